@@ -1,0 +1,59 @@
+# Everything runs in .venv, which the first command makes. `make help` lists the commands.
+#
+# One environment serves them all: the tests train agents and the demo is itself tested, so two would
+# hold nearly the same packages. That the core needs none of them is the business of tests/test_install.py.
+
+PYTHON ?=
+ARGS ?=
+BIN := .venv/bin
+
+# The oldest supported Gymnasium, and the tests that are run on it too.
+OLDEST_GYMNASIUM := 1.2.2
+GYMNASIUM_TESTS ?= tests
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow test-oldest lint types check bench format clean
+
+help:  ## list the commands
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+	@echo "ARGS=... is passed on: make demo ARGS=--help, make test ARGS='-k vector'"
+
+setup:  ## make or update .venv (all others do this first); PYTHON=... chooses a new one's interpreter
+	@PYTHON="$(PYTHON)" sh tools/setup
+
+demo: setup  ## train and evaluate an agent on PivotedBar-v0
+	$(BIN)/python -m agents.demo $(ARGS)
+
+test: setup  ## run the tests and doctests, all but the slow ones
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+
+test-slow: setup  ## run the slow tests
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+test-oldest: setup  ## run the tests on the oldest supported Gymnasium
+	@rm -rf .venv/oldest
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--no-deps --target .venv/oldest gymnasium==$(OLDEST_GYMNASIUM)
+	@PYTHONPATH=.venv/oldest $(BIN)/python -c \
+		"from gymnasium import __version__ as v; print('Gymnasium', v); assert v == '$(OLDEST_GYMNASIUM)'"
+	PYTHONPATH=$(CURDIR)/.venv/oldest $(BIN)/python -m pytest -n 2 --dist worksteal $(GYMNASIUM_TESTS) $(ARGS)
+
+lint: setup
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: setup
+	$(BIN)/python -m mypy
+
+check: lint types test  ## all that CI runs: lint, types, tests, doctests
+
+bench: setup  ## compare the speed with other environments
+	$(BIN)/lag-envs bench $(ARGS)
+
+format: setup  ## format the code and mend what ruff can mend
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+clean:  ## remove caches and build products (not .venv, not what was trained)
+	rm -rf build dist .coverage .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find src tests agents -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Plumbing: Gymnasium's single and vector environments, and the pictures."""

@@ -1,0 +1,335 @@
+"""From a task to compiled functions: one program for the single and for the vector environment.
+
+A program records the formulas of a task and its scene as lines of code and prints them into a few functions. All
+keep one order within a step: control, held step, reward and ending, kick, observation.
+
+Memory of one environment is a column of numbers, its rows: lifted state ``y``, lifted state after the step ``z``, target
+``g``, control ``u``, reward ``r``, steps taken ``n``, ``over`` (1 terminated + 2 truncated), ``within`` (whether the step was an
+ordinary one), observation ``o``. A batch is cut into blocks of 64 environments, and the rows of a block lie behind one
+another at distances known when compiling. So the compiler sees that rows do not overlap, and turns each loop
+over a block into vector instructions; with one array per row it would give up on proving that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any
+
+from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.flows import Stepper, lift_lines, section, split
+from lag_envs.tasks.base import Task
+
+BLOCK = 64
+SLOW = -3  #: status of a step that the fast formula does not cover
+
+
+def constants_of(task: Task) -> dict[str, float]:
+    """Return every number that a task's compiled functions take, by name."""
+    start = {f"centre{i}": c for i, c in enumerate(task.centre)} | {f"half{i}": h for i, h in enumerate(task.start)}
+    return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+
+
+class Program:
+    """The compiled functions of a task.
+
+    Parameters
+    ----------
+    task : Task
+        Its class and its scene's class and control decide the code; its numbers do not.
+    absent : frozenset of str
+        Constants that are zero in every environment that the program is for: they leave no code behind.
+    varying : frozenset of str
+        Constants that differ within a batch; they become rows.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> None:
+        scene = task.scene
+        names = constants_of(task)
+        self._stepper = Stepper(scene, absent)
+        self.constants = [name for name in names if name not in absent]
+        self.uniform = [name for name in self.constants if name not in varying]
+        self.varying = [name for name in self.constants if name in varying]
+        self.y, self.z = self._stepper.start, self._stepper.end
+        self.o = [f"o{i}" for i in range(len(task.observation))]
+        k_rows = [f"k_{name}" for name in self.varying]
+        #: Names of the rows, in order.
+        self.rows = [*self.y, *self.z, "g", "u", "r", "n", "over", "within", *self.o, *k_rows]
+        self._record(task, {name: 0.0 if name in absent else f"k_{name}" for name in names})
+
+    def _record(self, task: Task, constants: dict[str, Any]) -> None:
+        scene, width = task.scene, task.scene.width
+        states, given = len(scene.state_names), list(constants.values())
+
+        def k(values: Sequence) -> SimpleNamespace:
+            return SimpleNamespace(**dict(zip(constants, values, strict=True)))
+
+        def control(xp: Any, a: Any, *values: Any) -> list:
+            y, rest = split(values, width)
+            return [task.control(a, y, k(rest), k(rest).dt, xp)]
+
+        def judge(xp: Any, u: Any, g: Any, *values: Any) -> list:
+            y, z, rest = split(values, width, width)
+            reward = task.reward(y, z, u, g, k(rest), k(rest).dt, xp)
+            return [reward, xp.where(task.terminated(z, k(rest), xp), 1.0, 0.0)]
+
+        def last(xp: Any, u: Any, g: Any, *values: Any) -> list:
+            y, z, rest = split(values, width, width)
+            return [task.last_reward(y, z, u, g, k(rest), k(rest).dt, xp)]
+
+        def kick(xp: Any, *values: Any) -> Sequence:
+            draws, z, rest = split(values, task.draws, width)
+            return task.kick(z, draws, k(rest), xp)
+
+        def observe(xp: Any, g: Any, *values: Any) -> Sequence:
+            y, rest = split(values, width)
+            return task.observe(y, g, k(rest))
+
+        def start(xp: Any, *values: Any) -> list:
+            draws, rest = split(values, states + 1)
+            numbers = vars(k(rest))
+            state = [numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)]
+            return [*state, (task.target_range or 0.0) * (2.0 * draws[states] - 1.0)]
+
+        clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
+        self.control = clip + _lines("p", control, ["a", *self.y, *given], ["u"])
+        self.fast = [f"dt = {constants['dt']}", f"x = {constants['x']}", *self._stepper.fast]
+        self.judge = _lines("q", judge, ["u", "g", *self.y, *self.z, *given], ["r", "over"])
+        has_last = type(task).last_reward is not Task.last_reward
+        self.last = _lines("l", last, ["u", "g", *self.y, *self.z, *given], ["r"]) if has_last else []
+        draws, kicked = [f"draw{i}" for i in range(task.draws)], [f"e{i}" for i in range(width)]
+        self.kick = _draw(draws, "np.uint64(n)") + _lines("h", kick, [*draws, *self.z, *given], kicked) if draws else []
+        self.move = [f"{a} = {b}" for a, b in zip(self.y, kicked if draws else self.z, strict=True)]
+        self.observe = _lines("v", observe, ["g", *self.y, *given], self.o)
+        draws, names = [f"draw{i}" for i in range(states + 1)], [f"s{i}" for i in range(states + 1)]
+        self.sample = _draw(draws, "np.uint64(0)") + _lines("s", start, [*draws, *given], names)
+        self.n_state = states
+        self.lift = lift_lines(states, scene.angle, "y")
+
+    # --- one environment: rows, then constants, in one array --------------------------------------------------
+
+    @cached_property
+    def step_one(self) -> Callable:
+        """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the control stored."""
+        at = self._at_one
+        body = [
+            *self._constants_one(), *_load(at, [*self.y, "g", "n"]),
+            *self.control, *_store(at, ["u"]), *self.fast,
+            "if not within:", f"    return 0.0, {SLOW}",
+            *self._finish_one(),
+        ]  # fmt: skip
+        return _function("step_one", "f, obs, a, ids", body)
+
+    @cached_property
+    def finish_one(self) -> Callable:
+        """``finish_one(f, obs, ids)``: the rest of a step whose rows ``z`` were filled in by `advance`."""
+        rows = _load(self._at_one, [*self.y, *self.z, "g", "u", "n"])
+        return _function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
+
+    @cached_property
+    def start_one(self) -> Callable:
+        """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling what is not given."""
+        rows = [*self.y[: self.n_state], "g"]
+        body = [
+            *self._constants_one(), *_load(self._at_one, rows),
+            *_next_episode("0", "1", "2"), *self._start, *self.observe,
+            *_store(self._at_one, [*self.y, "g", "n", "over"]),
+            *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
+        ]  # fmt: skip
+        return _function("start_one", "f, obs, ids, state_given, target_given", body)
+
+    @cached_property
+    def advance(self) -> Callable:
+        """The scalar function for any step; see `Stepper.compile`."""
+        return self._stepper.compile()
+
+    @property
+    def advance_constants(self) -> list[str]:
+        """Names of the constants that `advance` takes after ``y..., u, dt, x``."""
+        return [name.removeprefix("k_") for name in self._stepper.constants]
+
+    def _at_one(self, row: str) -> str:
+        return f"f[{self.rows.index(row)}]"
+
+    def _constants_one(self) -> list[str]:
+        return [f"k_{name} = f[{len(self.rows) + j}]" for j, name in enumerate(self.uniform)]
+
+    def _finish_one(self) -> list[str]:
+        return [
+            *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
+            "if n >= k_limit:", "    over = over + 2.0",
+            *self.observe, *_store(self._at_one, [*self.y, "n", "over"]),
+            *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
+            "return r, np.int64(over)",
+        ]  # fmt: skip
+
+    @property
+    def _start(self) -> list[str]:
+        return [
+            *self.sample,
+            "if not state_given:", *_indent([f"y{i} = s{i}" for i in range(self.n_state)]),
+            "if not target_given:", f"    g = s{self.n_state}",
+            *self.lift, "n = 0.0", "over = 0.0",
+        ]  # fmt: skip
+
+    # --- a batch: blocks of rows of 64 environments -----------------------------------------------------------
+
+    @cached_property
+    def step_all(self) -> Callable:
+        """``step_all(f, ids, par, action, obs, reward, ended, target_given, count)`` to (status, over).
+
+        Steps every environment; one whose episode was over is restarted instead. The status is 0; or i + 1 where
+        environment i was refused and kept its state; or -(i + 1), before anything was stepped, where action i
+        is not finite. ``over`` counts the environments whose episode is over now.
+        """
+        y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
+        lane = "for i in range(size):"
+        call = ", ".join([*y, "u", "k_dt", "k_x", *self._stepper.constants])
+        step = [
+            *_load(_at, [*varying, *y]), "a = action[first + i]", *self.control, *self.fast,
+            "slow += not within", "ordinary = select(within, 1.0, 0.0)",
+            *_store(_at, [*z, "u"]), f"{_at('within')} = ordinary",
+        ]  # fmt: skip
+        redo = [
+            f"if {_at('within')} == 0.0 and {_at('over')} == 0.0:",
+            *_indent([
+                *_load(_at, [*varying, *y, "u"]),
+                f"{', '.join(z)}, status = advance({call})",
+                "if status < 0:",
+                "    refused = first + i + np.uint64(1)",
+                f"    {_at('n')} -= 1.0",
+                *_indent([f"{b} = {a}" for a, b in zip(y, z, strict=True)]),
+                *_store(_at, z),
+            ]),
+        ]  # fmt: skip
+        judge = [
+            *_load(_at, [*varying, *y, *z, "g", "u", "n"]),
+            f"before = {_at('over')}", "restarts += before > 0.0", f"{_at('within')} = before",
+            *self.judge, *_store(_at, ["r"]),
+        ]  # fmt: skip
+        finish = [
+            "n = n + 1.0", *(["key = ids[last + first + i]"] if self.kick else []), *self.kick, *self.move,
+            "over = select(n >= k_limit, over + 2.0, over)",
+            *self.observe, *_store(_at, [*y, "n", "over", *self.o]),
+        ]  # fmt: skip
+        if self.last:
+            again = _load(_at, [*varying, *y, *z, "g", "u", "n", "over"])
+            end = [f"if {_at('over')} > 0.0:", *_indent([*again, *self.last, *_store(_at, ["r"])])]
+            middle = [*_block(lane, [*judge, *_store(_at, ["over"])]), *_block(lane, end), *_block(lane, [*again, *finish])]
+        else:
+            middle = _block(lane, [*judge, *finish])
+        restart = [
+            f"if {_at('within')} > 0.0:",
+            *_indent([
+                *_load(_at, [*varying, "g"]),
+                *_next_episode("first + i", "second + first + i", "last + first + i"),
+                "state_given = False", *self._start, "r = 0.0", *self.observe,
+                *_store(_at, [*y, "g", "n", "over", "r", *self.o]),
+            ]),
+        ]  # fmt: skip
+        output = [
+            f"reward[first + i] = {_at('r')}", f"over = {_at('over')}",
+            "ended[first + i] = (over == 1.0) | (over == 3.0)", "ended[second + first + i] = over >= 2.0",
+            "overs += over > 0.0", *_observations(self.o),
+        ]  # fmt: skip
+        body = [
+            "wide_vectors()",
+            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            "second, last = np.uint64(count), np.uint64(2 * count)",
+            "bad = 0",
+            "for i in range(second):", "    bad += not (abs(action[i]) < math.inf)",
+            "if bad > 0:",
+            "    for i in range(count):",
+            "        if not (abs(action[i]) < math.inf):",
+            "            return -(i + 1), 0",
+            "overs, refused = 0, np.uint64(0)",
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            *_indent([
+                *self._block_start(),
+                "slow, restarts = 0, 0",
+                *_block(lane, step), "if slow > 0:", *_indent(_block(lane, redo)),
+                *middle,
+                "if restarts > 0:", *_indent(_block(lane, restart)),
+                *_block(lane, output),
+            ]),
+            "return np.int64(refused), overs",
+        ]  # fmt: skip
+        return _function("step_all", "f, ids, par, action, obs, reward, ended, target_given, count", body, self.advance)
+
+    @cached_property
+    def start_all(self) -> Callable:
+        """``start_all(f, ids, par, obs, mask, state_given, target_given, count)``: begin episodes where the mask is set."""
+        varying = [f"k_{name}" for name in self.varying]
+        start = [
+            "if mask[first + i]:",
+            *_indent([
+                *_load(_at, [*varying, *self.y[: self.n_state], "g"]),
+                *_next_episode("first + i", "second + first + i", "last + first + i"),
+                *self._start, *self.observe, *_store(_at, [*self.y, "g", "n", "over", *self.o]),
+            ]),
+        ]  # fmt: skip
+        body = [
+            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            "second, last = np.uint64(count), np.uint64(2 * count)",
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            *_indent([*self._block_start(), *_block("for i in range(size):", [*start, *_observations(self.o)])]),
+        ]  # fmt: skip
+        return _function("start_all", "f, ids, par, obs, mask, state_given, target_given, count", body)
+
+    def _block_start(self) -> list[str]:
+        # Unsigned, since a signed index might be negative, which NumPy's rules make a branch.
+        rows = [f"row_{row} = base + np.uint64({j * BLOCK})" for j, row in enumerate(self.rows)]
+        return [
+            f"first = block * np.uint64({BLOCK})", f"size = min(np.uint64({BLOCK}), second - first)",
+            f"base = block * np.uint64({BLOCK * len(self.rows)})", *rows,
+        ]  # fmt: skip
+
+
+def _at(row: str) -> str:
+    return f"f[row_{row} + i]"
+
+
+def _observations(names: Sequence[str]) -> list[str]:
+    """Copy the rows of the observation to the batch's array."""
+    place = f"(first + i) * np.uint64({len(names)})"
+    return [f"obs[{place} + np.uint64({j})] = {_at(o)}" for j, o in enumerate(names)]
+
+
+def _next_episode(key: str, episode: str, episode_key: str) -> list[str]:
+    return [
+        f"ids[{episode}] += np.uint64(1)",
+        f"key = episode_key(ids[{key}], ids[{episode}])",
+        f"ids[{episode_key}] = key",
+    ]
+
+
+def _block(head: str, body: Sequence[str]) -> list[str]:
+    return [head, *_indent(body)]
+
+
+def _lines(prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> list[str]:
+    """Record a formula; outputs that turned out constant are assigned as well."""
+    lines, values = section(prefix, formula, inputs, outputs)
+    return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
+
+
+def _draw(names: Sequence[str], step: str) -> list[str]:
+    return [f"{name} = uniform(key, {step}, np.uint64({i}))" for i, name in enumerate(names)]
+
+
+def _load(at: Callable, rows: Sequence[str]) -> list[str]:
+    return [f"{row} = {at(row)}" for row in rows]
+
+
+def _store(at: Callable, rows: Sequence[str]) -> list[str]:
+    return [f"{at(row)} = {row}" for row in rows]
+
+
+def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
+    return ["    " * levels + line for line in lines]
+
+
+def _function(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
+    return compile_function(name, "\n".join([f"def {name}({arguments}):", *_indent(body), ""]), *helpers)

@@ -1,0 +1,290 @@
+"""The single environment: a task behind Gymnasium's interface."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from numpy.typing import NDArray
+
+from lag_envs.envs.program import SLOW, Program, constants_of
+from lag_envs.tasks import load_task
+from lag_envs.tasks.base import Task
+
+RENDER_MODES = ["human", "rgb_array"]
+
+
+class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """One environment of any task; made by ``gym.make(id, **parameters)``.
+
+    What it does is described by its task: ``help(env.unwrapped.task)``.
+
+    Parameters
+    ----------
+    task : str
+        The task, as "module:Class". The ids fix it.
+    render_mode : {"human", "rgb_array"}, optional
+        How `render` shows the scene.
+    diagnostics : bool, default False
+        Whether `info` reports forces, needed friction and energy after each step.
+    **options
+        Parameters of the scene and of the task, such as ``mass``, ``damping``, ``dt``, ``duration``, ``target``.
+
+    Notes
+    -----
+    ``reset(options={"state": ..., "target": ...})`` starts an episode from a given state, in the order of
+    ``env.unwrapped.scene.state_names``.
+
+    Examples
+    --------
+    >>> import gymnasium as gym, lag_envs
+    >>> env = gym.make("PivotedBar-v0", mass=0.3)
+    >>> observation, info = env.reset(seed=1)
+    >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    """
+
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+
+    def __init__(self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any) -> None:
+        check_render_mode(render_mode)
+        self.task: Task = load_task(task)(**options)
+        self.scene = self.task.scene
+        self.__doc__ = self.task.__doc__
+        self.render_mode = render_mode
+        self.diagnostics = diagnostics
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": max(1, round(1.0 / self.task.dt))}
+        self.action_space = action_space()
+        self.observation_space = observation_space([self.task])
+
+        constants = constants_of(self.task)
+        self._program = program = Program(self.task, absent=absent([constants]))
+        self._rows = np.zeros(len(program.rows) + len(program.uniform))
+        self._rows[len(program.rows) :] = [constants[name] for name in program.uniform]
+        #: Key of the seed, number of the episode, key of the episode.
+        self._ids = np.zeros(3, dtype=np.uint64)
+        self._row = {name: j for j, name in enumerate(program.rows)}
+        self._size = len(self.task.observation)
+        self._ready = False
+        self._started = False
+        self._bind()
+
+    def _bind(self) -> None:
+        self._step = self._program.step_one
+        self._viewer: Any = None
+
+    # --- Gymnasium's interface --------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode.
+
+        Parameters
+        ----------
+        seed : int, optional
+            Seeds starts, targets and kicks of this and of the following episodes.
+        options : dict, optional
+            ``"state"``: the start, in the scene's order and units; ``"target"``: the target, where the task has one.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            The first observation.
+        info : dict
+            Empty, or the diagnostics.
+
+        Raises
+        ------
+        ValueError
+            For unknown options, and a state or target with which the task cannot start. The episode in
+            progress, if there is one, is left as it is.
+        """
+        state, target = start_options(options)
+        given_state = None if state is None else self.task.check_start(state)
+        given_target = self.task.target if target is None else self.task.check_target(target)
+        super().reset(seed=seed)
+        if seed is not None:
+            self._ids[:2] = seed, 0
+        elif not self._started:
+            self._ids[:2] = self.np_random.integers(2**63), 0
+        self._started = True
+        if given_state is not None:
+            self._rows[: len(given_state)] = given_state
+        if given_target is not None:
+            self._rows[self._row["g"]] = given_target
+        observation = np.empty(self._size, dtype=np.float32)
+        self._program.start_one(self._rows, observation, self._ids, given_state is not None, given_target is not None)
+        self._rows[self._row["u"]] = 0.0
+        self._ready = True
+        if self.render_mode == "human":
+            self.render()
+        return observation, self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Hold one control for one control interval.
+
+        Parameters
+        ----------
+        action : array_like, shape (1,)
+            The action in [-1, 1]; a finite value outside is clipped.
+
+        Returns
+        -------
+        observation, reward, terminated, truncated, info
+            As Gymnasium defines them.
+
+        Raises
+        ------
+        ValueError
+            For an action that is not finite, not real or not of shape (1,).
+        ResetNeeded
+            Before the first reset, and after termination.
+        StepRefused
+            Where the step cannot be taken to full accuracy. In each case the environment stays as it was.
+        """
+        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind == "f":
+            a = action.item()
+        else:
+            a = one_action(action)
+        if not -math.inf < a < math.inf:
+            raise ValueError(f"the action must be finite, got {action!r}")
+        if not self._ready:
+            raise ResetNeeded(
+                "call reset() before step(): " + ("the episode has terminated" if self._started else "no episode has begun")
+            )
+        observation = np.empty(self._size, np.float32)
+        reward, over = self._step(self._rows, observation, a, self._ids)
+        if over:
+            if over == SLOW:
+                reward, over = self._slow_step(observation)
+            self._ready = over % 2 == 0
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, over % 2 == 1, over >= 2, self._info() if self.diagnostics else {}
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the scene; returns an RGB picture of shape (height, width, 3) for the mode "rgb_array"."""
+        if self.render_mode is None:
+            gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array" or "human"')
+            return None
+        if not self._started:
+            raise ResetNeeded("call reset() before render(): no episode has begun")
+        if self._viewer is None:
+            from lag_envs.envs.rendering import Viewer
+
+            self._viewer = Viewer(self.task, self.render_mode)
+        return self._viewer.draw(self.state, self.control, self.target)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    # --- what can be looked at --------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """Copy of the state, in the order of ``scene.state_names``, in SI units."""
+        return self._rows[: len(self.scene.state_names)].copy()
+
+    @property
+    def target(self) -> float | None:
+        """The episode's target; None for a task without one."""
+        return None if self.task.target_range is None else float(self._rows[self._row["g"]])
+
+    @property
+    def control(self) -> float:
+        """The control applied last, in SI units; 0 after a reset."""
+        return float(self._rows[self._row["u"]])
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How the environment was made. Its step limit is the one that the environment itself enforces."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        if value is not None and value.max_episode_steps is None and math.isfinite(self.task.limit):
+            value.max_episode_steps = int(self.task.limit)
+        self._spec = value
+
+    _spec: EnvSpec | None = None
+
+    # --- the rest ---------------------------------------------------------------------------------------------
+
+    def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
+        """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
+        program, rows = self._program, self._rows
+        start = [rows[self._row[name]] for name in [*program.y, "u"]]
+        constants = constants_of(self.task)
+        *end, status = program.advance(*start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants))
+        if status < 0:
+            raise self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
+        for name, value in zip(program.z, end, strict=True):
+            rows[self._row[name]] = value
+        return program.finish_one(rows, observation, self._ids)
+
+    def _info(self) -> dict[str, Any]:
+        return diagnostics(self.scene, self.state, np.float64(self.control)) if self.diagnostics else {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out compiled functions and windows."""
+        state = {k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_program")}
+        return copy.copy(state)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, and compile anew (from the cache)."""
+        self.__dict__.update(state)
+        self._program = Program(self.task, absent=absent([constants_of(self.task)]))
+        self._bind()
+
+
+def absent(constants: list[dict[str, float]]) -> frozenset[str]:
+    """Return the names of the constants that are zero in all environments: what is not there costs nothing."""
+    return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
+
+
+def action_space() -> gym.spaces.Box:
+    """Return the space of actions, the same for every task."""
+    return gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+
+def observation_space(tasks: list[Task]) -> gym.spaces.Box:
+    """Return a space that holds the observations of all the tasks."""
+    high = np.max([np.asarray(task.bounds()) for task in tasks], axis=0).astype(np.float32)
+    return gym.spaces.Box(-high, high, dtype=np.float32)
+
+
+def check_render_mode(mode: str | None) -> None:
+    """Raise ValueError for an unknown render mode."""
+    if mode is not None and mode not in RENDER_MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)} or None, got {mode!r}")
+
+
+def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("state", "target")) -> list[Any]:
+    """Return the values of the known options of `reset`, None where one is missing."""
+    unknown = sorted(set(options or ()) - set(known))
+    if unknown:
+        raise ValueError(f"unknown reset option {unknown[0]!r}; known are {', '.join(known)}")
+    return [(options or {}).get(name) for name in known]
+
+
+def one_action(action: Any) -> float:
+    """Return an action of any real type as float, or raise a ValueError."""
+    array = np.asarray(action)
+    if array.shape != (1,):
+        raise ValueError(f"the action must have shape (1,), got shape {array.shape}: {action!r}")
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"the action must be a real number, got {action!r} of type {array.dtype}")
+    return float(array[0])
+
+
+def diagnostics(scene: Any, state: NDArray[np.float64], control: Any) -> dict[str, Any]:
+    """Return what `info` reports when asked: forces and energies, and the control that was applied."""
+    return {"control": control, **scene.forces(state, control), "energy": scene.energy(state, control)["total"]}

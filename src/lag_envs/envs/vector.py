@@ -1,0 +1,392 @@
+"""The native vector environment: all environments of a batch in one compiled call."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from lag_envs.envs.program import BLOCK, Program, constants_of
+from lag_envs.envs.single import (
+    RENDER_MODES,
+    absent,
+    action_space,
+    check_render_mode,
+    diagnostics,
+    observation_space,
+    start_options,
+)
+from lag_envs.tasks import load_task
+from lag_envs.tasks.base import Task
+
+
+class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
+    """Many environments of one task, stepped together; made by ``gym.make_vec(id, num_envs=..., **parameters)``.
+
+    Sub-environment i of a batch seeded s goes through the same numbers, bit for bit, as the single environment seeded
+    s + i.
+
+    Parameters
+    ----------
+    task : str
+        The task, as "module:Class". The ids fix it.
+    num_envs : int
+        Number of environments.
+    max_episode_steps : int, optional
+        Steps after which an episode is truncated, if earlier than the task's own limit.
+    autoreset_mode : {"NextStep", "SameStep", "Disabled"} or AutoresetMode
+        What happens when an episode is over; see `gymnasium.vector.AutoresetMode`.
+    render_mode : {"rgb_array"}, optional
+        `render` then returns one picture for each environment.
+    diagnostics : bool, default False
+        Whether `info` reports forces, needed friction and energy after each step.
+    **options
+        Parameters of the scene and of the task. A sequence of `num_envs` values gives each environment its own.
+
+    Notes
+    -----
+    ``reset(options=...)`` takes ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,) and ``"reset_mask"``, a boolean array
+    (num_envs,) of the environments to reset.
+
+    Examples
+    --------
+    >>> import gymnasium as gym, lag_envs
+    >>> envs = gym.make_vec("PivotedBar-v0", num_envs=3, damping=[0.0, 0.001, 0.1])
+    >>> observations, infos = envs.reset(seed=1)
+    >>> observations.shape
+    (3, 5)
+    """
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        diagnostics: bool = False,
+        **options: Any,
+    ) -> None:
+        check_render_mode(render_mode)
+        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
+        self.num_envs = int(num_envs)
+        self.render_mode = render_mode
+        self.diagnostics = diagnostics
+        self._mode = check_mode(autoreset_mode)
+        self._tasks = make_tasks(load_task(task), self.num_envs, options)
+        self.task = self._tasks[0]
+        self.scene = self.task.scene
+        self.__doc__ = self.task.__doc__
+        self.metadata = {
+            "render_modes": RENDER_MODES,
+            "render_fps": max(1, round(1.0 / self.task.dt)),
+            "autoreset_mode": self._mode,
+        }
+        self.single_action_space = action_space()
+        self.single_observation_space = observation_space(self._tasks)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+        self._constants = [constants_of(task) for task in self._tasks]
+        if max_episode_steps is not None and max_episode_steps != -1:
+            if isinstance(max_episode_steps, bool) or not max_episode_steps >= 1:
+                raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
+            for constants in self._constants:
+                constants["limit"] = min(constants["limit"], float(max_episode_steps))
+        self._compile()
+        program = self._program
+        self._par = np.array([self._constants[0][name] for name in program.uniform])
+        blocks = -(-self.num_envs // BLOCK)
+        self._memory = np.zeros(blocks * len(program.rows) * BLOCK)
+        #: Keys of the seeds, numbers of the episodes, keys of the episodes.
+        self._ids = np.zeros(3 * self.num_envs, dtype=np.uint64)
+        self._lanes = np.arange(self.num_envs)
+        for name in program.varying:
+            values = [constants[name] for constants in self._constants]
+            self._write(f"k_{name}", self._lanes, np.array(values))
+        self._targets_given = self.task.target is not None
+        if self._targets_given:
+            self._write("g", self._lanes, np.array([task.target for task in self._tasks]))
+        self._started = False
+        self._over = 0
+
+    def _compile(self) -> None:
+        first = self._constants[0]
+        varying = frozenset(name for name in first if any(c[name] != first[name] for c in self._constants))
+        self._program = Program(self.task, absent(self._constants), varying)
+        self._row = {name: j for j, name in enumerate(self._program.rows)}
+        self._viewers: list[Any] = []
+
+    # --- Gymnasium's interface --------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode in every environment, or in those of a mask.
+
+        Parameters
+        ----------
+        seed : int or sequence of int, optional
+            A seed s seeds environment i with s + i; a sequence seeds each with its own, None leaving one as it is.
+        options : dict, optional
+            ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool. Rows
+            that the mask leaves out are ignored.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, n_observation)
+            The observations; those of environments that the mask leaves out are their last ones.
+        infos : dict
+            Empty, or the diagnostics.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For unknown options, and arrays of the wrong shape, type or content; nothing is reset then.
+        """
+        state, target, mask = start_options(options, ("state", "target", "reset_mask"))
+        mask = self._check_mask(mask)
+        lanes = self._lanes[mask]
+        seeds = self._check_seeds(seed)
+        if state is not None:
+            state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
+            state = np.array([self._tasks[i].check_start(state[i]) for i in lanes])
+        if target is not None:
+            target = self._check_rows("target", target, (self.num_envs,))
+            target = np.array([self._tasks[i].check_target(target[i]) for i in lanes])
+        if not self._started and not mask.all():
+            raise ResetNeeded("the first reset must reset every environment, got a reset_mask that leaves some out")
+        super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
+        if seed is None and not self._started:
+            self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
+        for i, s in seeds:
+            if mask[i]:
+                self._ids[i], self._ids[self.num_envs + i] = s, 0
+        if state is not None:
+            for j, column in enumerate(state.T):
+                self._write(f"y{j}", lanes, column)
+        if target is not None:
+            self._write("g", lanes, target)
+        elif self._targets_given:
+            self._write("g", lanes, np.array([self._tasks[i].target for i in lanes]))
+        observations = self._start(mask, state is not None, target is not None or self._targets_given)
+        self._write("u", lanes, 0.0)
+        self._started = True
+        self._over = int(np.count_nonzero(self._read("over")))
+        return observations, self._infos(mask)
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Hold one control for one control interval in every environment.
+
+        Parameters
+        ----------
+        actions : array_like, shape (num_envs, 1)
+            Actions in [-1, 1]; finite values outside are clipped.
+
+        Returns
+        -------
+        observations, rewards, terminations, truncations, infos
+            As Gymnasium defines them; the reward is float64.
+
+        Raises
+        ------
+        ValueError
+            For actions that are not finite, not real or not of that shape; nothing is stepped then.
+        ResetNeeded
+            Before the first reset; with autoreset disabled also while an episode is over.
+        StepRefused
+            Where an environment's step cannot be taken to full accuracy. That environment keeps its state, the others
+            have been stepped.
+        """
+        actions = self._check_actions(actions)
+        if not self._started:
+            raise ResetNeeded("call reset() before step(): no episode has begun")
+        if self._over and self._mode == AutoresetMode.DISABLED:
+            over = np.flatnonzero(self._read("over"))
+            raise ResetNeeded(f"the episodes of environments {over.tolist()} are over: reset them with options['reset_mask']")
+        n, program = self.num_envs, self._program
+        observations = np.empty((n, len(program.o)), dtype=np.float32)
+        rewards = np.empty(n)
+        ended = np.empty((2, n), dtype=np.bool_)
+        restarted = self._read("over") > 0.0 if self.diagnostics and self._over else None
+        status, self._over = program.step_all(
+            self._memory, self._ids, self._par, actions, observations.reshape(-1), rewards, ended.reshape(-1), self._targets_given, n
+        )
+        if status < 0:
+            raise ValueError(f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}")
+        if status > 0:
+            self._refuse(status - 1)
+        terminations, truncations = ended
+        infos = self._infos(None, restarted) if self.diagnostics else {}
+        if self._over and self._mode == AutoresetMode.SAME_STEP:
+            observations, infos = self._restart(observations, ended.any(axis=0), infos)
+        return observations, rewards, terminations, truncations, infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """Return a picture of each environment."""
+        if self.render_mode is None:
+            gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array"')
+            return None
+        if not self._started:
+            raise ResetNeeded("call reset() before render(): no episode has begun")
+        if not self._viewers:
+            from lag_envs.envs.rendering import Viewer
+
+            self._viewers = [Viewer(task, "rgb_array") for task in self._tasks]
+        targets = self.target if self.target is not None else [None] * self.num_envs
+        return tuple(v.draw(s, u, g) for v, s, u, g in zip(self._viewers, self.state, self.control, targets, strict=True))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Let go of the pictures."""
+        for viewer in self._viewers:
+            viewer.close()
+        self._viewers = []
+
+    # --- what can be looked at --------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """Copy of the states, shape (num_envs, n_state), in the order of ``scene.state_names``, in SI units."""
+        return np.stack([self._read(f"y{j}") for j in range(len(self.scene.state_names))], axis=1)
+
+    @property
+    def target(self) -> NDArray[np.float64] | None:
+        """The targets, shape (num_envs,); None for a task without one."""
+        return None if self.task.target_range is None else self._read("g")
+
+    @property
+    def control(self) -> NDArray[np.float64]:
+        """The controls applied last, shape (num_envs,), in SI units; 0 after a reset."""
+        return self._read("u")
+
+    # --- the rest ---------------------------------------------------------------------------------------------
+
+    def _read(self, row: str) -> NDArray[np.float64]:
+        return self._memory.reshape(-1, len(self._row), BLOCK)[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
+
+    def _write(self, row: str, lanes: NDArray[np.intp], values: Any) -> None:
+        self._memory.reshape(-1, len(self._row), BLOCK)[lanes // BLOCK, self._row[row], lanes % BLOCK] = values
+
+    def _start(self, mask: NDArray[np.bool_], state_given: bool, target_given: bool) -> NDArray[np.float32]:
+        observations = np.empty((self.num_envs, len(self._program.o)), dtype=np.float32)
+        self._program.start_all(
+            self._memory, self._ids, self._par, observations.reshape(-1), mask, state_given, target_given, self.num_envs
+        )
+        return observations
+
+    def _restart(
+        self, observations: NDArray[np.float32], over: NDArray[np.bool_], infos: dict[str, Any]
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin new episodes in the same step; the old ones' last observations and infos go into `infos`."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(over):
+            final[i] = observations[i].copy()
+        last = {k: v if k.startswith("_") else np.where(over, v, 0) for k, v in infos.items()}
+        last |= {k: over & v for k, v in last.items() if k.startswith("_")}
+        observations = self._start(over, False, self._targets_given)
+        self._write("u", self._lanes[over], 0.0)
+        self._over = 0
+        infos = self._infos(None) if self.diagnostics else {}
+        ends = {"final_obs": final, "_final_obs": over.copy(), "final_info": last, "_final_info": over.copy()}
+        return observations, infos | ends
+
+    def _infos(self, mask: NDArray[np.bool_] | None, restarted: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+        if not self.diagnostics:
+            return {}
+        mask = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
+        if restarted is not None:
+            self._write("u", self._lanes[restarted], 0.0)
+        infos: dict[str, Any] = {}
+        states, controls = self.state, self.control
+        for i in self._lanes[mask]:
+            infos = self._add_info(infos, diagnostics(self._tasks[i].scene, states[i], controls[i]), int(i))
+        return infos
+
+    def _refuse(self, i: int) -> None:
+        scene = self._tasks[i].scene
+        raise scene.refusal(self.state[i], float(self.control[i]), self.task.dt, None, f"the step of environment {i}")
+
+    def _check_actions(self, actions: Any) -> NDArray[np.float64]:
+        array = np.asarray(actions)
+        if array.shape != (self.num_envs, 1):
+            raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {array.shape}")
+        if array.dtype.kind not in "fiub":
+            raise ValueError(f"actions must be real numbers, got an array of type {array.dtype}")
+        return array.astype(np.float64).reshape(-1)
+
+    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
+        if mask is None:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {mask!r}")
+        if mask.shape != (self.num_envs,):
+            raise ValueError(f"options['reset_mask'] must have shape ({self.num_envs},), got {mask.shape}")
+        if not mask.any():
+            raise ValueError("options['reset_mask'] must select at least one environment")
+        return mask
+
+    def _check_seeds(self, seed: Any) -> list[tuple[int, int]]:
+        if seed is None:
+            return []
+        if isinstance(seed, int | np.integer):
+            seed = range(int(seed), int(seed) + self.num_envs)
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must be one number or {self.num_envs}, got {len(seed)}")
+        pairs = [(i, int(s)) for i, s in enumerate(seed) if s is not None]
+        for _, s in pairs:
+            if s < 0:
+                raise ValueError(f"a seed must be at least 0, got {s}")
+        return pairs
+
+    def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape != shape:
+            raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
+        return array
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out compiled functions and pictures."""
+        return copy.copy({k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore, and compile anew (from the cache)."""
+        self.__dict__.update(state)
+        self._compile()
+
+
+def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """Return the autoreset mode named by a string or the enum itself."""
+    for known in AutoresetMode:
+        if mode == known or (isinstance(mode, str) and mode.replace("_", "").lower() == known.value.replace("_", "").lower()):
+            return known
+    raise ValueError(f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {mode!r}")
+
+
+def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
+    """Return one task per environment; all are the same object where no option varies."""
+    many = {k: v for k, v in options.items() if isinstance(v, list | tuple | np.ndarray) and np.ndim(v) > 0}
+    for name, values in many.items():
+        if len(values) != n:
+            raise ValueError(f"{name} must be one value or {n}, one per environment, got {len(values)}")
+        if name in ("control", "dt", "duration"):
+            raise ValueError(f"{name} must be the same for all environments, got {values!r}")
+    if not many:
+        return [kind(**options)] * n
+    tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
+    if len({(t.scene.state_names, t.target is None, t.observation) for t in tasks}) > 1:
+        raise ValueError("the environments of a batch must have the same states, got some with and some without a track")
+    return tasks
+
+
+del math

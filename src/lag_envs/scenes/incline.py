@@ -1,0 +1,216 @@
+"""A cylinder that rolls without slipping on an incline::
+
+      \\   x ->  down the slope is positive, and so is the angular velocity of rolling down
+       \\ O
+        \\_____)  phi   tilt; the plane turns about the point x = 0 of its surface
+
+With K = I/(m R²) and k = 1/(1 + K), centre at x along and R above the surface::
+
+    T = m ((x' + R phi')² + x² phi'²)/2 + I (x'/R + phi')²/2,   V = m g (R cos(phi) - x sin(phi))
+
+Fixed tilt:    x'' = k g sin(phi) - (c k/m) x'
+Turning tilt:  (1 + K)(x'' + R phi'') = g sin(phi) + x phi'² - (c/m) x'
+
+While the rate phi' is held, w = x' + R phi' obeys an equation without phi'', and stays continuous when the rate
+is switched, whereas x' jumps by -R times the switch. So w is the state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lag_envs.scenes.base import Motion, Scene, parameter
+from lag_envs.stepping import slope
+from lag_envs.stepping.flows import SLIDE, TURN, Flow
+
+CONTROLS = {"damping": "c [N s/m]", "tilt": "phi [rad]", "tilt_rate": "phi' [rad/s]"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Incline(Scene):
+    """A cylinder rolling on an incline; the control is the drag, the tilt or the tilt's rate.
+
+    Parameters
+    ----------
+    mass : float [kg]
+        Mass m.
+    radius : float [m]
+        Rolling radius R.
+    inertia : float [kg m²], optional
+        Moment of inertia I about the axis; by default that of a solid cylinder, mR²/2.
+    damping : float [N s/m]
+        Coefficient c of the drag -cx' at the axis. It adds to a drag that is the control.
+    tilt : float [rad], optional
+        Fixed tilt, below π/2 to either side; 0.26 by default. Only for the control "damping".
+    gravity : float [m/s²]
+        Field g, downward.
+    control : {"damping", "tilt", "tilt_rate"}
+        What the control is: a drag coefficient [N s/m] on the fixed tilt; the tilt φ [rad], quasi-static (each step is one of
+        a fixed plane); or the rate φ' [rad/s] of a moving plane, held over the step.
+
+    Notes
+    -----
+    State (x, x_dot); for the control "tilt_rate" (x, w, phi) with w = x' + Rφ'. The zero of the potential energy
+    lies at the height of the point x = 0 of the surface.
+
+    Examples
+    --------
+    >>> Incline(tilt=0.1, damping=0.0).simulate([0.0, 0.0], [0.0], dt=1.0)[1].round(3).tolist()
+    [0.326, 0.653]
+    """
+
+    mass: float = parameter(1.0, "kg", above=0.0)
+    radius: float = parameter(0.05, "m", above=0.0)
+    inertia: float = parameter(None, "kg m²", least=0.0)
+    damping: float = parameter(0.0, "N s/m", least=0.0)
+    tilt: float = parameter(None, "rad", above=-math.pi / 2, below=math.pi / 2)
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    control: str = "damping"
+
+    def check(self) -> None:
+        """Fill in the solid cylinder's inertia and the tilt, and check the control."""
+        if self.control not in CONTROLS:
+            raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
+        if self.control != "damping" and self.tilt is not None:
+            raise ValueError(f"tilt={self.tilt:g} rad would be ignored: with control={self.control!r} the tilt is controlled")
+        if self.control == "damping" and self.tilt is None:
+            object.__setattr__(self, "tilt", 0.26)
+        if self.inertia is None:
+            object.__setattr__(self, "inertia", 0.5 * self.mass * self.radius * self.radius)
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state's entries."""
+        return ("x", "w", "phi") if self.control == "tilt_rate" else ("x", "x_dot")
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Their units."""
+        return ("m", "m/s", "rad") if self.control == "tilt_rate" else ("m", "m/s")
+
+    @property
+    def control_unit(self) -> str:
+        """The control and its unit."""
+        return CONTROLS[self.control]
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """The cylinder's place is free, the tilt is moved."""
+        return ("x", "phi")
+
+    @property
+    def flow(self) -> Flow:
+        """The closed form of the fixed slope, or the linear flow of the turning one."""
+        return TURN if self.control == "tilt_rate" else SLIDE
+
+    @property
+    def angle(self) -> int | None:
+        """Index of phi, where it is a state."""
+        return 2 if self.control == "tilt_rate" else None
+
+    def constants(self) -> dict[str, Any]:
+        """Return the numbers that the chosen control needs."""
+        rolling = 1.0 / (1.0 + self.inertia / (self.mass * self.radius * self.radius))
+        drag = self.damping * rolling / self.mass
+        if self.control == "tilt":
+            return {"pull": rolling * self.gravity, "drag": drag}
+        if self.control == "tilt_rate":
+            return {"rolling": rolling, "field": self.gravity, "radius": self.radius, "drag": drag}
+        sine = math.sin(self.tilt) if isinstance(self.tilt, float) else _symbolic_sine(self.tilt)
+        return {"pull": rolling * self.gravity * sine, "drag": drag, "brake": rolling / self.mass}
+
+    def drive(self, y: Sequence, u: Any, k: Any, xp: Any) -> slope.Pull | slope.Turn:
+        """Return the flow's coefficients."""
+        if self.control == "tilt_rate":
+            return slope.Turn(k.rolling, k.field, k.drag, u)
+        if self.control == "tilt":
+            return slope.Pull(k.pull * xp.sin(u), k.drag)
+        return slope.Pull(k.pull, k.drag + k.brake * u)
+
+    def unpack(self, y: Sequence, u: Any, k: Any) -> Sequence:
+        """Return (x, x'), with cosφ and sinφ where the plane turns."""
+        if self.control != "tilt_rate":
+            return y
+        x, w, _, c, s = y
+        return x, w - k.radius * u, c, s
+
+    def pack(self, moved: Sequence, y: Sequence, u: Any, dt: Any, k: Any) -> Sequence:
+        """Return the state, with w and φ where the plane turns."""
+        if self.control != "tilt_rate":
+            return moved
+        x, v, c, s = moved
+        return x, v + k.radius * u, y[2] + dt * u, c, s
+
+    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
+        """Return T [J]."""
+        along, across, spin = v.x + self.radius * v.phi, q.x * v.phi, v.x / self.radius + v.phi
+        return 0.5 * self.mass * (along * along + across * across) + 0.5 * self.inertia * spin * spin
+
+    def potential(self, q: Any, xp: Any) -> Any:
+        """Return V [J]."""
+        return self.mass * self.gravity * (self.radius * xp.cos(q.phi) - q.x * xp.sin(q.phi))
+
+    def dissipation(self, v: Any, u: Any) -> Any:
+        """Return half of the drag's loss [W]."""
+        c = self.damping + u if self.control == "damping" else self.damping
+        return 0.5 * c * v.x * v.x
+
+    def motion(self, state: ArrayLike, control: ArrayLike) -> Motion:
+        """Return x, phi and their derivatives."""
+        u = np.asarray(control, dtype=np.float64)
+        y = self.lift(state)
+        k = SimpleNamespace(**self.constants())
+        coefficients = self.drive(y, u, k, np)
+        x, v = self.unpack(y, u, k)[:2]
+        phi, rate = {"damping": (self.tilt, 0.0), "tilt": (u, 0.0), "tilt_rate": (y[-1] if self.angle is None else y[2], u)}[self.control]
+        if isinstance(coefficients, slope.Turn):
+            acceleration = coefficients.rolling * (self.gravity * y[4] + x * u * u) - coefficients.drag * v
+        else:
+            acceleration = coefficients.pull - coefficients.drag * v
+        return Motion(
+            SimpleNamespace(x=x, phi=phi), SimpleNamespace(x=v, phi=rate), SimpleNamespace(x=acceleration, phi=0.0)
+        )
+
+    def reactions(self, m: Motion, u: Any) -> dict[str, Any]:
+        """Return normal force, friction (down the slope positive on the cylinder's turning, up on its place), needed μ."""
+        rolling = m.a.x + self.radius * m.a.phi
+        turn = m.v.phi * m.v.phi
+        normal = self.mass * (
+            self.gravity * np.cos(m.q.phi) - 2.0 * m.v.x * m.v.phi - self.radius * turn - m.q.x * m.a.phi
+        )
+        friction = self.inertia * rolling / (self.radius * self.radius)
+        forces = {"normal": normal, "friction": friction, "needed_friction": _ratio(friction, normal)}
+        if self.control == "tilt_rate":
+            forces["drive_torque"] = (
+                (self.mass * self.radius + self.inertia / self.radius) * rolling
+                + self.mass * m.q.x * m.q.x * m.a.phi
+                + 2.0 * self.mass * m.q.x * m.v.x * m.v.phi
+                - self.mass * self.gravity * (m.q.x * np.cos(m.q.phi) + self.radius * np.sin(m.q.phi))
+            )
+        return forces
+
+    def drive_power(self, m: Motion, u: Any) -> Any:
+        """Return the power of the torque that turns the plane [W]."""
+        if self.control != "tilt_rate":
+            return 0.0 * m.v.x
+        return self.reactions(m, u)["drive_torque"] * m.v.phi
+
+
+def _ratio(friction: Any, normal: Any) -> Any:
+    """Return |F|/N; infinite where the contact carries nothing or pulls."""
+    friction, normal = np.broadcast_arrays(np.abs(friction), normal)
+    out = np.full(normal.shape, np.inf)
+    return np.divide(friction, normal, out=out, where=normal > 0.0)[()]
+
+
+def _symbolic_sine(tilt: Any) -> Any:
+    import sympy
+
+    return sympy.sin(tilt)

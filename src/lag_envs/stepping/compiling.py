@@ -1,0 +1,78 @@
+"""Compile straight-line code with Numba, and keep the result on disk.
+
+Numba is imported on first use: it takes a while, and brings SciPy along where that is installed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from lag_envs.stepping.tracing import Trace
+
+
+@lru_cache(maxsize=None)
+def compile_function(name: str, source: str, /, *helpers: Callable, **constants: float) -> Callable:
+    """Compile the function ``name`` that ``source`` defines.
+
+    Parameters
+    ----------
+    name : str
+        The function's name in the source.
+    source : str
+        Python source of one function; it may use `fma`, `select`, `math`, NumPy, the helpers and the constants.
+    *helpers : callable
+        What this function returned for the functions that the source calls, known there by their names.
+    **constants : float
+        Numbers that the source names.
+
+    Returns
+    -------
+    callable
+        The compiled function.
+
+    Notes
+    -----
+    Numba's disk cache knows a function by file, name, line and bytecode, not by its constants or by
+    what it calls. The name therefore carries a digest of the source, the constants and every helper's
+    name, which carries its own, and so on down.
+    """
+    from lag_envs.stepping import primitives
+
+    parts = [inspect.getsource(primitives), source, repr(sorted(constants.items())), *(h.__name__ for h in helpers)]
+    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    unique = f"{name}_{digest}"
+    # Under this file's name the cache finds a folder to write to and a date to check.
+    code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), __file__, "exec")
+    namespace: dict[str, Any] = dict(primitives.NAMES, **constants, __name__=__name__)
+    namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
+    exec(code, namespace)
+    return primitives.jit(namespace[unique])
+
+
+def compile_python(name: str, function: Callable, *helpers: Callable, **constants: float) -> Callable:
+    """Compile, under a name, a function that is written out in Python; otherwise like `compile_function`."""
+    source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)
+    return compile_function(name, source, *helpers, **constants)
+
+
+def compile_traced(name: str, arguments: str, formula: Callable) -> Callable:
+    """Run ``formula(xp, *arguments)`` once on recording numbers and compile what it did.
+
+    Parameters
+    ----------
+    name : str
+        Name of the compiled function.
+    arguments : str
+        Its arguments, separated by commas.
+    formula : callable
+        Takes the `Trace` as namespace and one `Number` per argument; returns a tuple of numbers.
+    """
+    trace = Trace()
+    outputs = formula(trace, *trace.inputs(*arguments.split(", ")))
+    names = [f"out{i}" for i in range(len(outputs))]
+    lines = [f"def {name}({arguments}):", *trace.code(dict(zip(names, outputs, strict=True)))]
+    return compile_function(name, "\n    ".join([*lines, f"return {', '.join(names)}"]) + "\n")

@@ -1,0 +1,207 @@
+"""The three exact flows, and how a scene's control step is put together from one of them.
+
+A scene names its flow and says how its state and held control become the flow's variables and coefficients.
+From that, this module makes the scalar ``advance`` that a single environment and `Scene.simulate` call,
+and the lines of the vectorised step. Both print the same recorded sections with the same roundings, which is
+why a batch and a single environment agree bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from itertools import islice
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.tracing import Trace
+
+if TYPE_CHECKING:
+    from lag_envs.scenes.base import Scene
+
+
+class Flow(NamedTuple):
+    """An exact flow: what it moves, and two ways to run it.
+
+    ``fast(variables, coefficients, dt)`` is the formula of an ordinary step, ``within(variables, coefficients,
+    dt, x, xp)`` tells whether this step is one, and ``compile(present)`` makes the scalar function for any step.
+    """
+
+    size: int
+    coefficients: type
+    fast: Callable
+    within: Callable
+    compile: Callable
+
+
+@lru_cache(maxsize=None)
+def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
+    """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
+    return Flow(
+        4,
+        pendulum.Drive,
+        lambda variables, drive, dt: pendulum.step(*variables, drive, dt, order),
+        lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
+        lambda present: pendulum.compile_flow(present, order),
+    )
+
+
+def _turn(variables: Sequence, turn: slope.Turn, dt: Any) -> tuple:
+    x, v, c, s = variables
+    return *slope.turn_series(x, v, c, s, turn, dt), *slope.rotate(c, s, turn.rate * dt)
+
+
+SLIDE = Flow(
+    2,
+    slope.Pull,
+    lambda variables, pull, dt: slope.slide(*variables, pull, dt),
+    lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
+    slope.compile_slide,
+)
+TURN = Flow(4, slope.Turn, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn)
+
+
+def section(prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> tuple[list[str], list]:
+    """Record ``formula(xp, *inputs)``.
+
+    Parameters
+    ----------
+    prefix : str
+        What its intermediate names begin with.
+    formula : callable
+        Returns one number per output.
+    inputs : sequence of str or float
+        A string names an input; a float is a constant.
+    outputs : sequence of str
+        Names for the results.
+
+    Returns
+    -------
+    lines : list of str
+        The code.
+    values : list of str or float
+        For each output its name, or the constant that it turned out to be.
+    """
+    trace = Trace(prefix)
+    results = list(formula(trace, *(trace.inputs(i)[0] if isinstance(i, str) else i for i in inputs)))
+    constant = [isinstance(r, float | bool) for r in results]
+    named = {name: r for name, r, c in zip(outputs, results, constant, strict=True) if not c}
+    return trace.code(named), [r if c else name for name, r, c in zip(outputs, results, constant, strict=True)]
+
+
+def split(values: Sequence, *sizes: int) -> list[list]:
+    """Cut a sequence into lists of the given lengths; what is left over makes the last.
+
+    Examples
+    --------
+    >>> split([1, 2, 3, 4], 1, 2)
+    [[1], [2, 3], [4]]
+    """
+    rest = iter(values)
+    return [*(list(islice(rest, n)) for n in sizes), list(rest)]
+
+
+def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
+    """Return the lines that append cosine and sine of the state's angle, if it has one."""
+    return [] if angle is None else [f"{y}{n} = math.cos({y}{angle})", f"{y}{n + 1} = math.sin({y}{angle})"]
+
+
+class Stepper:
+    """One scene's control step as lines of code.
+
+    The lines take the lifted state ``y0, y1, ...``, the control ``u``, the step ``dt``, the bound's ``x`` and the
+    scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's end.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its class and its control decide the code; its numbers do not.
+    absent : frozenset of str
+        Constants that are zero: their terms are left out of the code.
+    """
+
+    def __init__(self, scene: Scene, absent: frozenset[str]) -> None:
+        self._names, self._angle = scene.state_names, scene.angle
+        flow = scene.flow
+        terms = len(flow.coefficients._fields)
+        constants = {name: 0.0 if name in absent else f"k_{name}" for name in scene.constants()}
+        self.constants = [name for name in constants.values() if isinstance(name, str)]
+        self.start = [f"y{i}" for i in range(scene.width)]
+        self.end = [f"z{i}" for i in range(scene.width)]
+        before = [f"before{i}" for i in range(flow.size)]
+        after = [f"after{i}" for i in range(flow.size)]
+
+        def k(values: Sequence) -> SimpleNamespace:
+            return SimpleNamespace(**dict(zip(constants, values, strict=True)))
+
+        def prepare(xp: Any, *values: Any) -> list:
+            y, (u,), rest = split(values, scene.width, 1)
+            return [*scene.unpack(y, u, k(rest)), *scene.drive(y, u, k(rest), xp)]
+
+        def finish(xp: Any, *values: Any) -> Sequence:
+            moved, y, (u, dt), rest = split(values, flow.size, scene.width, 2)
+            return scene.pack(moved, y, u, dt, k(rest))
+
+        def move(xp: Any, *values: Any) -> tuple:
+            variables, coefficients, (dt,) = split(values, flow.size, terms)
+            return flow.fast(variables, flow.coefficients(*coefficients), dt)
+
+        def within(xp: Any, *values: Any) -> list:
+            variables, coefficients, (dt, x) = split(values, flow.size, terms)
+            return [flow.within(variables, flow.coefficients(*coefficients), dt, x, xp)]
+
+        given = list(constants.values())
+        names = [*before, *flow.coefficients._fields]
+        prepared, values = section("a", prepare, [*self.start, "u", *given], names)
+        finished, _ = section("c", finish, [*after, *self.start, "u", "dt", *given], self.end)
+        moved, _ = section("b", move, [*values, "dt"], after)
+        tested, (condition,) = section("w", within, [*values, "dt", "x"], ["within"])
+        if isinstance(condition, bool):
+            tested = [f"within = {condition}"]
+
+        #: Ordinary step, without a branch; ``within`` tells whether it was one.
+        self.fast = [*prepared, *tested, *moved, *finished]
+        present = tuple(not isinstance(v, float) for v in values[flow.size :])
+        call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
+        self._any = [*prepared, call, *finished]
+        self._flow = lambda: flow.compile(present)
+
+    @property
+    def arguments(self) -> str:
+        """The arguments of `advance`."""
+        return ", ".join([*self.start, "u", "dt", "x", *self.constants])
+
+    def compile(self) -> Callable:
+        """Compile ``advance(y..., u, dt, x, constants...)`` to ``(z..., status)``.
+
+        It takes any step. The status is the number of substeps, or negative where the step is refused.
+        """
+        body = [f"def advance({self.arguments}):", *self._any, f"return {', '.join(self.end)}, status"]
+        return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
+
+    def compile_simulate(self) -> Callable:
+        """Compile ``simulate(trajectory, controls, dt, x, constants...)``.
+
+        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0.
+        """
+        n = len(self._names)
+        load = [f"y{i} = trajectory[0, {i}]" for i in range(n)]
+        load += lift_lines(n, self._angle, "y")
+        loop = [
+            "u = controls[i]",
+            f"{', '.join(self.start)}, status = advance({self.arguments})",
+            "if status < 0:",
+            "    return i + 1",
+            *(f"trajectory[i + 1, {i}] = y{i}" for i in range(n)),
+        ]
+        extra = "".join(f", {name}" for name in self.constants)
+        body = [
+            f"def simulate(trajectory, controls, dt, x{extra}):",
+            *load,
+            "for i in range(controls.shape[0]):",
+            *("    " + line for line in loop),
+            "return 0",
+        ]
+        return compile_function("simulate", "\n    ".join(body) + "\n", self.compile())

@@ -1,0 +1,211 @@
+"""The rolling cylinder on a slope: both of its equations are linear, so both are stepped by their exact flow.
+
+Fixed slope
+    ``x'' = pull - drag x'``, solved by φ-functions, φ₁(z) = (e^z - 1)/z and φ₂(z) = (e^z - 1 - z)/z² [1]_::
+
+        x₁ = x + vT φ₁(-drag T) + pull T² φ₂(-drag T),   v₁ = v e^(-drag T) + pull T φ₁(-drag T)
+
+    A sum of terms without cancellation for any drag >= 0; without drag it is the quadratic.
+Turning slope
+    ``x'' = k g sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series has
+    the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|); where σ is large the
+    matrix of a short step is squared until it spans the whole one ("scaling and squaring").
+
+References
+----------
+.. [1] M. Hochbruck, A. Ostermann, "Exponential integrators", Acta Numerica 19 (2010), 209-286.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.stepping.compiling import compile_python, compile_traced
+from lag_envs.stepping.pendulum import rotate
+from lag_envs.stepping.tracing import clip, polynomial
+
+SMALL_DECAY = 0.25  # up to here the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
+_PHI2 = [(-1.0) ** k / math.factorial(k + 2) for k in range(12)]
+TURN_ORDER = 12
+SMALL_TURN = 0.25  # .25^13/13! = 2e-18
+
+
+class Pull(NamedTuple):
+    """Coefficients of the fixed slope while a control is held; a literal 0.0 drops the term."""
+
+    pull: Any  # [m/s²]
+    drag: Any = 0.0  # [1/s]
+
+
+def slide(x: Any, v: Any, force: Pull, dt: Any) -> tuple:
+    """Advance (x, x') by dt for drag·dt up to `SMALL_DECAY`."""
+    decay = force.drag * dt
+    phi2 = polynomial(_PHI2, decay) if not (isinstance(decay, float) and decay == 0.0) else 0.5
+    phi1 = 1.0 - decay * phi2
+    push = force.pull * dt
+    return x + dt * (v * phi1 + push * phi2), v * (1.0 - decay * phi1) + push * phi1
+
+
+def slides(force: Pull, dt: Any) -> Any:
+    """Tell whether `slide` is exact to rounding."""
+    return force.drag * dt <= SMALL_DECAY
+
+
+def _slide_any(x, v, pull, drag, dt, _):  # type: ignore[no-untyped-def]
+    """Advance by dt for any drag; return the state and 1, or -2 where there is no finite result."""
+    if not holds(pull, drag, dt):
+        z = drag * dt
+        if z < 1.5:  # where 1 - phi1 would cancel
+            phi2 = 0.5
+            term = 0.5
+            for k in range(3, 26):
+                term *= -z / k
+                phi2 += term
+            phi1 = 1.0 - z * phi2
+        else:
+            phi1 = -math.expm1(-z) / z
+            phi2 = (1.0 - phi1) / z
+        x, v = x + dt * (v * phi1 + pull * dt * phi2), v * math.exp(-z) + pull * dt * phi1
+    else:
+        x, v = slide(x, v, pull, drag, dt)
+    return x, v, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
+
+
+def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
+    """Return the time at which a cylinder that rolls down from x < 0 passes 0, given that it does so within dt.
+
+    Parameters
+    ----------
+    x, v : number
+        Place (below 0) and speed (not below 0) at the step's start.
+    force : Pull
+        The coefficients.
+    dt : number
+        The step.
+    xp : namespace
+        Where functions are taken from.
+
+    Notes
+    -----
+    Newton's method on the closed form, from a side on which it is monotone: where the cylinder speeds up, x(t) is
+    convex, so from the step's end; else x(t) is concave and lies below the line that it approaches, so from where
+    that line crosses.
+    """
+    drag, pull = force
+    faster = drag * v <= pull
+    line = -(drag * drag * x + (drag * v - pull)) / (drag * pull)
+    time = xp.where(faster, dt, xp.where(pull > 0.0, xp.maximum(line, 0.0), 0.0))
+    for _ in range(8):
+        z = drag * time
+        small = z <= SMALL_DECAY
+        phi1 = xp.where(small, 1.0 - z * polynomial(_PHI2, z), (1.0 - xp.exp(-z)) / z)
+        phi2 = xp.where(small, polynomial(_PHI2, z), (1.0 - phi1) / z)
+        place = x + time * (v * phi1 + pull * time * phi2)
+        speed = v * (1.0 - z * phi1) + pull * time * phi1
+        time = clip(time - place / speed, 0.0, dt, xp)
+    return time
+
+
+@lru_cache(maxsize=None)
+def compile_slide(present: tuple[bool, ...]) -> Callable:
+    """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative where it is refused."""
+
+    def force(*coefficients: Any) -> Pull:
+        return Pull(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
+
+    fast = compile_traced("slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, force(p, d), dt))
+    holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(force(p, d), dt),))
+    return compile_python("flow", _slide_any, fast, holds)
+
+
+class Turn(NamedTuple):
+    """Coefficients of the turning slope while a control is held."""
+
+    rolling: Any  # k
+    gravity: Any  # [m/s²]
+    drag: Any  # [1/s]
+    rate: Any  # Ω [rad/s]
+
+
+def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+    """Advance (x, x') by the Taylor series; (c, s) are cosφ and sinφ at the start."""
+    rate = turn.rate * h
+    carry = turn.rolling * (rate * rate)
+    weight = turn.rolling * turn.gravity * (h * h)
+    drag = turn.drag * h
+    X, V, S, C = [x], [h * v], [weight * s], [weight * c]
+    for k in range(TURN_ORDER):
+        V.append((carry * X[k] + S[k] - drag * V[k]) * (1.0 / (k + 1)))
+        X.append(V[k] * (1.0 / (k + 1)))
+        S.append(rate * C[k] * (1.0 / (k + 1)))
+        C.append(rate * S[k] * (-1.0 / (k + 1)))
+    dx, dv = X[TURN_ORDER], V[TURN_ORDER]
+    for k in range(TURN_ORDER - 1, 0, -1):
+        dx, dv = dx + X[k], dv + V[k]
+    return x + dx, v + dv * (1.0 / h)
+
+
+def turns(turn: Turn, h: Any, xp: Any) -> Any:
+    """Tell whether one step of the series is exact to rounding."""
+    return _growth(turn.rolling, turn.drag, turn.rate, h, xp) <= SMALL_TURN
+
+
+def _growth(rolling: Any, drag: Any, rate: Any, h: Any, xp: Any) -> Any:
+    # rolling = 1/(1 + κ) lies below 1, so its root does too.
+    return h * (2.0 * drag + 3.0 * xp.abs(rate))
+
+
+def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[no-untyped-def]
+    """Advance by dt for any coefficients; return x, x', the angle's cos and sin, and 1 or -2."""
+    doublings = 0
+    h = dt
+    growth = dt * (2.0 * drag + 3.0 * abs(rate))
+    while growth > SMALL_TURN and doublings < 60:
+        growth *= 0.5
+        h *= 0.5
+        doublings += 1
+    if doublings == 0:
+        x, v = series(x, v, c, s, rolling, gravity, drag, rate, h)
+        c, s = turn_pair(c, s, rate * h)
+        return x, v, c, s, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
+    # Rows (x, x'), columns (x, x', cos, sin): the matrix of a short step, from its effect on unit vectors.
+    m = np.empty((2, 4))
+    m[0, 0], m[1, 0] = series(1.0, 0.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 1], m[1, 1] = series(0.0, 1.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 2], m[1, 2] = series(0.0, 0.0, 1.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 3], m[1, 3] = series(0.0, 0.0, 0.0, 1.0, rolling, gravity, drag, rate, h)
+    for i in range(doublings):
+        angle = rate * (dt * 0.5 ** (doublings - i))
+        p, q = math.cos(angle), math.sin(angle)
+        a = m.copy()
+        for r in range(2):
+            m[r, 0] = a[r, 0] * a[0, 0] + a[r, 1] * a[1, 0]
+            m[r, 1] = a[r, 0] * a[0, 1] + a[r, 1] * a[1, 1]
+            m[r, 2] = a[r, 0] * a[0, 2] + a[r, 1] * a[1, 2] + a[r, 2] * p + a[r, 3] * q
+            m[r, 3] = a[r, 0] * a[0, 3] + a[r, 1] * a[1, 3] - a[r, 2] * q + a[r, 3] * p
+    x, v = m[0, 0] * x + m[0, 1] * v + (m[0, 2] * c + m[0, 3] * s), m[1, 0] * x + m[1, 1] * v + (m[1, 2] * c + m[1, 3] * s)
+    p, q = math.cos(rate * dt), math.sin(rate * dt)
+    c, s = c * p - s * q, s * p + c * q
+    r = 1.5 - 0.5 * (c * c + s * s)
+    return x, v, c * r, s * r, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
+
+
+@lru_cache(maxsize=None)
+def compile_turn(present: tuple[bool, ...]) -> Callable:
+    """Compile ``flow(x, v, c, s, rolling, gravity, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
+
+    def turn(*coefficients: Any) -> Turn:
+        return Turn(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
+
+    series = compile_traced(
+        "series",
+        "x, v, c, s, rolling, gravity, drag, rate, h",
+        lambda xp, x, v, c, s, *rest: turn_series(x, v, c, s, turn(*rest[:4]), rest[4]),
+    )
+    pair = compile_traced("turn_pair", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
+    return compile_python("flow", _turn_any, series, pair, SMALL_TURN=SMALL_TURN)

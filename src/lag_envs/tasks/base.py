@@ -1,0 +1,161 @@
+"""What a task adds to a scene: start, control, reward, ending, observation."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.scenes.base import Scene, check_number
+from lag_envs.stepping import pendulum
+
+#: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
+FASTEST_START = 100.0
+
+
+class Task(ABC):
+    """A task on a scene.
+
+    A subclass says what its class attributes and abstract methods ask for. Formulas follow the same
+    rules as a scene's: numbers in, ``+ - * /`` and `xp`, numbers out. ``y`` is the lifted state before the step, ``z`` the
+    one after it, ``u`` the control that was applied, ``g`` the target, ``k`` the constants by name.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Control interval [s]. The episode keeps its seconds, not its steps.
+    duration : float, optional
+        Length of an episode [s]; infinity for one without an end.
+    target : float, optional
+        A fixed target in place of a random one, for tasks that have one.
+    **parameters
+        Parameters of the scene.
+    """
+
+    scene_type: ClassVar[type[Scene]]
+    #: Parameters of the scene that differ from its own defaults.
+    defaults: ClassVar[dict[str, Any]] = {}
+    #: Control interval [s] and steps of an episode.
+    interval: ClassVar[float] = 0.02
+    steps: ClassVar[int] = 500
+    #: Names of the observation's entries.
+    observation: ClassVar[tuple[str, ...]]
+    #: Random targets lie in [-target_range, target_range]; None for a task without target.
+    target_range: ClassVar[float | None] = None
+    #: Random numbers that one step's kick uses, at most 16.
+    draws: ClassVar[int] = 0
+
+    def __init__(
+        self, *, dt: float | None = None, duration: float | None = None, target: float | None = None, **parameters: Any
+    ) -> None:
+        known = {f.name for f in dataclasses.fields(self.scene_type)}
+        unknown = sorted(set(parameters) - known)
+        if unknown:
+            options = [*sorted(known), "dt", "duration", *(["target"] if self.target_range is not None else [])]
+            raise TypeError(f"unknown keyword {unknown[0]!r}; this environment takes {', '.join(options)}")
+        self.scene = self.scene_type(**(self.defaults | parameters))
+        self.dt = self.interval if dt is None else check_number("dt", dt, "s")
+        if not 1e-6 <= self.dt <= 1.0:
+            raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
+        seconds = self.interval * self.steps if duration is None else duration
+        if isinstance(seconds, bool | str) or not seconds >= self.dt:
+            raise ValueError(f"duration must be at least dt={self.dt:g} s, got {seconds!r}")
+        self.duration = float(seconds)
+        self.target = None if target is None else self.check_target(target)
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError where the parameters do not fit the task."""
+
+    @property
+    def limit(self) -> float:
+        """Steps of an episode; infinity for one without an end."""
+        return self.duration if math.isinf(self.duration) else float(round(self.duration / self.dt))
+
+    def constants(self) -> dict[str, float]:
+        """Return what the compiled step needs: the scene's constants, the task's, and those of the stepping."""
+        own = {name: float(value) for name, value in self.numbers().items()}
+        stepping = {"scale": self.dt / self.interval, "limit": self.limit}
+        return self.scene.constants() | own | stepping
+
+    @property
+    def largest_x(self) -> float:
+        """The bound's x up to which one step is certified."""
+        return pendulum.largest_x(self.dt, self.scene.order)
+
+    def check_target(self, target: Any) -> float:
+        """Return the target as float, or raise a ValueError."""
+        if self.target_range is None:
+            raise ValueError(f"this task has no target, got target={target!r}")
+        return check_number("target", target)
+
+    def check_start(self, state: ArrayLike) -> NDArray[np.float64]:
+        """Return a start given by hand as float64 array, or raise a ValueError where the task cannot start there."""
+        array = self.scene.check_state(state)
+        for name, unit, value in zip(self.scene.state_names, self.scene.state_units, array, strict=True):
+            if unit.endswith("/s") and abs(value) > FASTEST_START:
+                raise ValueError(f"{name} must lie within ±{FASTEST_START:g} {unit} at the start, got {value:g} {unit}")
+        self.check_safe(array)
+        return array
+
+    def check_safe(self, state: NDArray[np.float64]) -> None:
+        """Raise ValueError for a start outside the set in which the episode goes on."""
+
+    # --- what a task defines --------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def start(self) -> Sequence[float]:
+        """Half widths of the box around `centre` from which the state starts."""
+
+    @property
+    def centre(self) -> Sequence[float]:
+        """Centre of the box from which the state starts."""
+        return [0.0] * len(self.scene.state_names)
+
+    @abstractmethod
+    def numbers(self) -> dict[str, float]:
+        """Return the constants that the task's formulas need."""
+
+    @abstractmethod
+    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+        """Return the control for an action in [-1, 1]."""
+
+    @abstractmethod
+    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+        """Return the step's reward."""
+
+    def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+        """Return the reward of the step that terminates, or None where it is like any other."""
+        return None
+
+    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+        """Tell whether the episode has come to its end."""
+        return False
+
+    def kick(self, z: Sequence, draws: Sequence, k: Any, xp: Any) -> Sequence:
+        """Return the lifted state after a random kick; draws lie in [0, 1)."""
+        return z
+
+    @abstractmethod
+    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+        """Return the observation's entries."""
+
+    @abstractmethod
+    def bounds(self) -> Sequence[float]:
+        """Return for each entry of the observation a bound on its size, proved for every start that is accepted."""
+
+
+def finite(bound: float) -> float:
+    """Return the bound, or the largest float32 where the episode has no end and so no bound exists."""
+    return min(bound, float(np.finfo(np.float32).max))
+
+
+def kick_chance(task: Task, chance: float) -> float:
+    """Return the chance of a kick in one step such that a second has as many as at the task's own interval."""
+    return -math.expm1(task.dt / task.interval * math.log1p(-chance))

@@ -1,0 +1,169 @@
+"""Roll a cylinder to a mark by tilting its plane; let it cross a line slowly by braking."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.scenes import Incline
+from lag_envs.stepping import slope
+from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.base import FASTEST_START, Task, finite
+
+
+class Tilt(Task):
+    """Roll a cylinder to a mark on a plane by tilting it, and stop there."""
+
+    scene_type = Incline
+    defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
+    interval, steps = 0.05, 200
+    target_range = 0.3
+    edge = 0.5
+    largest_tilt = 0.1
+
+    def check(self) -> None:
+        """Refuse the damping control."""
+        if self.scene.control == "damping":
+            raise ValueError("this task is controlled by 'tilt_rate' or 'tilt', got control='damping'")
+
+    @property
+    def quasi_static(self) -> bool:
+        """Whether the tilt itself is the control."""
+        return self.scene.control == "tilt"
+
+    @property
+    def observation(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Names of the observation's entries."""
+        return (*self.scene.state_names, "target")
+
+    @property
+    def limit_control(self) -> float:
+        """Largest tilt [rad], or largest rate [rad/s]."""
+        return self.largest_tilt if self.quasi_static else 0.3
+
+    @property
+    def start(self) -> Sequence[float]:
+        """Anywhere near, slowly rolling."""
+        return [0.4, 0.3] if self.quasi_static else [0.4, 0.3, 0.05]
+
+    def numbers(self) -> dict[str, float]:
+        """Return the limits."""
+        return {"limit_control": self.limit_control, "largest_tilt": self.largest_tilt}
+
+    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+        """Return U·a, cut back so that the tilt stays within its limit at the step's end."""
+        wanted = k.limit_control * a
+        if self.quasi_static:
+            return wanted
+        return clip(wanted, (-k.largest_tilt - y[2]) / dt, (k.largest_tilt - y[2]) / dt, xp)
+
+    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+        """Return exp(-((x - x*)/0.1)²) - 0.02 (u/U)²."""
+        off = 10.0 * (z[0] - g)
+        effort = u * (1.0 / k.limit_control)
+        return k.scale * (xp.exp(-(off * off)) - 0.02 * (effort * effort))
+
+    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+        """Tell whether the cylinder has left the plane."""
+        return xp.abs(z[0]) > self.edge
+
+    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+        """Return the state and the target."""
+        return [*z[: len(self.scene.state_names)], g]
+
+    def bounds(self) -> Sequence[float]:
+        """Return bounds: within the edges |w'| <= k (g sin(tilt) + |x| rate²) + drag R rate, and drag only slows."""
+        k = self.scene.constants()
+        rate = 0.0 if self.quasi_static else self.limit_control
+        radius = self.scene.radius
+        reach = self.edge + 1.0
+        gravity = k["pull"] if self.quasi_static else k["rolling"] * k["field"]
+        push = gravity * math.sin(self.largest_tilt) + reach * rate * rate + k["drag"] * radius * rate
+        speed = FASTEST_START + radius * rate + push * self.duration
+        state = [self.edge + speed * self.dt, speed]
+        return [finite(b) for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), 1e3)]
+
+    def check_target(self, target: Any) -> float:
+        """Refuse a target off the plane."""
+        target = super().check_target(target)
+        if abs(target) > self.edge:
+            raise ValueError(f"target must lie on the plane, within ±{self.edge} m, got {target:g} m")
+        return target
+
+    def check_safe(self, state: NDArray[np.float64]) -> None:
+        """Refuse a start off the plane or beyond the largest tilt."""
+        if abs(state[0]) > self.edge:
+            raise ValueError(f"the episode would be over at x={state[0]:g} m: |x| must be at most {self.edge} m")
+        if not self.quasi_static and abs(state[2]) > self.largest_tilt:
+            raise ValueError(f"phi must lie within ±{self.largest_tilt} rad, got {state[2]:g} rad")
+
+
+class Brake(Task):
+    """Let a cylinder roll down to a line by braking it: cross slowly, but soon."""
+
+    scene_type = Incline
+    defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
+    observation = ("distance", "v")
+    limit_control = 6.0
+    gentle = 0.5
+
+    def check(self) -> None:
+        """Refuse the other controls, and a slope on which the cylinder would not roll down."""
+        if self.scene.control != "damping":
+            raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
+        if self.scene.tilt < 0.0:
+            raise ValueError(f"tilt must be at least 0 rad for the cylinder to roll down, got {self.scene.tilt:g} rad")
+
+    @property
+    def centre(self) -> Sequence[float]:
+        """Two metres before the line, which is at x = 0."""
+        return [-2.0, 0.5]
+
+    @property
+    def start(self) -> Sequence[float]:
+        """One to three metres away, at 0 to 1 m/s."""
+        return [1.0, 0.5]
+
+    def numbers(self) -> dict[str, float]:
+        """Return the strongest brake."""
+        return {"limit_control": self.limit_control}
+
+    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+        """Return the drag coefficient, from 0 (a = -1) to its largest (a = 1)."""
+        return k.limit_control * (0.5 + 0.5 * a)
+
+    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+        """Return minus the time that the step takes."""
+        return -dt
+
+    def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+        """Return minus the time to the line, and -5 (v - v_s)₊ with the speed v there."""
+        force = self.scene.drive(y, u, k, xp)
+        time = slope.crossing_time(y[0], y[1], force, dt, xp)
+        # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
+        speed = y[1] + force.pull * time + force.drag * y[0]
+        return -time - 5.0 * xp.maximum(speed - self.gentle, 0.0)
+
+    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+        """Tell whether the line has been crossed."""
+        return z[0] >= 0.0
+
+    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+        """Return distance to the line and speed."""
+        return [-z[0], z[1]]
+
+    def bounds(self) -> Sequence[float]:
+        """Return bounds; a start may lie at most 1000 m away."""
+        speed = FASTEST_START + self.scene.constants()["pull"] * self.duration
+        return [finite(1e3 + speed * self.duration), finite(speed)]
+
+    def check_safe(self, state: NDArray[np.float64]) -> None:
+        """Refuse a start beyond the line, or uphill."""
+        if not -1e3 <= state[0] < 0.0:
+            raise ValueError(f"x must lie before the line at 0 m, at -1000 m or later, got {state[0]:g} m")
+        if state[1] < 0.0:
+            raise ValueError(f"x_dot must be at least 0 m/s, got {state[1]:g} m/s")

@@ -1,0 +1,68 @@
+"""The core stands alone: what it installs, and what importing it loads."""
+
+import json
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+OPTIONAL = ["matplotlib", "mpmath", "pygame", "scipy", "sympy", "torch"]
+
+STEP = """
+import gymnasium as gym
+import lag_envs
+
+env = gym.make("PivotedBar-v0")
+env.reset(seed=1)
+for _ in range(3):
+    observation, *_ = env.step(env.action_space.sample())
+assert env.observation_space.contains(observation)
+
+vec = gym.make_vec("PivotedBar-v0", num_envs=3)
+vec.reset(seed=1)
+observations, *_ = vec.step(vec.action_space.sample())
+assert vec.observation_space.contains(observations)
+"""
+LOADED = f"""
+import json, sys
+print(json.dumps([name for name in {OPTIONAL} if name in sys.modules]))
+"""
+INSTALLED = f"""
+import importlib.util, json
+print(json.dumps([name for name in {OPTIONAL} if importlib.util.find_spec(name)]))
+"""
+
+
+def run(*command, cwd):
+    """Run a command outside the repository and return what it printed."""
+    done = subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, f"{command[0]} failed ({done.returncode}):\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+# Numba looks for SciPy when it is imported, so a step may load it, an import of the package may not.
+@pytest.mark.parametrize(
+    ("script", "allowed"), [("import lag_envs", set()), (STEP, {"scipy"})], ids=["import", "step"]
+)
+def test_optional_packages_are_not_loaded(script, allowed, tmp_path):
+    loaded = json.loads(run(sys.executable, "-W", "error", "-c", script + LOADED, cwd=tmp_path))
+    assert set(loaded) <= allowed
+
+
+def test_core_alone_can_be_installed_and_stepped(tmp_path):
+    home = tmp_path / "venv"
+    venv.create(home)  # without pip, which takes seconds to install: ours installs from outside
+    python = home / ("Scripts" if sys.platform == "win32" else "bin") / "python"
+    pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
+    try:
+        run(*pip, "install", "--quiet", "-c", ROOT / "constraints.txt", ROOT, cwd=tmp_path)
+    except AssertionError as failure:
+        needs = "a package index, or to be told where wheels of the core's dependencies and of hatchling are"
+        pytest.fail(f"pip could not install the core into a fresh environment; it needs {needs}.\n{failure}")
+
+    # -I keeps the surrounding environment's PYTHONPATH out.
+    assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
+    assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
