@@ -3,11 +3,16 @@
 A program records the formulas of a task and its scene as lines of code and prints them into a few functions. All
 keep one order within a step: control, held step, reward and ending, kick, observation.
 
-Memory of one environment is a column of numbers, its rows: lifted state ``y``, lifted state after the step ``z``, target
-``g``, control ``u``, reward ``r``, steps taken ``n``, ``over`` (1 terminated + 2 truncated), ``within`` (whether the step was an
-ordinary one), observation ``o``. A batch is cut into blocks of 64 environments, and the rows of a block lie behind one
-another at distances known when compiling. So the compiler sees that rows do not overlap, and turns each loop
-over a block into vector instructions; with one array per row it would give up on proving that.
+Memory of one environment is a column of numbers, its rows. Kept from step to step: lifted state ``y``, target ``g`` where
+there is one, control ``u``, steps taken ``n`` (in a batch, where the episode is over, minus the kind of its end: 1
+terminated, 2 truncated, 3 both). Needed within a step: lifted state at its end ``z``, reward ``r``, kind of end ``over``,
+whether the step was an ``ordinary`` one (1; 0 special; 2 none but a restart), observation ``o``.
+
+A batch is cut into blocks of 64 environments. A block's kept rows are copied to one place of work, stepped, and copied
+back. There rows lie behind one another at distances known when compiling, so the compiler sees that they do not
+overlap and turns the loop over a block into vector instructions; with one array per row it gives up on proving that.
+Rows needed within a step exist only there and stay in the processor's nearest cache: with many environments,
+moving memory is half of the time.
 """
 
 from __future__ import annotations
@@ -53,14 +58,17 @@ class Program:
         self.varying = [name for name in self.constants if name in varying]
         self.y, self.z = self._stepper.start, self._stepper.end
         self.o = [f"o{i}" for i in range(len(task.observation))]
-        k_rows = [f"k_{name}" for name in self.varying]
-        #: Names of the rows, in order.
-        self.rows = [*self.y, *self.z, "g", "u", "r", "n", "over", "within", *self.o, *k_rows]
+        self.g = ["g"] if task.target_range is not None else []
+        #: Names of the rows that are kept from step to step, and of those that are needed within one.
+        self.kept = [*self.y, *self.g, "u", "n", *(f"k_{name}" for name in self.varying)]
+        self.scratch = [*self.z, "a", "r", "over", "ordinary", *self.o]
         self._record(task, {name: 0.0 if name in absent else f"k_{name}" for name in names})
 
     def _record(self, task: Task, constants: dict[str, Any]) -> None:
         scene, width = task.scene, task.scene.width
-        states, given = len(scene.state_names), list(constants.values())
+        self.n_state = states = len(scene.state_names)
+        given = list(constants.values())
+        g = self.g or [0.0]
 
         def k(values: Sequence) -> SimpleNamespace:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
@@ -87,24 +95,24 @@ class Program:
             return task.observe(y, g, k(rest))
 
         def start(xp: Any, *values: Any) -> list:
-            draws, rest = split(values, states + 1)
+            draws, rest = split(values, states + len(self.g))
             numbers = vars(k(rest))
             state = [numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)]
-            return [*state, (task.target_range or 0.0) * (2.0 * draws[states] - 1.0)]
+            return [*state, *(task.target_range * (2.0 * draw - 1.0) for draw in draws[states:])]
 
         clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
         self.control = clip + _lines("p", control, ["a", *self.y, *given], ["u"])
         self.fast = [f"dt = {constants['dt']}", f"x = {constants['x']}", *self._stepper.fast]
-        self.judge = _lines("q", judge, ["u", "g", *self.y, *self.z, *given], ["r", "over"])
+        self.judge = _lines("q", judge, ["u", *g, *self.y, *self.z, *given], ["r", "over"])
         has_last = type(task).last_reward is not Task.last_reward
-        self.last = _lines("l", last, ["u", "g", *self.y, *self.z, *given], ["r"]) if has_last else []
+        self.last = _lines("l", last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
         draws, kicked = [f"draw{i}" for i in range(task.draws)], [f"e{i}" for i in range(width)]
         self.kick = _draw(draws, "np.uint64(n)") + _lines("h", kick, [*draws, *self.z, *given], kicked) if draws else []
-        self.move = [f"{a} = {b}" for a, b in zip(self.y, kicked if draws else self.z, strict=True)]
-        self.observe = _lines("v", observe, ["g", *self.y, *given], self.o)
-        draws, names = [f"draw{i}" for i in range(states + 1)], [f"s{i}" for i in range(states + 1)]
+        self.moved = kicked if draws else self.z
+        self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
+        self.observe = _lines("v", observe, [*g, *self.y, *given], self.o)
+        draws, names = ([f"{name}{i}" for i in range(states + len(self.g))] for name in ("draw", "s"))
         self.sample = _draw(draws, "np.uint64(0)") + _lines("s", start, [*draws, *given], names)
-        self.n_state = states
         self.lift = lift_lines(states, scene.angle, "y")
 
     # --- one environment: rows, then constants, in one array --------------------------------------------------
@@ -114,7 +122,7 @@ class Program:
         """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the control stored."""
         at = self._at_one
         body = [
-            *self._constants_one(), *_load(at, [*self.y, "g", "n"]),
+            *self._constants_one(), *_load(at, [*self.y, *self.g, "n"]),
             *self.control, *_store(at, ["u"]), *self.fast,
             "if not within:", f"    return 0.0, {SLOW}",
             *self._finish_one(),
@@ -124,17 +132,17 @@ class Program:
     @cached_property
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step whose rows ``z`` were filled in by `advance`."""
-        rows = _load(self._at_one, [*self.y, *self.z, "g", "u", "n"])
+        rows = _load(self._at_one, [*self.y, *self.z, *self.g, "u", "n"])
         return _function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
 
     @cached_property
     def start_one(self) -> Callable:
         """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling what is not given."""
-        rows = [*self.y[: self.n_state], "g"]
+        rows = [*self.y[: self.n_state], *self.g]
         body = [
             *self._constants_one(), *_load(self._at_one, rows),
             *_next_episode("0", "1", "2"), *self._start, *self.observe,
-            *_store(self._at_one, [*self.y, "g", "n", "over"]),
+            *_store(self._at_one, [*self.y, *self.g, "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return _function("start_one", "f, obs, ids, state_given, target_given", body)
@@ -150,17 +158,18 @@ class Program:
         return [name.removeprefix("k_") for name in self._stepper.constants]
 
     def _at_one(self, row: str) -> str:
-        return f"f[{self.rows.index(row)}]"
+        return f"f[{(self.kept + self.scratch).index(row)}]"
 
     def _constants_one(self) -> list[str]:
-        return [f"k_{name} = f[{len(self.rows) + j}]" for j, name in enumerate(self.uniform)]
+        first = len(self.kept + self.scratch)
+        return [f"k_{name} = f[{first + j}]" for j, name in enumerate(self.uniform)]
 
     def _finish_one(self) -> list[str]:
         return [
             *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
             "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
-            *self.observe, *_store(self._at_one, [*self.y, "n", "over"]),
+            *self.observe, *_store(self._at_one, [*self.y, "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
             "return r, np.int64(over)",
         ]  # fmt: skip
@@ -170,8 +179,8 @@ class Program:
         return [
             *self.sample,
             "if not state_given:", *_indent([f"y{i} = s{i}" for i in range(self.n_state)]),
-            "if not target_given:", f"    g = s{self.n_state}",
-            *self.lift, "n = 0.0", "over = 0.0",
+            *(["if not target_given:", f"    g = s{self.n_state}"] if self.g else []),
+            *self.lift, "n = 0.0",
         ]  # fmt: skip
 
     # --- a batch: blocks of rows of 64 environments -----------------------------------------------------------
@@ -186,47 +195,45 @@ class Program:
         """
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
-        call = ", ".join([*y, "u", "k_dt", "k_x", *self._stepper.constants])
-        step = [
-            *_load(_at, [*varying, *y]), "a = action[first + i]", *self.control, *self.fast,
-            "slow += not within", "ordinary = select(within, 1.0, 0.0)",
-            *_store(_at, [*z, "u"]), f"{_at('within')} = ordinary",
+        inputs = _load(_at, [*varying, *y, *self.g, "n"])
+        results = ["n", "over", "r", "ordinary", *self.o]
+        key = ["key = ids[last + first + i]"] if self.kick else []
+        # Where the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
+        special = " and not over > 0.0" if self.last else ""
+        main = [
+            *inputs, f"a = {_at('a')}", *self.control, *self.fast,
+            "again = n < 0.0", "restarts += again", *self.judge,
+            f"plain = within{special}", "slow += not plain", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
+            "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
+            *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
+            "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
+            *self.observe, *_store(_at, [*y, "u", *results]),
         ]  # fmt: skip
+        call = ", ".join([*y, "u", "k_dt", "k_x", *self._stepper.constants])
         redo = [
-            f"if {_at('within')} == 0.0 and {_at('over')} == 0.0:",
+            f"if {_at('ordinary')} == 0.0:",
             *_indent([
-                *_load(_at, [*varying, *y, "u"]),
+                *inputs, f"u = {_at('u')}",
                 f"{', '.join(z)}, status = advance({call})",
                 "if status < 0:",
                 "    refused = first + i + np.uint64(1)",
-                f"    {_at('n')} -= 1.0",
-                *_indent([f"{b} = {a}" for a, b in zip(y, z, strict=True)]),
-                *_store(_at, z),
+                "else:",
+                *_indent([
+                    *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+                    "n = n + 1.0",
+                    "if n >= k_limit:", "    over = over + 2.0",
+                    "if over > 0.0:", "    n = -over",
+                    *key, *self.kick, *self.move, *self.observe, *_store(_at, [*y, "n", "over", "r", *self.o]),
+                ]),
             ]),
         ]  # fmt: skip
-        judge = [
-            *_load(_at, [*varying, *y, *z, "g", "u", "n"]),
-            f"before = {_at('over')}", "restarts += before > 0.0", f"{_at('within')} = before",
-            *self.judge, *_store(_at, ["r"]),
-        ]  # fmt: skip
-        finish = [
-            "n = n + 1.0", *(["key = ids[last + first + i]"] if self.kick else []), *self.kick, *self.move,
-            "over = select(n >= k_limit, over + 2.0, over)",
-            *self.observe, *_store(_at, [*y, "n", "over", *self.o]),
-        ]  # fmt: skip
-        if self.last:
-            again = _load(_at, [*varying, *y, *z, "g", "u", "n", "over"])
-            end = [f"if {_at('over')} > 0.0:", *_indent([*again, *self.last, *_store(_at, ["r"])])]
-            middle = [*_block(lane, [*judge, *_store(_at, ["over"])]), *_block(lane, end), *_block(lane, [*again, *finish])]
-        else:
-            middle = _block(lane, [*judge, *finish])
         restart = [
-            f"if {_at('within')} > 0.0:",
+            f"if {_at('ordinary')} == 2.0:",
             *_indent([
-                *_load(_at, [*varying, "g"]),
+                *_load(_at, [*varying, *self.g]),
                 *_next_episode("first + i", "second + first + i", "last + first + i"),
-                "state_given = False", *self._start, "r = 0.0", *self.observe,
-                *_store(_at, [*y, "g", "n", "over", "r", *self.o]),
+                "state_given = False", *self._start, "r = 0.0", "over = 0.0", *self.observe,
+                *_store(_at, [*y, *self.g, "n", "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
@@ -245,14 +252,18 @@ class Program:
             "        if not (abs(action[i]) < math.inf):",
             "            return -(i + 1), 0",
             "overs, refused = 0, np.uint64(0)",
-            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            f"blocks = np.uint64((count + {BLOCK - 1}) // {BLOCK})",
+            f"width = np.uint64({BLOCK * len(self.kept)})", "work = blocks * width",
+            "for block in range(blocks):",
             *_indent([
                 *self._block_start(),
                 "slow, restarts = 0, 0",
-                *_block(lane, step), "if slow > 0:", *_indent(_block(lane, redo)),
-                *middle,
+                *_block("for i in range(width):", ["f[work + i] = f[base + i]"]),
+                *_block(lane, [f"{_at('a')} = action[first + i]"]),
+                *_block(lane, main), "if slow > 0:", *_indent(_block(lane, redo)),
                 "if restarts > 0:", *_indent(_block(lane, restart)),
                 *_block(lane, output),
+                *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
             ]),
             "return np.int64(refused), overs",
         ]  # fmt: skip
@@ -260,30 +271,41 @@ class Program:
 
     @cached_property
     def start_all(self) -> Callable:
-        """``start_all(f, ids, par, obs, mask, state_given, target_given, count)``: begin episodes where the mask is set."""
+        """``start_all(f, ids, par, obs, mask, whole, state_given, target_given, count)``.
+
+        Begins episodes where the mask is set. Writes their observations, and with `whole` everybody's.
+        """
         varying = [f"k_{name}" for name in self.varying]
         start = [
-            "if mask[first + i]:",
+            "if mask[first + i] or whole:",
             *_indent([
-                *_load(_at, [*varying, *self.y[: self.n_state], "g"]),
-                *_next_episode("first + i", "second + first + i", "last + first + i"),
-                *self._start, *self.observe, *_store(_at, [*self.y, "g", "n", "over", *self.o]),
+                *_load(_at, [*varying, *self.y, *self.g, "n"]),
+                "if mask[first + i]:",
+                *_indent([*_next_episode("first + i", "second + first + i", "last + first + i"), *self._start]),
+                *self.observe, *_store(_at, [*self.y, *self.g, "n"]), *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip
         body = [
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            *_indent([*self._block_start(), *_block("for i in range(size):", [*start, *_observations(self.o)])]),
+            f"blocks = np.uint64((count + {BLOCK - 1}) // {BLOCK})",
+            f"width = np.uint64({BLOCK * len(self.kept)})", "work = blocks * width",
+            "for block in range(blocks):",
+            *_indent([
+                *self._block_start(),
+                *_block("for i in range(width):", ["f[work + i] = f[base + i]"]),
+                *_block("for i in range(size):", start),
+                *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
+            ]),
         ]  # fmt: skip
-        return _function("start_all", "f, ids, par, obs, mask, state_given, target_given, count", body)
+        return _function("start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body)
 
     def _block_start(self) -> list[str]:
         # Unsigned, since a signed index might be negative, which NumPy's rules make a branch.
-        rows = [f"row_{row} = base + np.uint64({j * BLOCK})" for j, row in enumerate(self.rows)]
         return [
             f"first = block * np.uint64({BLOCK})", f"size = min(np.uint64({BLOCK}), second - first)",
-            f"base = block * np.uint64({BLOCK * len(self.rows)})", *rows,
+            "base = block * width",
+            *(f"row_{row} = work + np.uint64({j * BLOCK})" for j, row in enumerate(self.kept + self.scratch)),
         ]  # fmt: skip
 
 
@@ -291,10 +313,10 @@ def _at(row: str) -> str:
     return f"f[row_{row} + i]"
 
 
-def _observations(names: Sequence[str]) -> list[str]:
-    """Copy the rows of the observation to the batch's array."""
+def _observations(names: Sequence[str], value: str = _at("{}")) -> list[str]:
+    """Put the observation's numbers into the batch's array."""
     place = f"(first + i) * np.uint64({len(names)})"
-    return [f"obs[{place} + np.uint64({j})] = {_at(o)}" for j, o in enumerate(names)]
+    return [f"obs[{place} + np.uint64({j})] = {value.format(o)}" for j, o in enumerate(names)]
 
 
 def _next_episode(key: str, episode: str, episode_key: str) -> list[str]:

@@ -63,11 +63,11 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
         constants = constants_of(self.task)
         self._program = program = Program(self.task, absent=absent([constants]))
-        self._rows = np.zeros(len(program.rows) + len(program.uniform))
-        self._rows[len(program.rows) :] = [constants[name] for name in program.uniform]
+        rows = program.kept + program.scratch
+        self._rows = np.array([0.0] * len(rows) + [constants[name] for name in program.uniform])
         #: Key of the seed, number of the episode, key of the episode.
         self._ids = np.zeros(3, dtype=np.uint64)
-        self._row = {name: j for j, name in enumerate(program.rows)}
+        self._row = {name: j for j, name in enumerate(rows)}
         self._size = len(self.task.observation)
         self._ready = False
         self._started = False
@@ -109,7 +109,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         given_target = self.task.target if target is None else self.task.check_target(target)
         super().reset(seed=seed)
         if seed is not None:
-            self._ids[:2] = seed, 0
+            self._ids[:2] = int(seed) % 2**64, 0
         elif not self._started:
             self._ids[:2] = self.np_random.integers(2**63), 0
         self._started = True
@@ -147,7 +147,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         StepRefused
             Where the step cannot be taken to full accuracy. In each case the environment stays as it was.
         """
-        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind == "f":
+        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
             a = action.item()
         else:
             a = one_action(action)

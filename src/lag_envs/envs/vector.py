@@ -106,7 +106,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         program = self._program
         self._par = np.array([self._constants[0][name] for name in program.uniform])
         blocks = -(-self.num_envs // BLOCK)
-        self._memory = np.zeros(blocks * len(program.rows) * BLOCK)
+        self._memory = np.zeros(((blocks + 1) * len(program.kept) + len(program.scratch)) * BLOCK)
         #: Keys of the seeds, numbers of the episodes, keys of the episodes.
         self._ids = np.zeros(3 * self.num_envs, dtype=np.uint64)
         self._lanes = np.arange(self.num_envs)
@@ -123,7 +123,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         first = self._constants[0]
         varying = frozenset(name for name in first if any(c[name] != first[name] for c in self._constants))
         self._program = Program(self.task, absent(self._constants), varying)
-        self._row = {name: j for j, name in enumerate(self._program.rows)}
+        self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers: list[Any] = []
 
     # --- Gymnasium's interface --------------------------------------------------------------------------------
@@ -166,11 +166,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._started and not mask.all():
             raise ResetNeeded("the first reset must reset every environment, got a reset_mask that leaves some out")
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
-        if seed is None and not self._started:
+        if not self._started:
             self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
         for i, s in seeds:
             if mask[i]:
-                self._ids[i], self._ids[self.num_envs + i] = s, 0
+                self._ids[i], self._ids[self.num_envs + i] = s % 2**64, 0
         if state is not None:
             for j, column in enumerate(state.T):
                 self._write(f"y{j}", lanes, column)
@@ -178,10 +178,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._write("g", lanes, target)
         elif self._targets_given:
             self._write("g", lanes, np.array([self._tasks[i].target for i in lanes]))
-        observations = self._start(mask, state is not None, target is not None or self._targets_given)
+        observations = np.empty((self.num_envs, len(self._program.o)), dtype=np.float32)
+        self._start(observations, mask, True, state is not None, target is not None or self._targets_given)
         self._write("u", lanes, 0.0)
         self._started = True
-        self._over = int(np.count_nonzero(self._read("over")))
+        self._over = int(np.count_nonzero(self._read("n") < 0.0))
         return observations, self._infos(mask)
 
     def step(
@@ -213,24 +214,26 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._started:
             raise ResetNeeded("call reset() before step(): no episode has begun")
         if self._over and self._mode == AutoresetMode.DISABLED:
-            over = np.flatnonzero(self._read("over"))
-            raise ResetNeeded(f"the episodes of environments {over.tolist()} are over: reset them with options['reset_mask']")
+            done = np.flatnonzero(self._read("n") < 0.0)
+            raise ResetNeeded(f"the episodes of environments {done.tolist()} are over: reset them with options['reset_mask']")
         n, program = self.num_envs, self._program
-        observations = np.empty((n, len(program.o)), dtype=np.float32)
+        observations = np.empty(n * len(program.o), dtype=np.float32)
         rewards = np.empty(n)
-        ended = np.empty((2, n), dtype=np.bool_)
-        restarted = self._read("over") > 0.0 if self.diagnostics and self._over else None
-        status, self._over = program.step_all(
-            self._memory, self._ids, self._par, actions, observations.reshape(-1), rewards, ended.reshape(-1), self._targets_given, n
+        ended = np.empty(2 * n, dtype=np.bool_)
+        restarted = self._read("n") < 0.0 if self.diagnostics and self._over else None
+        status, over = program.step_all(
+            self._memory, self._ids, self._par, actions, observations, rewards, ended, self._targets_given, n
         )
         if status < 0:
             raise ValueError(f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}")
+        self._over = over
         if status > 0:
             self._refuse(status - 1)
-        terminations, truncations = ended
+        observations = observations.reshape(n, -1)
+        terminations, truncations = ended[:n], ended[n:]
         infos = self._infos(None, restarted) if self.diagnostics else {}
         if self._over and self._mode == AutoresetMode.SAME_STEP:
-            observations, infos = self._restart(observations, ended.any(axis=0), infos)
+            observations, infos = self._restart(observations, terminations | truncations, infos)
         return observations, rewards, terminations, truncations, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
@@ -273,17 +276,22 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     # --- the rest ---------------------------------------------------------------------------------------------
 
     def _read(self, row: str) -> NDArray[np.float64]:
-        return self._memory.reshape(-1, len(self._row), BLOCK)[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
+        return self._blocks[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
 
     def _write(self, row: str, lanes: NDArray[np.intp], values: Any) -> None:
-        self._memory.reshape(-1, len(self._row), BLOCK)[lanes // BLOCK, self._row[row], lanes % BLOCK] = values
+        self._blocks[lanes // BLOCK, self._row[row], lanes % BLOCK] = values
 
-    def _start(self, mask: NDArray[np.bool_], state_given: bool, target_given: bool) -> NDArray[np.float32]:
-        observations = np.empty((self.num_envs, len(self._program.o)), dtype=np.float32)
+    @property
+    def _blocks(self) -> NDArray[np.float64]:
+        """The rows that are kept, as (block, row, lane)."""
+        blocks, rows = -(-self.num_envs // BLOCK), len(self._row)
+        return self._memory[: blocks * rows * BLOCK].reshape(blocks, rows, BLOCK)
+
+    def _start(self, observations: NDArray[np.float32], mask: NDArray[np.bool_], *given: bool) -> None:
+        """Begin episodes where the mask is set; ``given``: whether to write all observations, states, targets."""
         self._program.start_all(
-            self._memory, self._ids, self._par, observations.reshape(-1), mask, state_given, target_given, self.num_envs
+            self._memory, self._ids, self._par, observations.reshape(-1), mask, *given, self.num_envs
         )
-        return observations
 
     def _restart(
         self, observations: NDArray[np.float32], over: NDArray[np.bool_], infos: dict[str, Any]
@@ -294,7 +302,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             final[i] = observations[i].copy()
         last = {k: v if k.startswith("_") else np.where(over, v, 0) for k, v in infos.items()}
         last |= {k: over & v for k, v in last.items() if k.startswith("_")}
-        observations = self._start(over, False, self._targets_given)
+        self._start(observations, over, False, False, self._targets_given)
         self._write("u", self._lanes[over], 0.0)
         self._over = 0
         infos = self._infos(None) if self.diagnostics else {}
@@ -317,13 +325,15 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         scene = self._tasks[i].scene
         raise scene.refusal(self.state[i], float(self.control[i]), self.task.dt, None, f"the step of environment {i}")
 
-    def _check_actions(self, actions: Any) -> NDArray[np.float64]:
+    def _check_actions(self, actions: Any) -> NDArray[np.floating]:
         array = np.asarray(actions)
         if array.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {array.shape}")
         if array.dtype.kind not in "fiub":
             raise ValueError(f"actions must be real numbers, got an array of type {array.dtype}")
-        return array.astype(np.float64).reshape(-1)
+        if array.dtype.char not in "fd" or not array.flags.writeable:  # what the compiled step takes as it is
+            array = array.astype(np.float64)
+        return array.ravel()
 
     def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         if mask is None:
@@ -350,7 +360,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return pairs
 
     def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        array = np.asarray(values, dtype=np.float64)
+        try:
+            array = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"options[{name!r}] must be numbers of shape {shape}, got {values!r}") from error
         if array.shape != shape:
             raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
         return array
@@ -384,8 +397,8 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     if not many:
         return [kind(**options)] * n
     tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
-    if len({(t.scene.state_names, t.target is None, t.observation) for t in tasks}) > 1:
-        raise ValueError("the environments of a batch must have the same states, got some with and some without a track")
+    if len({t.variant for t in tasks}) > 1:
+        raise ValueError(f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}")
     return tasks
 
 

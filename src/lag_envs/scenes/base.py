@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.scenes.shapes import Moment, Shape, Window
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, Stepper
 
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     import sympy
 
 Array = NDArray[np.float64]
+
+#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not vanish or overflow.
+SMALLEST = 1e-60
 
 
 class StepRefused(ArithmeticError):
@@ -55,9 +60,13 @@ def check_number(name: str, value: Any, unit: str = "") -> float:
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
         raise ValueError(f"{name} must be a real number, got {value!r}")
-    if not math.isfinite(value):
-        raise ValueError(f"{name} must be finite, got {value}{unit and ' ' + unit}")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer may be too large
+        number = math.inf
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
+    return number
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -145,6 +154,18 @@ class Scene(ABC):
     def drive_power(self, m: Motion, u: Any) -> Any:
         """Return the power that moving the support, plane or shell feeds in [W]."""
 
+    @abstractmethod
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front."""
+
+    @abstractmethod
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at."""
+
+    def turning(self, state: Sequence[float]) -> float:
+        """Return the rate of a coordinate that the picture shows and the state leaves out."""
+        return 0.0
+
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""
 
@@ -168,7 +189,10 @@ class Scene(ABC):
 
     def lift(self, state: ArrayLike) -> tuple:
         """Return the state's entries followed by cosine and sine of its angle, if it has one."""
-        y = tuple(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0))
+        array = np.asarray(state, dtype=np.float64)
+        if array.shape[-1:] != (len(self.state_names),):
+            raise ValueError(f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}")
+        y = tuple(np.moveaxis(array, -1, 0))
         return y if self.angle is None else (*y, np.cos(y[self.angle]), np.sin(y[self.angle]))
 
     def check_state(self, state: ArrayLike) -> Array:
@@ -222,11 +246,13 @@ class Scene(ABC):
         controls = self.check_control(controls)
         if controls.ndim != 1:
             raise ValueError(f"controls must have shape (T,), got {controls.shape}")
-        dt = _check_step(dt)
+        dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)
         x = pendulum.largest_x(dt, self.order)
         row = self._simulate(trajectory, controls, dt, x, *(v for v in map(float, self.constants().values()) if v != 0.0))
+        if not row and not np.isfinite(trajectory[-1]).all():
+            row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
         if row:
             raise self.refusal(trajectory[row - 1], controls[row - 1], dt, trajectory[:row], f"step {row - 1} of {len(controls)}")
         return trajectory
@@ -307,6 +333,7 @@ class Scene(ABC):
         dict
             ``change`` of energy, ``work`` of the drive, ``loss`` to drag, and ``residual`` = change - work + loss.
         """
+        dt = check_step(dt)
         points, weights = np.polynomial.legendre.leggauss(nodes)
         times = 0.5 * dt * (points + 1.0)
         states = np.array([self.simulate(state, [control], t)[1] for t in [*times, dt]])
@@ -319,9 +346,13 @@ class Scene(ABC):
     def truncation_bound(self, state: ArrayLike, control: float, dt: float) -> pendulum.Bound | None:
         """Return what is known of a step before it is taken: substeps and proved bounds on what they leave out.
 
-        None for a scene that is stepped in closed form.
+        None for a scene that is stepped in closed form; see `pendulum.truncation_bound`.
         """
-        return None
+        if self.flow.coefficients is not pendulum.Drive:
+            return None
+        y, u, k = self.lift(self.check_state(state)), check_number("control", control), SimpleNamespace(**self.constants())
+        coefficients = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
+        return pendulum.truncation_bound(float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order)
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression in functions of time and symbols of the parameters."""
@@ -338,14 +369,17 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
         ("above", above, above is not None and not number > above),
         ("at least", least, least is not None and not number >= least),
         ("below", below, below is not None and not number < below),
+        ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
+        ("at most", 1.0 / SMALLEST, number > 1.0 / SMALLEST),
     ):
         if broken:
             raise ValueError(f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " "))
     return number
 
 
-def _check_step(dt: Any) -> float:
+def check_step(dt: Any) -> float:
+    """Return the step as float, or raise a ValueError."""
     dt = check_number("dt", dt, "s")
-    if not dt > 0.0:
+    if not dt >= sys.float_info.min:  # what lies between has no inverse
         raise ValueError(f"dt must be above 0 s, got {dt:g} s")
     return dt

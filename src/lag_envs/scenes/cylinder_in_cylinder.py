@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Motion, Scene, parameter
 from lag_envs.scenes.incline import _ratio
+from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window, arc, polar, roller
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, pendulum_flow
 
@@ -78,7 +79,7 @@ class CylinderInCylinder(Scene):
 
     def check(self) -> None:
         """Fill in the solid cylinder's inertia; check the radii and the control."""
-        if self.control not in CONTROLS:
+        if self.control not in tuple(CONTROLS):
             raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
         if not self.radius < self.shell_radius:
             raise ValueError(f"radius must be below shell_radius={self.shell_radius:g} m, got {self.radius:g} m")
@@ -194,8 +195,40 @@ class CylinderInCylinder(Scene):
             return 0.0 * m.v.theta
         return self.reactions(m, u)["drive_torque"] * m.v.psi
 
-    def truncation_bound(self, state: ArrayLike, control: float, dt: float) -> pendulum.Bound:
-        """Return the substeps of a step and the bounds on what they leave out; see `pendulum.truncation_bound`."""
-        y = self.lift(self.check_state(state))
-        coefficients = self.drive(y, float(control), SimpleNamespace(**self.constants()), math)
-        return pendulum.truncation_bound(float(y[1]), coefficients, dt, self.order)
+    def turning(self, state: Sequence[float]) -> float:
+        """Return the shell's rate [rad/s]; its angle is not in the state."""
+        return state[2] if self.control == "tilt" else 0.0
+
+    def place(self, theta: float, distance: float | None = None) -> Point:
+        """Return the point at an angle, and at a distance [m] from the shell's axis: by default R - r."""
+        return polar((0.0, 0.0), self.arm if distance is None else distance, theta - 0.5 * math.pi)
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return shell, cylinder and angle; what has turned is the shell."""
+        theta, psi, big, small, origin = now.state[0], now.turned, self.shell_radius, self.radius, (0.0, 0.0)
+        up, centre, rim, part = 0.5 * math.pi, self.place(theta), 1.1 * self.shell_radius, math.pi / 12
+        stave = (up + psi - part, up + psi + part)
+        joints = [up + psi + part * i for i in range(3, 22, 2)]
+        angle, ratio = up + (big * psi - self.arm * theta) / small, self.inertia / (self.mass * small * small)
+        if self.control == "tilt":
+            action = arc(origin, 1.19 * big, up, up + now.share * math.pi / 3)
+        else:
+            back = -math.copysign(0.6 * big * now.share, now.state[1])
+            action = [centre, polar(centre, back, theta)]
+        return [
+            Circle(origin, rim, "ground"),
+            *(Line([polar(origin, big, a), polar(origin, rim, a)], "ground") for a in joints),
+            Polygon([*arc(origin, rim, *stave), *arc(origin, big, *reversed(stave))], "frame"),
+            Circle(origin, big, "hole"),
+            Line([origin, (0.0, -big)], "guide"),
+            Line([origin, centre], "guide"),
+            Line(arc(origin, 0.4 * self.arm, -up, math.remainder(theta, 2.0 * math.pi) - up), "guide"),
+            *roller(centre, small, angle, ratio),
+            Arrow(action),
+        ]
+
+    def window(self, now: Moment) -> Window:
+        """Return a window on the whole shell."""
+        size = 1.28 * self.shell_radius
+        return Window(-size, -size, size, size)
+

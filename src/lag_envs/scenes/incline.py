@@ -27,6 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Motion, Scene, parameter
+from lag_envs.scenes import shapes
+from lag_envs.scenes.shapes import Arrow, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow
 
@@ -76,7 +78,7 @@ class Incline(Scene):
 
     def check(self) -> None:
         """Fill in the solid cylinder's inertia and the tilt, and check the control."""
-        if self.control not in CONTROLS:
+        if self.control not in tuple(CONTROLS):
             raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
         if self.control != "damping" and self.tilt is not None:
             raise ValueError(f"tilt={self.tilt:g} rad would be ignored: with control={self.control!r} the tilt is controlled")
@@ -201,6 +203,63 @@ class Incline(Scene):
         if self.control != "tilt_rate":
             return 0.0 * m.v.x
         return self.reactions(m, u)["drive_torque"] * m.v.phi
+
+    def tilted(self, now: Moment) -> float:
+        """Return the tilt [rad]."""
+        return {"damping": self.tilt, "tilt": now.control, "tilt_rate": now.state[-1]}[self.control]
+
+    def place(self, x: float, height: float, phi: float) -> Point:
+        """Return the point at x along the surface and at a height above it [m]."""
+        c, s = math.cos(phi), math.sin(phi)
+        return x * c + height * s, height * c - x * s
+
+    def shapes(self, now: Moment, ends: tuple[float, float] | None = None) -> list[Shape]:
+        """Return plane, cylinder and tilt; the surface reaches from end to end [m]."""
+        x, radius, phi = now.state[0], self.radius, self.tilted(now)
+        ends = (x - 20.0 * radius, x + 20.0 * radius) if ends is None else ends
+        # Rolling ties the cylinder's own angle to its place: it turns at x'/R + phi', clockwise.
+        angle, ratio = 0.5 * math.pi - x / radius - phi, self.inertia / (self.mass * radius * radius)
+        cylinder = shapes.roller(self.place(x, radius, phi), radius, angle, ratio)
+        if self.control == "damping":
+            return [*self._slope(*ends), *cylinder, self._drag(now)]
+        far = max(-ends[0], ends[1])
+        start, sweep = (-phi, -0.3 * now.share) if self.control == "tilt_rate" else (0.0, -phi)
+        turn = Arrow(shapes.arc((0.0, 0.0), 1.15 * far, start, start + sweep))
+        return [*self._plank(*ends, phi), *cylinder, turn]
+
+    def _slope(self, low: float, high: float) -> list[Shape]:
+        phi, radius = self.tilt, self.radius
+        left, right = self.place(low, 0.0, phi), self.place(high, 0.0, phi)
+        depth = min(left[1], right[1]) - (high - low)
+        marks = shapes.ticks(low, high, shapes.round_length(10.0 * radius))
+        return [
+            Polygon([left, right, (right[0], depth), (left[0], depth)], "ground"),
+            *(Line([self.place(x, 0.0, phi), self.place(x, -0.6 * radius, phi)], "ground") for x in marks),
+            Line([(0.0, 0.0), (-24.0 * radius, 0.0)], "guide"),
+            Line(shapes.arc((0.0, 0.0), 20.0 * radius, math.pi - phi, math.pi), "guide"),
+        ]
+
+    def _drag(self, now: Moment) -> Arrow:
+        x, v = now.state
+        tip = x - math.copysign(8.0 * self.radius * now.share, v)
+        return Arrow([self.place(x, self.radius, self.tilt), self.place(tip, self.radius, self.tilt)])
+
+    def _plank(self, low: float, high: float, phi: float) -> list[Shape]:
+        far, thick = max(-low, high), 0.02 * (high - low)
+        floor, side = -9.0 * thick, 2.0 * far
+        corners = [(low, 0.0), (high, 0.0), (high, -thick), (low, -thick)]
+        return [
+            Polygon([(-4.0 * thick, floor), (0.0, -0.5 * thick), (4.0 * thick, floor)], "ground"),
+            Polygon([(-side, floor), (side, floor), (side, -side), (-side, -side)], "ground"),
+            Line([(-1.3 * far, 0.0), (1.3 * far, 0.0)], "guide"),
+            Polygon([self.place(a, b, phi) for a, b in corners], "frame"),
+        ]
+
+    def window(self, now: Moment) -> Window:
+        """Return a window that follows the cylinder."""
+        x, y = self.place(now.state[0], self.radius, self.tilted(now))
+        size = 12.0 * self.radius
+        return Window(x - size, y - size, x + size, y + size)
 
 
 def _ratio(friction: Any, normal: Any) -> Any:

@@ -26,7 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, parameter
+from lag_envs.scenes.base import Motion, Scene, check_number, parameter
+from lag_envs.scenes import shapes
+from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, pendulum_flow
 
@@ -75,9 +77,10 @@ class PivotedBar(Scene):
         if self.inertia is None:
             object.__setattr__(self, "inertia", self.mass * self.com_distance * self.com_distance / 3.0)
         if self.track is not None:
-            if isinstance(self.track, bool | str) or not self.track > 0.0:
-                raise ValueError(f"track must be above 0 m, infinity or None, got {self.track!r}")
-            object.__setattr__(self, "track", float(self.track))
+            track = math.inf if self.track == math.inf else check_number("track", self.track, "m")
+            if not track > 0.0:
+                raise ValueError(f"track must be above 0 m, infinity or None, got {track:g} m")
+            object.__setattr__(self, "track", track)
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -98,6 +101,11 @@ class PivotedBar(Scene):
     def coordinates(self) -> tuple[str, ...]:
         """The bar's angle is free, the support is moved."""
         return ("theta", "s")
+
+    @property
+    def order(self) -> int:
+        """Order of the Taylor series: at 14 one step of 0.02 s is certified for all that the tasks reach."""
+        return 14
 
     @property
     def flow(self) -> Flow:
@@ -176,8 +184,59 @@ class PivotedBar(Scene):
             return -self.mass * self.com_distance * u * m.v.theta * np.cos(m.q.theta)
         return self.reactions(m, u)["support_horizontal"] * m.v.s
 
-    def truncation_bound(self, state: ArrayLike, control: float, dt: float) -> pendulum.Bound:
-        """Return the substeps of a step and the bounds on what they leave out; see `pendulum.truncation_bound`."""
-        y = self.lift(self.check_state(state))
-        coefficients = self.drive(y, float(control), SimpleNamespace(**self.constants()), math)
-        return pendulum.truncation_bound(float(y[-3]), coefficients, dt, self.order)
+    @property
+    def reach(self) -> float:
+        """Distance from the pivot to the far end of a uniform bar with this mass, centre and inertia [m]."""
+        return self.com_distance + 0.5 * self._length
+
+    @property
+    def _length(self) -> float:
+        return math.sqrt(12.0 * self.inertia / self.mass)
+
+    def outline(self, s: float, theta: float) -> list[Point]:
+        """Return the corners of the bar [m]."""
+        half = 0.035 * self.reach
+        near, far = self.com_distance - 0.5 * self._length - half, self.reach
+        along, across = (math.sin(theta), -math.cos(theta)), (math.cos(theta), math.sin(theta))
+        corners = [(near, -half), (far, -half), (far, half), (near, half)]
+        return [(s + a * along[0] + b * across[0], a * along[1] + b * across[1]) for a, b in corners]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return track, support and bar, and the angle."""
+        s, theta, reach = (0.0 if self.track is None else now.state[0]), now.state[-2], self.reach
+        wide, high = 0.11 * reach, 0.05 * reach
+        slider = [(s - wide, -high), (s + wide, -high), (s + wide, high), (s - wide, high)]
+        com = (s + self.com_distance * math.sin(theta), -self.com_distance * math.cos(theta))
+        turn = math.remainder(theta, 2.0 * math.pi)
+        edge = s + math.copysign(wide, now.share)
+        return [
+            *self._rail(s),
+            Line([(s, 0.0), (s, -0.4 * reach)], "guide"),
+            Line(shapes.arc((s, 0.0), 0.25 * reach, -0.5 * math.pi, turn - 0.5 * math.pi), "guide"),
+            Polygon(slider, "frame"),
+            Line([(s, 0.0), com], "body"),
+            Polygon(self.outline(s, theta)),
+            Circle((s, 0.0), 0.02 * reach, "hole"),
+            Circle(com, 0.022 * reach, "mark"),
+            Arrow([(edge, 0.0), (edge + 0.45 * reach * now.share, 0.0)]),
+        ]
+
+    def _rail(self, s: float) -> list[Shape]:
+        if self.track is None:
+            return [Line([(-2.0 * self.reach, 0.0), (2.0 * self.reach, 0.0)], "guide")]
+        endless, size = math.isinf(self.track), 0.035 * self.reach
+        low, high = (s - 3.0 * self.reach, s + 3.0 * self.reach) if endless else (-self.track, self.track)
+        step = shapes.round_length(0.2 * min(self.reach, high - low))
+        rail: list[Shape] = [Line([(x, 0.0), (x, -size)], "ground") for x in shapes.ticks(low, high, step)]
+        rail.append(Line([(low, 0.0), (high, 0.0)], "frame"))
+        if not endless:
+            rail += [Line([(end, -2.0 * size), (end, 2.0 * size)], "limit") for end in (low, high)]
+        return rail
+
+    def window(self, now: Moment) -> Window:
+        """Return a window on the whole track, or one that follows the support."""
+        tall = 1.08 * self.reach
+        if self.track is None or math.isinf(self.track):
+            s = 0.0 if self.track is None else now.state[0]
+            return Window(s - tall, -tall, s + tall, tall)
+        return Window(-self.track - tall, -tall, self.track + tall, tall)

@@ -12,7 +12,7 @@ called; the pair (cos, sin) is turned by the step's angle with two short polynom
 
 **Bound** (method of majorants). E = Q + iP obeys E' = iWE, so |E_0| = G = √(A² + B²). Suppose that for some x
 
-    |W_0| <= x,   x²/2 >= Γx + G + |D|,   x (x²/2 - Γx/2 - G) >= |R|.
+    |W_0| <= x,   x²/2 >= |Γ|x + G + |D|,   x (x²/2 - |Γ|x/2 - G) >= |R|.
 
 With κ = x/2 the series x/(1-κτ) and G/(1-κτ)² then satisfy the same recurrences with >= in place of =, so
 |W_k| <= xκ^k for every k. A series cut off after W_N leaves out at most xκ^(N+1)/(1-κ) of hθ', and
@@ -83,10 +83,11 @@ def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tup
         W.append(force * (-1.0 / (k + 1)))
         if k + 1 == order:
             break
-        P.append(balanced_sum((Q[j], W[k - j]) for j in range(k + 1)) * (1.0 / (k + 1)))
-        # The convolution is symmetric, so half of its products are enough.
-        half = balanced_sum((W[j], W[k + 1 - j]) for j in range((k + 2) // 2))
-        H.append(half + 0.5 * (W[(k + 1) // 2] * W[(k + 1) // 2]) if k % 2 else half)
+        early = sorted(range(k + 1), key=lambda j: (max(j, k - j), j))  # noqa: B023
+        P.append(balanced_sum((Q[j], W[k - j]) for j in early) * (1.0 / (k + 1)))
+        # The convolution of W with itself is symmetric, so half of its products are enough.
+        pairs = [(W[j], W[k + 1 - j]) for j in reversed(range((k + 2) // 2))]
+        H.append(balanced_sum([(0.5 * W[(k + 1) // 2], W[(k + 1) // 2]), *pairs] if k % 2 else pairs))
         work = 2.0 * (gamma * H[k]) - d * W[k]
         if k:
             work = work - r * W[k - 1]
@@ -106,8 +107,8 @@ def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
     return c1 * r, s1 * r
 
 
-def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
-    """Advance (θ, θ', cosθ, sinθ) by one step of the series."""
+def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
+    """Return by how much θ and hθ' change in one step of the series, and (cosθ, sinθ) after it."""
     W, _ = taylor_coefficients(omega * h, c, s, scaled(drive, h), order)
     # From the small terms to the large ones.
     change, angle = W[order], W[order] * (1.0 / (order + 1))
@@ -115,18 +116,23 @@ def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: in
         change = change + W[k]
         angle = angle + W[k] * (1.0 / (k + 1))
     angle = angle + W[0]
-    return theta + angle, omega + change * (1.0 / h), *rotate(c, s, angle)
+    return angle, change, *rotate(c, s, angle)
+
+
+def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
+    """Advance (θ, θ', cosθ, sinθ) by one step of the series."""
+    angle, change, c, s = step_change(omega, c, s, drive, h, order)
+    return theta + angle, omega + change * (1.0 / h), c, s
 
 
 def certified(omega: Any, drive: Drive, h: Any, x: Any, xp: Any) -> Any:
-    """Tell whether the three conditions of the bound hold for this x."""
+    """Tell whether the three conditions of the bound hold for this x; written without a root."""
     a, b, gamma, d, r = scaled(drive, h)
-    field = xp.sqrt(a * a + b * b)
-    half = 0.5 * (x * x)
-    holds = (xp.abs(omega * h) <= x) & (gamma * x + (field + xp.abs(d)) <= half)
+    half, loss = 0.5 * (x * x), xp.abs(gamma) * x
+    room = half - loss - xp.abs(d)
     if not (isinstance(r, float) and r == 0.0):
-        holds = holds & (xp.abs(r) <= x * (half - (0.5 * (gamma * x) + field)))
-    return holds
+        room = xp.minimum(room, half - 0.5 * loss - xp.abs(r) * (1.0 / x))
+    return (xp.abs(omega * h) <= x) & (room >= 0.0) & (a * a + b * b <= room * room)
 
 
 def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
@@ -163,10 +169,11 @@ def truncation_bound(omega: float, drive: Drive, dt: float, order: int = ORDER) 
     of plain substeps, which the jump replaces.
     """
     n = 1 if certified(omega, drive, dt, largest_x(dt, order), np) else _substeps(omega, *drive, dt, order)
+    n = min(n, 1e15)
     h = dt / n
     # One step needs the bound at its start only, several need it all the way.
     x = _rate(omega, *drive, dt if n > 1 else 0.0) * h
-    tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0)
+    tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
     return Bound(int(n), order, n * tail / (order + 2), n * tail / h)
 
 
@@ -174,10 +181,13 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
     """Return x/h such that the bound holds anywhere in the interval, for small h."""
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
-    speed = abs(omega) + (field + push) * dt
+    # What the field adds to the speed is limited by its acceleration and by the energy 2 field from top to bottom.
+    speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + push * dt
     if gamma * speed > field + push:
         speed = max(abs(omega), (field + push) / gamma)
-    root = gamma + math.sqrt(gamma * gamma + 2.0 * (field + push)) + (2.0 * abs(ramp)) ** (1.0 / 3.0)
+    elif gamma < 0.0:
+        speed *= math.exp(min(-gamma * dt, 700.0))
+    root = abs(gamma) + math.sqrt(gamma * gamma + 2.0 * (field + push)) + (2.0 * abs(ramp)) ** (1.0 / 3.0)
     return max(speed, root)
 
 
@@ -190,7 +200,7 @@ def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order):  # type: ignor
     scale = max(1.0, max(abs(omega), (alpha * alpha + beta * beta) ** 0.25))
     half = 0.5 * rate * dt
     n = (rate / (0.8 * TOLERANCE * scale)) ** (1.0 / order) * half ** (1.0 + 1.0 / order)
-    return math.ceil(max(1.0, max(n, 5.0 * half)))
+    return np.ceil(max(1.0, max(n, 5.0 * half)))
 
 
 def _slow_substep(theta, c, s, alpha, beta, gamma, delta, ramp, h):  # type: ignore[no-untyped-def]
@@ -237,13 +247,13 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     The number is negative where the step is refused: too many substeps, or no finite result.
     """
     if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
-        theta, omega, c, s = taylor(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt)
-        return theta, omega, c, s, 1
+        angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta, ramp, dt)
+        return theta + angle, fma(change, 1.0 / dt, omega), c, s, 1
     field = math.sqrt(alpha * alpha + beta * beta) + abs(delta) + abs(ramp) * dt
     # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then jump along the
     # slow manifold. Tested against 40 digits for field/gamma² up to 1e-3, with and without drive.
     layer = dt
-    if field <= 1e-3 * gamma * gamma:
+    if gamma > 0.0 and field <= 1e-3 * gamma * gamma:
         layer = (40.0 + math.log(max(1.0, abs(omega) + field / gamma))) / gamma
     slow = layer < 0.5 * dt
     if not slow:
@@ -251,12 +261,19 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     n = _substeps(omega, alpha, beta, gamma, delta, ramp, layer, order)
     m = 0.0
     if slow:
-        m = math.ceil(max(1.0, 12.0 * field / gamma * (dt - layer)))
-    if not n + m <= MAX_SUBSTEPS:
+        m = np.ceil(max(1.0, 12.0 * field / gamma * (dt - layer)))
+    # A substep along the slow manifold costs as much as 50 others.
+    if not n + 50.0 * m <= MAX_SUBSTEPS:
         return theta, omega, c, s, -1
     h = layer / n
+    # What rounding takes from the two sums is handed on (Kahan): equal terms would be rounded all to the same side.
+    lost_angle = lost_speed = 0.0
     for i in range(int(n)):
-        theta, omega, c, s = taylor(theta, omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)
+        angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)
+        angle, speed = angle - lost_angle, change / h - lost_speed
+        theta_end, omega_end = theta + angle, omega + speed
+        lost_angle, lost_speed = (theta_end - theta) - angle, (omega_end - omega) - speed
+        theta, omega = theta_end, omega_end
     if slow:
         h = (dt - layer) / m
         for i in range(int(m)):
@@ -289,10 +306,10 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
         return Drive(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
 
     coefficients = "alpha, beta, gamma, delta, ramp"
-    taylor = compile_traced(
-        "taylor",
-        f"theta, omega, c, s, {coefficients}, h",
-        lambda xp, theta, omega, c, s, *rest: step(theta, omega, c, s, drive(*rest[:5]), rest[5], order),
+    series = compile_traced(
+        "series",
+        f"omega, c, s, {coefficients}, h",
+        lambda xp, omega, c, s, *rest: step_change(omega, c, s, drive(*rest[:5]), rest[5], order),
     )
     holds = compile_traced(
         "holds",
@@ -303,4 +320,4 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
     rate = compile_python("_rate", _rate)
     count = compile_python("_substeps", _substeps, rate, TOLERANCE=TOLERANCE)
     slow = compile_python("_slow_substep", _slow_substep, turn, order=order)
-    return compile_python("flow", _flow, holds, taylor, count, slow, order=order, MAX_SUBSTEPS=MAX_SUBSTEPS)
+    return compile_python("flow", _flow, holds, series, count, slow, order=order, MAX_SUBSTEPS=MAX_SUBSTEPS)

@@ -88,6 +88,40 @@ def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     return types.void(), codegen
 
 
+@intrinsic
+def _power_of_two(typingctx, n):  # type: ignore[no-untyped-def]
+    """Return 2**n for a whole number n in [-1022, 1023], by writing the exponent's bits."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        exponent = builder.add(builder.fptosi(args[0], ir.IntType(64)), ir.Constant(ir.IntType(64), 1023))
+        return builder.bitcast(builder.shl(exponent, ir.Constant(ir.IntType(64), 52)), ir.DoubleType())
+
+    return types.float64(types.float64), codegen
+
+
+@njit(cache=True, forceinline=True)
+def exp(x):  # type: ignore[no-untyped-def]
+    """Return e**x to 1 ulp, clipped to |x| <= 700; arithmetic only, so that loops with it become vectors."""
+    x = select(x < -700.0, -700.0, select(x > 700.0, 700.0, x))
+    n = np.floor(fma(x, 1.4426950408889634, 0.5))
+    r = fma(-n, 1.9082149292705877e-10, fma(-n, 0.693147180369123816490, x))
+    p = 1.0 / 6227020800.0
+    p = fma(p, r, 1.0 / 479001600.0)
+    p = fma(p, r, 1.0 / 39916800.0)
+    p = fma(p, r, 1.0 / 3628800.0)
+    p = fma(p, r, 1.0 / 362880.0)
+    p = fma(p, r, 1.0 / 40320.0)
+    p = fma(p, r, 1.0 / 5040.0)
+    p = fma(p, r, 1.0 / 720.0)
+    p = fma(p, r, 1.0 / 120.0)
+    p = fma(p, r, 1.0 / 24.0)
+    p = fma(p, r, 1.0 / 6.0)
+    p = fma(p, r, 1.0 / 2.0)
+    p = fma(p, r, 1.0 / 1.0)
+    p = fma(p, r, 1.0 / 1.0)
+    return p * _power_of_two(n)
+
+
 def jit(function: Callable) -> Callable:
     """Compile a function, cached on disk where a place can be written to."""
     options = {"error_model": "numpy", "nogil": True}
@@ -103,6 +137,7 @@ NAMES = {
     "math": math,
     "fma": fma,
     "select": select,
+    "exp": exp,
     "wide_vectors": wide_vectors,
     "uniform": uniform,
     "episode_key": episode_key,

@@ -8,8 +8,9 @@ Fixed slope
     A sum of terms without cancellation for any drag >= 0; without drag it is the quadratic.
 Turning slope
     ``x'' = k g sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series has
-    the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|); where σ is large the
-    matrix of a short step is squared until it spans the whole one ("scaling and squaring").
+    the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large, short steps are
+    taken one after the other; where that is for the drag, the matrix of a short step is squared until it spans
+    the whole one ("scaling and squaring").
 
 References
 ----------
@@ -43,7 +44,7 @@ class Pull(NamedTuple):
 
 
 def slide(x: Any, v: Any, force: Pull, dt: Any) -> tuple:
-    """Advance (x, x') by dt for drag·dt up to `SMALL_DECAY`."""
+    """Advance (x, x') by dt for drag·dt up to `SMALL_DECAY` in size."""
     decay = force.drag * dt
     phi2 = polynomial(_PHI2, decay) if not (isinstance(decay, float) and decay == 0.0) else 0.5
     phi1 = 1.0 - decay * phi2
@@ -53,14 +54,15 @@ def slide(x: Any, v: Any, force: Pull, dt: Any) -> tuple:
 
 def slides(force: Pull, dt: Any) -> Any:
     """Tell whether `slide` is exact to rounding."""
-    return force.drag * dt <= SMALL_DECAY
+    decay = force.drag * dt
+    return (decay <= SMALL_DECAY) & (decay >= -SMALL_DECAY)
 
 
 def _slide_any(x, v, pull, drag, dt, _):  # type: ignore[no-untyped-def]
     """Advance by dt for any drag; return the state and 1, or -2 where there is no finite result."""
     if not holds(pull, drag, dt):
         z = drag * dt
-        if z < 1.5:  # where 1 - phi1 would cancel
+        if abs(z) < 1.5:  # where 1 - phi1 would cancel
             phi2 = 0.5
             term = 0.5
             for k in range(3, 26):
@@ -132,8 +134,8 @@ class Turn(NamedTuple):
     rate: Any  # Ω [rad/s]
 
 
-def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
-    """Advance (x, x') by the Taylor series; (c, s) are cosφ and sinφ at the start."""
+def turn_change(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+    """Return by how much (x, x') change, by the Taylor series; (c, s) are cosφ and sinφ at the start."""
     rate = turn.rate * h
     carry = turn.rolling * (rate * rate)
     weight = turn.rolling * turn.gravity * (h * h)
@@ -147,7 +149,13 @@ def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any
     dx, dv = X[TURN_ORDER], V[TURN_ORDER]
     for k in range(TURN_ORDER - 1, 0, -1):
         dx, dv = dx + X[k], dv + V[k]
-    return x + dx, v + dv * (1.0 / h)
+    return dx, dv * (1.0 / h)
+
+
+def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+    """Advance (x, x') by `turn_change`."""
+    dx, dv = turn_change(x, v, c, s, turn, h)
+    return x + dx, v + dv
 
 
 def turns(turn: Turn, h: Any, xp: Any) -> Any:
@@ -161,34 +169,45 @@ def _growth(rolling: Any, drag: Any, rate: Any, h: Any, xp: Any) -> Any:
 
 
 def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[no-untyped-def]
-    """Advance by dt for any coefficients; return x, x', the angle's cos and sin, and 1 or -2."""
+    """Advance by dt for any coefficients; return x, x', the angle's cos and sin, and 1 or, refused, -1 or -2."""
+    growth = dt * (2.0 * drag + 3.0 * abs(rate))
+    n = np.ceil(max(1.0, growth / SMALL_TURN))
+    if n == 1.0 or (drag <= abs(rate) and n <= 1e5):
+        h = dt / n
+        for _i in range(int(n)):
+            x, v = series(x, v, c, s, rolling, gravity, drag, rate, h)
+            c, s = turn_pair(c, s, rate * h)
+        return x, v, c, s, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
     doublings = 0
     h = dt
-    growth = dt * (2.0 * drag + 3.0 * abs(rate))
-    while growth > SMALL_TURN and doublings < 60:
+    while growth > SMALL_TURN:
         growth *= 0.5
         h *= 0.5
         doublings += 1
-    if doublings == 0:
-        x, v = series(x, v, c, s, rolling, gravity, drag, rate, h)
-        c, s = turn_pair(c, s, rate * h)
-        return x, v, c, s, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
-    # Rows (x, x'), columns (x, x', cos, sin): the matrix of a short step, from its effect on unit vectors.
+        if doublings > 60:
+            return x, v, c, s, -1
+    # Rows (x, x'), columns (x, x', cos, sin): what a short step adds, from its effect on unit vectors. The unit
+    # matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose a
+    # bit with each squaring.
     m = np.empty((2, 4))
-    m[0, 0], m[1, 0] = series(1.0, 0.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 1], m[1, 1] = series(0.0, 1.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 2], m[1, 2] = series(0.0, 0.0, 1.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 3], m[1, 3] = series(0.0, 0.0, 0.0, 1.0, rolling, gravity, drag, rate, h)
+    m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 2], m[1, 2] = change(0.0, 0.0, 1.0, 0.0, rolling, gravity, drag, rate, h)
+    m[0, 3], m[1, 3] = change(0.0, 0.0, 0.0, 1.0, rolling, gravity, drag, rate, h)
     for i in range(doublings):
         angle = rate * (dt * 0.5 ** (doublings - i))
         p, q = math.cos(angle), math.sin(angle)
         a = m.copy()
         for r in range(2):
-            m[r, 0] = a[r, 0] * a[0, 0] + a[r, 1] * a[1, 0]
-            m[r, 1] = a[r, 0] * a[0, 1] + a[r, 1] * a[1, 1]
-            m[r, 2] = a[r, 0] * a[0, 2] + a[r, 1] * a[1, 2] + a[r, 2] * p + a[r, 3] * q
-            m[r, 3] = a[r, 0] * a[0, 3] + a[r, 1] * a[1, 3] - a[r, 2] * q + a[r, 3] * p
-    x, v = m[0, 0] * x + m[0, 1] * v + (m[0, 2] * c + m[0, 3] * s), m[1, 0] * x + m[1, 1] * v + (m[1, 2] * c + m[1, 3] * s)
+            for j in range(4):
+                m[r, j] += a[r, 0] * a[0, j] + a[r, 1] * a[1, j]
+            m[r, 0] += a[r, 0]
+            m[r, 1] += a[r, 1]
+            m[r, 2] += a[r, 2] * p + a[r, 3] * q
+            m[r, 3] += a[r, 3] * p - a[r, 2] * q
+    dx = m[0, 0] * x + m[0, 1] * v + (m[0, 2] * c + m[0, 3] * s)
+    dv = m[1, 0] * x + m[1, 1] * v + (m[1, 2] * c + m[1, 3] * s)
+    x, v = x + dx, v + dv
     p, q = math.cos(rate * dt), math.sin(rate * dt)
     c, s = c * p - s * q, s * p + c * q
     r = 1.5 - 0.5 * (c * c + s * s)
@@ -202,10 +221,10 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
     def turn(*coefficients: Any) -> Turn:
         return Turn(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
 
-    series = compile_traced(
-        "series",
-        "x, v, c, s, rolling, gravity, drag, rate, h",
-        lambda xp, x, v, c, s, *rest: turn_series(x, v, c, s, turn(*rest[:4]), rest[4]),
+    arguments = "x, v, c, s, rolling, gravity, drag, rate, h"
+    series, change = (
+        compile_traced(name, arguments, lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, turn(*rest[:4]), rest[4]))
+        for name, f in (("series", turn_series), ("change", turn_change))
     )
     pair = compile_traced("turn_pair", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
-    return compile_python("flow", _turn_any, series, pair, SMALL_TURN=SMALL_TURN)
+    return compile_python("flow", _turn_any, series, change, pair, SMALL_TURN=SMALL_TURN)

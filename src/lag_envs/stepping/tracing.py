@@ -30,7 +30,7 @@ _OTHER = {
     "where": "select({}, {}, {})",
     "fma": "fma({}, {}, {})",
     "sqrt": "math.sqrt({})",
-    "exp": "math.exp({})",
+    "exp": "exp({})",
     "sin": "math.sin({})",
     "cos": "math.cos({})",
     "abs": "abs({})",
@@ -241,17 +241,26 @@ class Trace:
 
 
 def balanced_sum(products: Iterable[tuple[Any, Any]]) -> Any:
-    """Sum products in two running chains, which a processor can work on side by side.
+    """Sum products, given in the order in which their factors become known.
+
+    All but the last two run in two chains side by side, which a processor can finish while it waits for the rest.
 
     Examples
     --------
     >>> balanced_sum([(1.0, 2.0), (3.0, 4.0), (5.0, 6.0)])
     44.0
     """
-    chains: list[Any] = [None, None]
-    for i, (a, b) in enumerate(products):
-        chains[i % 2] = a * b if chains[i % 2] is None else chains[i % 2] + a * b
-    return chains[0] if chains[1] is None else chains[0] + chains[1]
+    products = list(products)
+    chains: list[Any] = []
+    for i, (a, b) in enumerate(products[:-2]):
+        if i < 2:
+            chains.append(a * b)
+        else:
+            chains[i % 2] = chains[i % 2] + a * b
+    total = sum(chains[1:], *chains[:1]) if chains else None
+    for a, b in products[-2:]:
+        total = a * b if total is None else total + a * b
+    return total
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:

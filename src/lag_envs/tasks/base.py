@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene, check_number
+from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping import pendulum
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
@@ -63,7 +65,7 @@ class Task(ABC):
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
         seconds = self.interval * self.steps if duration is None else duration
-        if isinstance(seconds, bool | str) or not seconds >= self.dt:
+        if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds >= self.dt:
             raise ValueError(f"duration must be at least dt={self.dt:g} s, got {seconds!r}")
         self.duration = float(seconds)
         self.target = None if target is None else self.check_target(target)
@@ -71,6 +73,11 @@ class Task(ABC):
 
     def check(self) -> None:
         """Raise ValueError where the parameters do not fit the task."""
+
+    @property
+    def variant(self) -> tuple:
+        """What decides the code besides class and control: the environments of a batch must agree in it."""
+        return self.scene.state_names, self.target is None
 
     @property
     def limit(self) -> float:
@@ -106,7 +113,28 @@ class Task(ABC):
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Raise ValueError for a start outside the set in which the episode goes on."""
 
+    # --- the picture ----------------------------------------------------------------------------------------
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front: the scene, and what matters to the task."""
+        return self.scene.shapes(now)
+
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at [m]."""
+        return self.scene.window(now)
+
+    def readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells besides state and control."""
+        if now.target is None:
+            return []
+        return [Reading(self.scene.state_names[0] + "*", now.target, self.scene.state_units[0], "target")]
+
     # --- what a task defines --------------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def limit_control(self) -> float:
+        """Largest control."""
 
     @property
     @abstractmethod

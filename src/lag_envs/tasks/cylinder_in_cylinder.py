@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes import CylinderInCylinder
+from lag_envs.scenes.shapes import Circle, Line, Moment, Reading, Shape
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 
@@ -40,7 +41,7 @@ class _Shell(Task):
     def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
         """Return U·a, cut back so that the shell's rate stays within its limit at the step's end."""
         wanted = k.limit_control * a
-        return clip(wanted, (-k.fastest_shell - y[2]) / dt, (k.fastest_shell - y[2]) / dt, xp)
+        return clip(wanted, (-k.fastest_shell - y[2]) * (1.0 / dt), (k.fastest_shell - y[2]) * (1.0 / dt), xp)
 
     def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
         """Tell whether the cylinder has been carried too high."""
@@ -52,6 +53,13 @@ class _Shell(Task):
         pull = k["weight"] + k["push"] * self.limit_control + k["drag"] * self.fastest_shell
         swing = FASTEST_START + pull * self.duration
         return [finite(b) for b in (self.largest_angle + swing * self.dt, swing, self.fastest_shell * (1.0 + 1e-6))]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add how far the cylinder may go."""
+        scene, limits = self.scene, (-self.largest_angle, self.largest_angle)
+        inner = scene.shell_radius - scene.radius
+        lines = [Line([scene.place(a, inner), scene.place(a, scene.shell_radius)], "limit") for a in limits]
+        return [*super().shapes(now), *lines]
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start at which the episode would be over, or with the shell too fast."""
@@ -84,6 +92,11 @@ class Tilt(_Shell):
     def bounds(self) -> Sequence[float]:
         """Return bounds on the observation."""
         return [*super().bounds(), self.largest_angle]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add the target."""
+        mark = Circle(self.scene.place(now.target or 0.0), self.scene.radius, "target")
+        return [*super().shapes(now), mark]
 
     def check_target(self, target: Any) -> float:
         """Refuse a target at which the episode would be over."""
@@ -122,6 +135,19 @@ class Pump(_Shell):
     def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
         """Return θ, θ', ψ'."""
         return list(z[:3])
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add the turning points of a swing of the wanted energy."""
+        places = [self.scene.place(a) for a in (-self.amplitude, self.amplitude)]
+        marks = [Circle(place, self.scene.radius, "target") for place in places]
+        return [*super().shapes(now), *marks]
+
+    def readings(self, now: Moment) -> list[Reading]:
+        """Tell the energy per inertia, and the wanted one."""
+        theta, theta_dot = now.state[:2]
+        energy = 0.5 * theta_dot * theta_dot + self.scene.constants()["weight"] * (1.0 - math.cos(theta))
+        wanted = self.numbers()["wanted_energy"]
+        return [Reading("E", energy, "1/s²"), Reading("E*", wanted, "1/s²", "target")]
 
 
 class Damping(Task):
@@ -180,6 +206,11 @@ class Damping(Task):
         """Return bounds: θ' grows by at most ω₀² a second and 3 rad/s a kick."""
         swing = FASTEST_START + self.scene.constants()["weight"] * self.duration + 3.0 * self.limit
         return [finite(1e3 + swing * self.duration), finite(swing)]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add the place of rest."""
+        mark = Circle(self.scene.place(0.0), self.scene.radius, "target")
+        return [*super().shapes(now), mark]
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start without contact."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes import Incline
+from lag_envs.scenes.shapes import Circle, Lens, Line, Moment, Reading, Shape, Window, polar
 from lag_envs.stepping import slope
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task, finite
@@ -59,7 +60,7 @@ class Tilt(Task):
         wanted = k.limit_control * a
         if self.quasi_static:
             return wanted
-        return clip(wanted, (-k.largest_tilt - y[2]) / dt, (k.largest_tilt - y[2]) / dt, xp)
+        return clip(wanted, (-k.largest_tilt - y[2]) * (1.0 / dt), (k.largest_tilt - y[2]) * (1.0 / dt), xp)
 
     def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-((x - x*)/0.1)²) - 0.02 (u/U)²."""
@@ -86,6 +87,19 @@ class Tilt(Task):
         speed = FASTEST_START + radius * rate + push * self.duration
         state = [self.edge + speed * self.dt, speed]
         return [finite(b) for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), 1e3)]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return a plank that ends at the edges, with the target and the largest tilt."""
+        scene, edge, phi, radius = self.scene, self.edge, self.scene.tilted(now), self.scene.radius
+        posts = [Line([scene.place(x, y, phi) for y in (0.0, 0.8 * radius)], "limit") for x in (-edge, edge)]
+        tilts = [-self.largest_tilt, self.largest_tilt]
+        limits = [Line([polar((0.0, 0.0), r * edge, a) for r in (1.03, 1.09)], "limit") for a in tilts]
+        mark = Circle(scene.place(now.target or 0.0, radius, phi), radius, "target")
+        return [mark, *scene.shapes(now, ends=(-edge, edge)), *posts, *limits]
+
+    def window(self, now: Moment) -> Window:
+        """Look at the whole plank."""
+        return Window(-1.25 * self.edge, -0.6 * self.edge, 1.25 * self.edge, 0.6 * self.edge)
 
     def check_target(self, target: Any) -> float:
         """Refuse a target off the plane."""
@@ -160,6 +174,28 @@ class Brake(Task):
         """Return bounds; a start may lie at most 1000 m away."""
         speed = FASTEST_START + self.scene.constants()["pull"] * self.duration
         return [finite(1e3 + speed * self.duration), finite(speed)]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return the slope with the line, and the cylinder magnified."""
+        scene, radius, tilt = self.scene, self.scene.radius, self.scene.tilt
+        near, far = self._stretch(now)
+        line = Line([scene.place(0.0, 0.0, tilt), scene.place(0.0, 6.0 * radius, tilt)], "target")
+        lens = Lens(scene.place(now.state[0], radius, tilt), 2.2 * radius)
+        return [*scene.shapes(now, ends=(near - 3.0, far + 3.0)), line, lens]
+
+    def window(self, now: Moment) -> Window:
+        """Look at the last metres before the line, or at those around a cylinder that is farther away."""
+        scene = self.scene
+        ends = [scene.place(x, scene.radius, scene.tilt) for x in self._stretch(now)]
+        return Window(ends[0][0], ends[1][1], ends[1][0], ends[0][1])
+
+    def _stretch(self, now: Moment) -> tuple[float, float]:
+        start = min(-3.2, now.state[0] - 0.2)
+        return start, start + 3.6
+
+    def readings(self, now: Moment) -> list[Reading]:
+        """Tell the speed at which the line should be crossed."""
+        return [Reading("x_dot*", self.gentle, "m/s", "target")]
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start beyond the line, or uphill."""

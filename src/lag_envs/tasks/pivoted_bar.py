@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes import PivotedBar
+from lag_envs.scenes.shapes import Line, Moment, Polygon, Shape, Window, polar
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 
@@ -33,6 +34,11 @@ class SwingUp(Task):
         return self.scene.track is not None
 
     @property
+    def variant(self) -> tuple:
+        """Add whether there is an end of the track to guard."""
+        return *super().variant, self.scene.track == math.inf
+
+    @property
     def observation(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the observation's entries."""
         return (*(("s/S", "s_dot/2") if self.has_track else ()), "cos(theta)", "sin(theta)", "theta_dot/8")
@@ -53,11 +59,12 @@ class SwingUp(Task):
         if not self.has_track or math.isinf(self.scene.track):
             return wanted
         s, s_dot = y[:2]
-        high = _guard(s, s_dot, k, dt, xp)
-        low = -_guard(-s, -s_dot, k, dt, xp)
-        allowed = clip(wanted, low, high, xp)
-        # Empty only by rounding at the edge of the safe set: brake.
-        return xp.where(low <= high, allowed, xp.where(s_dot > 0.0, -k.limit_control, k.limit_control))
+        v = s_dot + dt * wanted
+        right, left = _too_far(s, s_dot, v, k, dt), _too_far(-s, -s_dot, -v, k, dt)
+        # Both ends at once would leave nothing to choose from, which inside the safe set does not happen.
+        side = xp.where(right, 1.0, xp.where(left, -1.0, 0.0))
+        nearest = side * xp.minimum(side * wanted, _hardest(side * s, side * s_dot, k, dt, xp))
+        return xp.where(right | left, nearest, wanted)
 
     def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
         """Return h² - 0.02 (u/U)² with the height h = (1 - cosθ)/2."""
@@ -82,6 +89,11 @@ class SwingUp(Task):
                 support = [finite((1e3 + fastest * self.duration) / 0.5), finite(0.5 * fastest)]
         return [*support, 1.0, 1.0, finite(0.125 * _speed_bound(self, u))]
 
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add the upright bar."""
+        s = now.state[0] if self.has_track else 0.0
+        return [Polygon(self.scene.outline(s, math.pi), "target"), *super().shapes(now)]
+
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start from which the support cannot stop inside the track."""
         if self.has_track:
@@ -96,17 +108,23 @@ class SwingUp(Task):
                 )
 
 
-def _guard(s: Any, s_dot: Any, k: Any, dt: Any, xp: Any) -> Any:
-    """Return the largest u in [-U, U] for which braking at -U after the step stops at S at the latest.
+def _too_far(s: Any, s_dot: Any, v: Any, k: Any, dt: Any) -> Any:
+    """Tell whether braking at -U from speed v at the step's end would pass S.
 
-    With v = s' + u dt at the step's end the condition is v²/(2U) + s + s' dt + u dt²/2 <= S where v > 0, and
-    s + s' dt + u dt²/2 <= S holds of itself where v <= 0 inside the safe set. In v: v² + U dt v <= U (2 (S - s) - s' dt).
+    The condition v²/(2U) + s + s' dt + u dt²/2 <= S with v = s' + u dt, multiplied by 2U. Below v = -U dt/2 its left
+    side, a parabola in v, falls with v: there a move away from S, at most as fast as U allows, meets equality, and
+    rounding must not call that too far.
     """
     top = k.limit_control
+    return (v > -0.5 * (top * dt)) & (v * v + (top * dt) * v > top * (2.0 * (k.track - s) - s_dot * dt))
+
+
+def _hardest(s: Any, s_dot: Any, k: Any, dt: Any, xp: Any) -> Any:
+    """Return the largest u in [-U, U] that is not too far: the condition's root, solved for v."""
+    top = k.limit_control
     half = 0.5 * (top * dt)
-    room = top * (2.0 * (k.track - s) - s_dot * dt)
-    v = xp.sqrt(xp.maximum(half * half + room, 0.0)) - half
-    return clip((v - s_dot) / dt, -top, top, xp)
+    v = xp.sqrt(xp.maximum(half * half + top * (2.0 * (k.track - s) - s_dot * dt), 0.0)) - half
+    return clip((v - s_dot) * (1.0 / dt), -top, top, xp)
 
 
 class Balance(SwingUp):
@@ -171,6 +189,18 @@ class Balance(SwingUp):
             finite(self.largest_angle + swing * self.dt),
             finite(swing),
         ]
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Add how far the bar may lean."""
+        pivot, up, reach = (now.state[0], 0.0), 0.5 * math.pi, self.scene.reach
+        limits = [up - self.largest_angle, up + self.largest_angle]
+        lines = [Line([polar(pivot, r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
+        return [*super().shapes(now), *lines]
+
+    def window(self, now: Moment) -> Window:
+        """Look at the upper half."""
+        reach, side = self.scene.reach, self.scene.track + 0.5 * self.scene.reach
+        return Window(-side, -0.3 * reach, side, 1.15 * reach)
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start at which the episode would be over."""

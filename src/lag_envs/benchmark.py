@@ -1,0 +1,638 @@
+"""Speed beside other environments, and the time to a first step; the command ``lag-envs bench``.
+
+All contestants are measured in one process on one core, in turn, round after round, and compared within each
+round, so that a slow spell of the machine falls on all of them. A sample is a loop over actions made
+beforehand; it holds all that a step does: dynamics, observation, reward, endings, kicks, and the resets that
+follow.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+
+import lag_envs
+from lag_envs.tasks import TASKS
+
+SIZES = (1, 64, 1024, 16384)
+LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "jax", "torchrl", "torch")
+#: Environment of the process that measures: no library may start threads.
+ONE_THREAD = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
+    "JAX_PLATFORMS": "cpu",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+}
+#: What a cold start does, from the start of the process on.
+COLD_START = """
+import gymnasium, lag_envs
+env = gymnasium.make({id!r})
+env.reset(seed=1)
+env.step(env.action_space.sample())
+"""
+
+#: Takes at least that many steps of every environment, and returns how many it took.
+Run = Callable[[int], int]
+Clock = Callable[[], float]
+CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+class Target(NamedTuple):
+    """A ratio that ours is to reach, against Gymnasium's CartPole-v1 of the same kind and size."""
+
+    kind: str
+    num_envs: int
+    ratio: float
+
+    def __str__(self) -> str:
+        """Return what is compared."""
+        return f"{self.kind}, {self.num_envs:,}" if self.kind == "vector" else f"single, {self.kind}"
+
+
+TARGETS = (Target("made", 1, 2.0), Target("vector", 64, 6.0), Target("vector", 16384, 3.0))
+#: Seconds from the start of a process to its first step, by state of Numba's cache.
+COLD_TARGETS = {"empty": 2.5, "filled": 1.2}
+
+
+@dataclass
+class Settings:
+    """What is measured, and for how long."""
+
+    ids: tuple[str, ...] = tuple(TASKS)
+    sizes: tuple[int, ...] = SIZES
+    rounds: int = 31
+    seconds: float = 0.05  #: aimed length of one sample
+    clock: str = "wall"  #: or "cpu", which leaves out what other programs take of the core
+    speed: bool = True
+    cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
+    date: str = ""
+    output: str | None = None
+
+
+@dataclass
+class Contestant:
+    """One row of the table.
+
+    ``rates`` holds the env-steps per second of each round; ``problem`` tells why there are no (more) of them.
+    """
+
+    library: str
+    id: str
+    kind: str  #: "made", "unwrapped" or "vector"
+    num_envs: int
+    prepare: Callable[[], Run]
+    rates: list[float] = field(default_factory=list)
+    problem: str | None = None
+
+
+# --- the contestants ---
+
+
+def contestants(ids: Sequence[str], sizes: Sequence[int]) -> list[Contestant]:
+    """Return ours and the peers."""
+    rows = []
+    for id in ids:
+        rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
+        rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
+        rows += [Contestant("lag_envs", id, "vector", n, partial(ours, id, n)) for n in sizes]
+    for id in ("CartPole-v1", "Pendulum-v1"):
+        rows += [Contestant("gymnasium", id, "made", 1, partial(made, id))]
+    for library, id, prepare in PEERS:
+        rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
+    return rows
+
+
+def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
+    """Return batches of shape (n, 1), uniform in [-scale, scale]: enough that they do not repeat too soon."""
+    count = max(8, min(1024, 2**17 // n))
+    return list(np.random.default_rng(0).uniform(-scale, scale, (count, n, 1)).astype(np.float32))
+
+
+def made(id: str) -> Run:
+    """Prepare one environment as users make it, in Gymnasium's default wrappers."""
+    return single(gym.make(id))
+
+
+def unwrapped(id: str) -> Run:
+    """Prepare one environment without wrappers."""
+    return single(gym.make(id).unwrapped)
+
+
+def single(env: gym.Env) -> Run:
+    """Prepare one environment of Gymnasium's interface."""
+    actions: list[Any]
+    if isinstance(env.action_space, gym.spaces.Discrete):
+        actions = [int(a[0, 0] > 0.0) for a in random_actions(1)]
+    else:
+        actions = [a[0] for a in random_actions(1, float(env.action_space.high[0]))]  # type: ignore[attr-defined]
+    endless = cycle(actions)
+    env.reset(seed=0)
+
+    def run(steps: int) -> int:
+        for action in islice(endless, steps):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return steps
+
+    return run
+
+
+def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
+    """Prepare a batch that resets its environments itself."""
+    endless = cycle(actions)
+
+    def run(steps: int) -> int:
+        for action in islice(endless, steps):
+            step(action)
+        return steps
+
+    return run
+
+
+def ours(id: str, n: int) -> Run:
+    """Prepare a native vector environment."""
+    envs = gym.make_vec(id, num_envs=n)
+    actions = random_actions(n)
+    envs.reset(seed=0)
+    spread_out(envs, actions)
+    return batch(envs.step, actions)
+
+
+def spread_out(envs: VectorEnv, actions: Sequence[Any]) -> None:
+    """Shift the episodes against each other, so that every sample has its share of endings."""
+    limit = envs.spec.max_episode_steps if envs.spec else None
+    length = limit or round(envs.task.limit)  # type: ignore[attr-defined]
+    turn = np.arange(envs.num_envs) * length // envs.num_envs
+    for i, action in enumerate(islice(cycle(actions), length)):
+        if (turn == i).any():
+            envs.reset(options={"reset_mask": turn == i})
+        envs.step(action)
+
+
+def cartpole(n: int) -> Run:
+    """Prepare Gymnasium's own vector environment of CartPole; its episodes soon end all over the place."""
+    envs = gym.make_vec("CartPole-v1", num_envs=n, vectorization_mode="vector_entry_point")
+    envs.reset(seed=0)
+    run = batch(envs.step, [(a[:, 0] > 0.0).astype(np.int64) for a in random_actions(n)])
+    run(100)
+    return run
+
+
+def envpool(n: int) -> Run:
+    """Prepare EnvPool on one thread."""
+    pool = import_module("envpool")
+    envs = pool.make_gymnasium("Pendulum-v1", num_envs=n, num_threads=1, seed=0)
+    envs.reset()
+    return batch(envs.step, random_actions(n, 2.0))
+
+
+def gymnax(n: int, together: int = 8) -> Run:
+    """Prepare gymnax, several steps in one compiled call, as it is meant to be used."""
+    jax = import_module("jax")
+    env, params = import_module("gymnax").make("Pendulum-v1")
+    reset = jax.vmap(env.reset, in_axes=(0, None))
+    step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
+    actions = jax.numpy.asarray(np.stack(random_actions(n, 2.0)[:together])[:, :, 0])
+
+    def one(state: Any, inputs: tuple) -> tuple:
+        key, action = inputs
+        observation, state, *others = step(jax.random.split(key, n), state, action, params)
+        return state, (observation, others[:-1])  # all but info
+
+    @jax.jit
+    def several(key: Any, state: Any) -> tuple:
+        key, now = jax.random.split(key)
+        return key, *jax.lax.scan(one, state, (jax.random.split(now, together), actions))
+
+    key = jax.random.PRNGKey(0)
+    _, state = jax.jit(reset)(jax.random.split(key, n), params)
+
+    def run(steps: int) -> int:
+        nonlocal key, state
+        calls = -(-steps // together)
+        for _ in range(calls):
+            key, state, seen = several(key, state)
+            jax.block_until_ready(seen)
+        return calls * together
+
+    return run
+
+
+def torchrl(n: int) -> Run:
+    """Prepare TorchRL's pendulum; its episodes have no end."""
+    torch = import_module("torch")
+    torch.set_num_threads(1)
+    env = import_module("torchrl.envs").PendulumEnv()
+    actions = cycle([torch.from_numpy(a) for a in random_actions(n, 2.0)])
+    now = env.reset(env.gen_params(batch_size=[n]))
+
+    @torch.no_grad()
+    def run(steps: int) -> int:
+        nonlocal now
+        for action in islice(actions, steps):
+            now["action"] = action
+            now = env.step(now)["next"]
+        return steps
+
+    return run
+
+
+#: Peers with batches: library, what they run, how they are prepared.
+PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
+    ("gymnasium", "CartPole-v1", cartpole),
+    ("envpool", "Pendulum-v1", envpool),
+    ("gymnax", "Pendulum-v1", gymnax),
+    ("torchrl", "PendulumEnv", torchrl),
+]
+
+
+# --- measuring ---
+
+
+def bench(settings: Settings) -> dict[str, Any]:
+    """Measure, print the tables, write the file if one is named, and return what it holds."""
+    rows = contestants(settings.ids, settings.sizes) if settings.speed else []
+    cold: dict[str, list[float]] = {}
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
+    if complete and settings.cold_starts:
+        complete = cold_starts(settings.ids[0], settings.cold_starts, cold)
+    results = [summary(row, rows) for row in rows]
+    report: dict[str, Any] = {
+        "date": settings.date,
+        "complete": complete,
+        "machine": machine() | {"load_at_start": load},
+        "versions": versions(),
+        "settings": asdict(settings),
+        "rows": results,
+        "cold_start": {
+            name: {"seconds": times, "median": quartiles(times)[1]} for name, times in cold.items()
+        },
+    }
+    report["targets"] = verdicts(results, cold)
+    print("\n".join(table(report)))
+    if settings.output:
+        Path(settings.output).write_text(
+            json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
+        print(f"written to {settings.output}")
+    return report
+
+
+def measure(
+    rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
+) -> bool:
+    """Fill in the contestants' rates; return False where the user broke it off, keeping what there is."""
+    runs: dict[int, tuple[Run, int]] = {}
+    with progress(len(rows) * (rounds + 1)) as advance:
+        try:
+            for i, row in enumerate(rows):
+                advance(f"{row.library} {row.id} {row.kind} {row.num_envs}")
+                with excused(row):
+                    run = row.prepare()
+                    runs[i] = run, calibrate(run, seconds, clock)
+            for _ in range(rounds):
+                for i, row in enumerate(rows):
+                    advance("measuring")
+                    if row.problem is None:
+                        with excused(row):
+                            row.rates.append(rate(*runs[i], clock) * row.num_envs)
+        except KeyboardInterrupt:
+            return False
+    return True
+
+
+@contextmanager
+def excused(row: Contestant) -> Iterator[None]:
+    """Note in the row what goes wrong with a contestant, so that the others can go on."""
+    try:
+        yield
+    except Exception as error:
+        missing = isinstance(error, ModuleNotFoundError) and error.name == row.library
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        row.problem = "not installed" if missing else f"failed: {text[:200]}"
+
+
+def calibrate(run: Run, seconds: float, clock: Clock) -> int:
+    """Return the number of steps that take about that long."""
+    run(1)  # compiles
+    steps = 1
+    while True:
+        start = clock()
+        taken = run(steps)
+        elapsed = clock() - start
+        if elapsed >= 0.25 * seconds:
+            return max(1, round(taken * seconds / elapsed))
+        steps *= 2
+
+
+def rate(run: Run, steps: int, clock: Clock) -> float:
+    """Return steps per second."""
+    run(1)  # what the others have pushed out of the caches comes back
+    start = clock()
+    taken = run(steps)
+    return taken / (clock() - start)
+
+
+def cold_starts(id: str, count: int, times: dict[str, list[float]]) -> bool:
+    """Time whole processes up to the first step into `times`; return False where the user broke it off."""
+    empty = (count + 1) // 2
+    with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
+        try:
+            for i in range(empty):
+                advance("cold start, cache empty")
+                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}"))
+            for _ in range(count):
+                advance("cold start, cache filled")
+                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0"))
+        except KeyboardInterrupt:
+            return False
+    return True
+
+
+def cold_start(id: str, cache: str) -> float:
+    """Return the seconds that a process takes from its start to its end after one step."""
+    command = [sys.executable, "-P", "-c", COLD_START.format(id=id)]
+    start = time.perf_counter()
+    subprocess.run(command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True)
+    return time.perf_counter() - start
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[str], None]]:
+    """Show a progress bar on a terminal, tqdm's where it is installed; yields a function that advances it."""
+    if not sys.stderr.isatty() or not total:
+        yield lambda text: None
+        return
+    try:
+        tqdm = import_module("tqdm").tqdm
+    except ImportError:
+        done = 0
+
+        def advance(text: str) -> None:
+            nonlocal done
+            done += 1
+            print(f"\r{100 * done // total:3d} % {text:60.60}", end="", file=sys.stderr, flush=True)
+
+        yield advance
+        print(f"\r{'':66}\r", end="", file=sys.stderr, flush=True)
+        return
+    with tqdm(total=total, leave=False, unit="", dynamic_ncols=True) as bar:
+
+        def advance(text: str) -> None:
+            bar.set_description_str(f"{text:40.40}", refresh=False)
+            bar.update()
+
+        yield advance
+
+
+# --- statistics ---
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return lower quartile, median and upper quartile.
+
+    Examples
+    --------
+    >>> quartiles([4.0, 1.0, 3.0, 2.0, 5.0])
+    (2.0, 3.0, 4.0)
+    """
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+    return low, middle, high
+
+
+def ratios(rates: Sequence[float], others: Sequence[float]) -> list[float]:
+    """Return the ratio within each round that both have.
+
+    Examples
+    --------
+    >>> ratios([4.0, 9.0], [2.0, 3.0, 5.0])
+    [2.0, 3.0]
+    """
+    return [a / b for a, b in zip(rates, others, strict=False)]
+
+
+def summary(row: Contestant, rows: Sequence[Contestant]) -> dict[str, Any]:
+    """Return a row with its statistics, and its ratio to CartPole-v1 of its size."""
+    kind = "vector" if row.kind == "vector" else "made"
+    rival = [
+        r.rates
+        for r in rows
+        if (r.library, r.id, r.kind, r.num_envs) == ("gymnasium", "CartPole-v1", kind, row.num_envs)
+    ]
+    result = {name: getattr(row, name) for name in ("library", "id", "kind", "num_envs", "problem", "rates")}
+    if row.rates:
+        result["steps_per_second"] = quartiles(row.rates)
+    if rival and (pairs := ratios(row.rates, rival[0])):
+        result["ratio"] = quartiles(pairs)
+    return result
+
+
+def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> list[dict[str, Any]]:
+    """Hold what was measured against the targets; ``met`` is None where nothing was measured."""
+    results = []
+    for target in TARGETS:
+        measured = {
+            row["id"]: row["ratio"][1]
+            for row in rows
+            if row["library"] == "lag_envs"
+            and (row["kind"], row["num_envs"]) == target[:2]
+            and "ratio" in row
+        }
+        met = all(value >= target.ratio for value in measured.values()) if measured else None
+        goal = f"{target}: at least {target.ratio:g} x CartPole-v1"
+        results.append({"target": goal, "limit": target.ratio, "met": met, "measured": measured})
+    for name, limit in COLD_TARGETS.items():
+        measured = {"seconds": quartiles(cold[name])[1]} if cold.get(name) else {}
+        met = measured["seconds"] < limit if measured else None
+        goal = f"cold start, cache {name}: below {limit:g} s"
+        results.append({"target": goal, "limit": limit, "met": met, "measured": measured})
+    return results
+
+
+def machine() -> dict[str, Any]:
+    """Describe the machine."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        lines = info.read_text(encoding="utf-8").splitlines()
+        model = next(
+            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model
+        )
+    return {
+        "processor": model or platform.machine(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what takes part."""
+    found = {"lag_envs": lag_envs.__version__}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+# --- printing ---
+
+
+def table(report: dict[str, Any]) -> list[str]:
+    """Return the report as lines of text."""
+    about, settings = report["machine"], report["settings"]
+    lines = [
+        f"{about['processor']}, {about['cores']} cores, {about['system']}, Python {about['python']}",
+        f"one core, {settings['clock']} time, {settings['rounds']} samples of {settings['seconds']:g} s each",
+        ", ".join(f"{name} {number}" for name, number in report["versions"].items()),
+        "",
+    ]
+    if report["rows"]:
+        head = (
+            "library",
+            "environment",
+            "kind",
+            "envs",
+            "steps/s",
+            "(quartiles)",
+            "ns/step",
+            "x CartPole",
+            "(quartiles)",
+        )
+        lines += columns([head, *map(_cells, report["rows"])])
+        lines += [
+            "",
+            "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
+            "",
+        ]
+    for name, cold in report["cold_start"].items():
+        low, middle, high = quartiles(cold["seconds"])
+        spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
+        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}"]
+    if report["cold_start"]:
+        lines += [""]
+    words = {True: "met", False: "missed", None: "not measured"}
+    lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
+    if not report["complete"]:
+        lines += ["", "broken off: these are the samples until then"]
+    return lines
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Align the rows' cells; what looks like a number goes to the right.
+
+    Examples
+    --------
+    >>> columns([("a", "1"), ("bc", "23")])
+    ['a    1', 'bc  23']
+    """
+    widths = [max(len(row[j]) for row in rows if j < len(row)) for j in range(max(map(len, rows)))]
+    return [
+        "  ".join(
+            cell.rjust(width) if cell[:1].isdigit() else cell.ljust(width)
+            for cell, width in zip(row, widths, strict=False)
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def short(value: float) -> str:
+    """Return a rate with three digits.
+
+    Examples
+    --------
+    >>> short(1234.0), short(41_234_567.0)
+    ('1.23 k', '41.2 M')
+    """
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= 0.9995 * size:
+            value /= size
+            return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
+    return f"{value:.0f}"
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    name = (row["library"], row["id"], row["kind"], f"{row['num_envs']:,}")
+    if "steps_per_second" not in row:
+        return (*name, row["problem"] or "not measured")
+    low, middle, high = row["steps_per_second"]
+    cells: tuple[str, ...] = (*name, short(middle), f"({short(low)} - {short(high)})", f"{1e9 / middle:,.1f}")
+    if "ratio" in row:
+        low, middle, high = row["ratio"]
+        cells = (*cells, f"{middle:.2f}", f"({low:.2f} - {high:.2f})")
+    return (*cells, row["problem"]) if row["problem"] else cells
+
+
+def _worst(target: dict[str, Any]) -> str:
+    measured = target["measured"]
+    if not measured:
+        return ""
+    if "seconds" in measured:
+        return f"{measured['seconds']:.2f} s"
+    worst = min(measured, key=measured.get)
+    missed = sum(value < target["limit"] for value in measured.values())
+    return f"{measured[worst]:.2f} by {worst}" + (
+        f", missed by {missed} of {len(measured)}" if missed and len(measured) > 1 else ""
+    )
+
+
+# --- the process that measures ---
+
+
+def in_own_process(settings: Settings) -> int:
+    """Run `bench` in a process of its own, on one core and without threads; return its exit status."""
+    command = [sys.executable, "-P", "-m", "lag_envs.benchmark", json.dumps(asdict(settings))]
+    child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
+    breaks = 0
+    while True:
+        try:
+            return child.wait()
+        except KeyboardInterrupt:
+            breaks += 1
+            if breaks > 1:
+                child.kill()
+            elif os.name == "posix":
+                child.send_signal(signal.SIGINT)  # it may have come to this process alone
+
+
+def _break_off(*_: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # what was measured is still to be written
+    raise KeyboardInterrupt
+
+
+def main() -> int:
+    """Measure as the settings on the command line say."""
+    signal.signal(signal.SIGINT, _break_off)
+    warnings.simplefilter("ignore")  # of the peers
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    report = bench(Settings(**json.loads(sys.argv[1])))
+    return 0 if report["complete"] else 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,395 @@
+"""The command ``lag-envs``.
+
+To add a subcommand, write a function that declares its arguments and one that runs it, and add an entry to
+`COMMANDS`. What a subcommand needs is imported where it runs, so that ``lag-envs --help`` stays quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import difflib
+import inspect
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from lag_envs import TASKS, __version__
+
+if TYPE_CHECKING:
+    from lag_envs.tasks.base import Task
+
+
+class UserError(Exception):
+    """A mistake in the command line; its text is shown, without a traceback."""
+
+
+class Command(NamedTuple):
+    """A subcommand: how it is called, what it takes, what it does."""
+
+    name: str
+    help: str
+    description: str
+    declare: Callable[[argparse.ArgumentParser], Any]
+    run: Callable[[argparse.Namespace], int]
+
+
+# --- list ---
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print a line for every environment."""
+    head = ("id", "observation", "control", "dt", "steps", "length")
+    print("\n".join(_columns([head, *(_line(id) for id in TASKS)])))
+    print("\n`lag-envs info ID` tells more about one.")
+    return 0
+
+
+def _line(id: str) -> tuple[str, ...]:
+    task = _task(id)
+    low, high = _controls(task)
+    name, _, unit = task.scene.control_unit.partition(" [")
+    control = f"{name} {low:g} to {high:g} {unit.rstrip(']')}".rstrip()
+    return (
+        id,
+        ", ".join(task.observation),
+        control,
+        f"{task.dt:g} s",
+        f"{task.limit:g}",
+        f"{task.duration:g} s",
+    )
+
+
+# --- info ---
+
+
+def declare_info(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``info``."""
+    parser.add_argument("id", metavar="ID", help="an environment, such as PivotedBar-v0")
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Print what there is to know about an environment."""
+    from lag_envs.envs.single import observation_space
+
+    task = _task(_known(args.id))
+    scene = task.scene
+    low, high = _controls(task)
+    text = [args.id, "", inspect.getdoc(type(task)) or ""]
+    text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
+    states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
+    text += [f"State: {', '.join(states)}"]
+    text += [
+        f"Control: {scene.control_unit}, from {low:g} (action -1) to {high:g} (action 1) where episodes start"
+    ]
+    text += [f"Step: {task.dt:g} s; episode: {task.limit:g} steps, {task.duration:g} s"]
+    if task.target_range is not None:
+        text += [f"Target: uniform in ±{task.target_range:g}, or target=..."]
+
+    bounds = observation_space([task]).high
+    text += ["", "Observation and its bounds (proved for every start that is accepted)"]
+    text += _columns(
+        [("  " + name, f"±{bound:g}") for name, bound in zip(task.observation, bounds, strict=True)]
+    )
+    text += ["", "Start (uniform, unless reset(options={'state': ...}))"]
+    starts = zip(scene.state_names, task.centre, task.start, scene.state_units, strict=True)
+    text += _columns(
+        [("  " + name, f"{centre:.4g} ± {half:g} {unit}") for name, centre, half, unit in starts]
+    )
+    text += ["", "Parameters, keywords of gym.make"]
+    text += _columns(
+        [*(_parameter(field, scene) for field in dataclasses.fields(scene)), *_own_parameters(task)]
+    )
+    text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
+    print("\n".join(text))
+    return 0
+
+
+def _parameter(field: dataclasses.Field, scene: Any) -> tuple[str, str, str]:
+    value, meta = getattr(scene, field.name), field.metadata
+    rules = [(word, meta.get(word)) for word in ("above", "least", "below")]
+    rule = ", ".join(
+        f"{'at least' if word == 'least' else word} {limit:g}" for word, limit in rules if limit is not None
+    )
+    shown = f"{value:.6g} {meta.get('unit', '')}" if isinstance(value, float) else repr(value)
+    return f"  {field.name}", shown.rstrip(), rule
+
+
+def _own_parameters(task: Task) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [
+        ("  dt", f"{task.dt:g} s", "1e-6 to 1"),
+        ("  duration", f"{task.duration:g} s", "at least dt; math.inf for no end"),
+    ]
+    return rows + [("  target", "None", "random if None")] * (task.target_range is not None)
+
+
+def _accuracy(task: Task) -> list[str]:
+    """Say what is proved of a step with the largest control, and how far one substep goes."""
+    scene, angle = task.scene, task.scene.angle
+    low, high = _controls(task)
+
+    def bound(speed: float | None = None) -> Any:
+        """Return the bound of the worse of the two controls, from the farthest start or at a given θ'."""
+        state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+        if speed is not None and angle is not None:
+            state[angle + 1] = speed
+        bounds = [scene.truncation_bound(state, u, task.dt) for u in (low, high)]
+        return max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
+
+    first = bound()
+    if first is None:
+        return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
+    near, far = 0.0, 1e4
+    if bound(near).substeps > 1:
+        reach = (
+            "no step is certified for a single substep: the number follows from the bound before each step"
+        )
+    else:
+        for _ in range(60):
+            middle = 0.5 * (near + far)
+            near, far = (middle, far) if bound(middle).substeps == 1 else (near, middle)
+        reach = (
+            f"one substep is certified up to |theta_dot| = {near:.3g} rad/s; above, the bound tells how many"
+        )
+    return [
+        f"Taylor series of order {first.order}",
+        f"from the edge of the starts under the largest control: {first.substeps} substep(s)",
+        f"proved truncation error there: {first.theta:.1e} rad, {first.theta_dot:.1e} rad/s",
+        reach,
+    ]
+
+
+# --- bench ---
+
+
+def declare_bench(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``bench``."""
+    parser.add_argument(
+        "ids",
+        metavar="ID",
+        nargs="*",
+        help="environments to measure (default: all; PivotedBar-v0 with --quick)",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
+    )
+    parser.add_argument(
+        "--cold", action="store_true", help="only the cold start: import, make, reset, first step"
+    )
+    parser.add_argument(
+        "--output", metavar="FILE", help="write everything, raw samples included, to this JSON file"
+    )
+    parser.add_argument(
+        "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
+    )
+    parser.add_argument(
+        "--rounds", metavar="N", type=_count, help="samples of each row (default: 31, or 9 with --quick)"
+    )
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=_seconds,
+        help="length of a sample (default: 0.05, or 0.02 with --quick)",
+    )
+    parser.add_argument(
+        "--clock",
+        choices=["wall", "cpu"],
+        default="wall",
+        help="cpu leaves out what other programs take (default: wall)",
+    )
+    parser.add_argument(
+        "--date", default=date.today().isoformat(), help="date to note in the file (default: today)"
+    )
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """Compare speeds."""
+    from lag_envs.benchmark import Settings, in_own_process
+
+    ids = tuple(map(_known, dict.fromkeys(args.ids))) or (
+        ("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS)
+    )
+    if args.output:
+        _check_writable(Path(args.output))
+    quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
+    given = {
+        name: getattr(args, name)
+        for name in ("sizes", "rounds", "seconds")
+        if getattr(args, name) is not None
+    }
+    plain = {
+        "ids": ids,
+        "speed": not args.cold,
+        "clock": args.clock,
+        "date": args.date,
+        "output": args.output,
+    }
+    return in_own_process(Settings(**(quick | given | plain)))
+
+
+def _check_writable(path: Path) -> None:
+    """Refuse before the measurement a file that could not be written after it."""
+    if path.is_dir():
+        raise UserError(f"--output must name a file, and {path} is a folder")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--output: there is no folder {path.absolute().parent}")
+    if not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
+        raise UserError(f"--output: {path} cannot be written to")
+
+
+def _sizes(text: str) -> tuple[int, ...]:
+    return tuple(map(_count, text.split(",")))
+
+
+def _count(text: str) -> int:
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
+    return int(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"a number above 0 is needed, got {text!r}")
+    return value
+
+
+# --- the command ---
+
+COMMANDS: tuple[Command, ...] = (
+    Command(
+        "list",
+        "list the environments",
+        "List the environments: observation, control, control interval, steps and length of an episode.",
+        lambda parser: None,
+        run_list,
+    ),
+    Command(
+        "info",
+        "tell about one environment",
+        """Tell about one environment: state, control, observation bounds, start, parameters, accuracy.
+
+examples:
+  lag-envs info PivotedBar-v0
+  lag-envs info InclineTilt-v0""",
+        declare_info,
+        run_info,
+    ),
+    Command(
+        "bench",
+        "compare the speed with other libraries",
+        """Compare steps per second with Gymnasium and, where installed, EnvPool, gymnax and TorchRL, in one
+run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
+the cold start of whole processes. Ctrl-C ends the measurement and keeps what there is.
+
+examples:
+  lag-envs bench --quick                             one environment, under a minute
+  lag-envs bench --output speed.json                 everything, a few minutes
+  lag-envs bench PivotedBar-v0 InclineTilt-v0 --sizes 64,16384
+  lag-envs bench --cold                              only the cold start
+  lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
+        declare_bench,
+        run_bench,
+    ),
+)
+
+EXAMPLES = """examples:
+  lag-envs list                      what environments there are
+  lag-envs info PivotedBar-v0        all about one of them
+  lag-envs bench --quick             how fast they are beside others
+  lag-envs bench --help              more about one command"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command."""
+    whole = argparse.ArgumentParser(
+        prog="lag-envs",
+        description="Mechanics as Gymnasium environments, stepped to near machine precision.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    whole.add_argument("--version", action="version", version=f"lag-envs {__version__}")
+    commands = whole.add_subparsers(title="commands", metavar="COMMAND")
+    for command in COMMANDS:
+        description, _, examples = command.description.partition("\n\nexamples:")
+        one = commands.add_parser(
+            command.name,
+            help=command.help,
+            description=description,
+            epilog=examples and "examples:" + examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.declare(one)
+        one.set_defaults(run=command.run)
+    return whole
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its status: 0, 2 for a mistake in the command line, 130 when broken off."""
+    args = parser().parse_args(arguments)
+    if "run" not in args:
+        parser().print_help(sys.stderr)
+        return 2
+    try:
+        return args.run(args)
+    except UserError as error:
+        print(f"lag-envs: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # The reader, such as `head`, has left; nothing more is to be written, at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+# --- what several need ---
+
+
+def _known(id: str) -> str:
+    """Return the id, or raise a UserError that names similar ones."""
+    if id in TASKS:
+        return id
+    names = {name.lower(): name for name in TASKS}
+    close = difflib.get_close_matches(id.lower(), names, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(names[c] for c in close)}?" if close else "`lag-envs list` names all"
+    raise UserError(f"there is no environment {id!r}; {hint}")
+
+
+def _task(id: str) -> Task:
+    from lag_envs.tasks import load_task
+
+    place, fixed = TASKS[id]
+    return load_task(place)(**fixed)
+
+
+def _controls(task: Task) -> tuple[float, float]:
+    """Return the controls of the actions -1 and 1 at the centre of the starts."""
+    from types import SimpleNamespace
+
+    import numpy as np
+
+    from lag_envs.envs.program import constants_of
+
+    k = SimpleNamespace(**constants_of(task))
+    y = task.scene.lift(np.asarray(task.centre, dtype=np.float64))
+    low, high = (float(task.control(a, y, k, task.dt, np)) for a in (-1.0, 1.0))
+    return low, high
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,38 @@
+"""What the tests of the environments share: ids, actions, and what an episode looks like bit for bit."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import gymnasium as gym
+import numpy as np
+
+from lag_envs.tasks import TASKS
+
+IDS = list(TASKS)
+RENDERS = find_spec("pygame") is not None and find_spec("lag_envs.envs.rendering") is not None
+
+
+def make(env_id, **options):
+    """Return the environment itself, without Gymnasium's wrappers."""
+    return gym.make(env_id, disable_env_checker=True, **options).unwrapped
+
+
+def actions(steps, *shape, seed=0):
+    """Return actions of three tempers: noise, stubborn full swings, and some beyond the limits."""
+    rng = np.random.default_rng(seed)
+    noise = rng.uniform(-1.0, 1.0, (steps, *shape))
+    swings = np.repeat(rng.choice([-1.0, 0.0, 1.0], (steps // 20 + 1, *shape)), 20, axis=0)[:steps]
+    temper = np.repeat(rng.integers(3, size=(steps // 50 + 1, *shape)), 50, axis=0)[:steps]
+    return np.select([temper == 0, temper == 1], [noise, swings], 2.0 * noise).astype(np.float32)
+
+
+def trace(env, given):
+    """Return what the steps return, as bytes where arrays; an episode that is over is followed by the next."""
+    out = []
+    for action in given:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        out.append((observation.tobytes(), reward, terminated, truncated))
+        if terminated or truncated:
+            out.append(env.reset()[0].tobytes())
+    return out

@@ -1,0 +1,306 @@
+"""The command `lag-envs` and the benchmark: what they print, write and survive. No speed is judged here."""
+
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+import lag_envs
+from lag_envs import benchmark, cli
+from lag_envs.benchmark import Contestant, Settings
+from lag_envs.tasks import TASKS
+
+ID = "PivotedBarFree-v0"
+
+
+def call(capsys, *arguments):
+    """Run the command in this process; return its exit status and what it printed."""
+    try:
+        status = cli.main(arguments)
+    except SystemExit as end:
+        status = end.code
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+# --- the command ---
+
+
+@pytest.mark.parametrize("command", [[], *([command.name] for command in cli.COMMANDS)])
+def test_help_teaches(command, capsys):
+    status, out, _ = call(capsys, *command, "--help")
+    assert status == 0
+    assert "usage: lag-envs" in out
+    if command != ["list"]:
+        assert "examples:\n  lag-envs " in out
+
+
+def test_no_command_shows_the_help(capsys):
+    status, out, err = call(capsys)
+    assert (status, out) == (2, "")
+    assert "lag-envs bench --quick" in err
+
+
+def test_version(capsys):
+    assert call(capsys, "--version") == (0, f"lag-envs {lag_envs.__version__}\n", "")
+
+
+def test_list_has_a_line_for_each_environment(capsys):
+    status, out, _ = call(capsys, "list")
+    assert status == 0
+    for id in TASKS:
+        (line,) = [line for line in out.splitlines() if line.startswith(id + " ")]
+        assert line.endswith("10 s")
+
+
+def test_list_shows_the_control_in_its_unit(capsys):
+    out = call(capsys, "list")[1]
+    (line,) = [line for line in out.splitlines() if line.startswith("PivotedBar-v0")]
+    assert "  s'' -5 to 5 m/s²  0.02 s  500  10 s" in re.sub(" {2,}", "  ", line)
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_info_tells_about_parameters_and_accuracy(id, capsys):
+    status, out, _ = call(capsys, "info", id)
+    assert status == 0
+    words = {line.split()[0] for line in out.splitlines() if line}
+    task = cli._task(id)
+    assert {*task.scene.state_names, *task.observation, "mass", "gravity", "dt", "duration"} <= words
+    assert "one substep" in out
+
+
+def test_info_certifies_the_substeps(capsys):
+    out = call(capsys, "info", ID)[1]
+    (line,) = [line for line in out.splitlines() if "certified up to" in line]
+    fastest = float(line.split("=")[1].split()[0])
+    task = cli._task(ID)
+
+    def substeps(speed):
+        return max(task.scene.truncation_bound([0.1, speed], u, task.dt).substeps for u in (-5.0, 5.0))
+
+    assert substeps(0.99 * fastest) == 1
+    assert substeps(1.01 * fastest) > 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["info", "PivotdBar-v0"], "there is no environment 'PivotdBar-v0'; did you mean PivotedBar-v0"),
+        (["info", "pivotedbar-v0"], "did you mean PivotedBar-v0"),
+        (["info", "???"], "`lag-envs list` names all"),
+        (["bench", "InclineTild-v0"], "did you mean InclineTilt-v0"),
+        (["bench", "--sizes", "1,x"], "a whole number of at least 1 is needed, got 'x'"),
+        (["bench", "--rounds", "0"], "a whole number of at least 1 is needed, got '0'"),
+        (["bench", "--seconds", "nan"], "a number above 0 is needed, got 'nan'"),
+        (["bench", "--output", "."], "--output must name a file"),
+        (["bench", "--output", "no/such/folder.json"], "there is no folder"),
+        (["fly"], "invalid choice: 'fly'"),
+    ],
+)
+def test_mistakes_are_told_without_a_traceback(arguments, message, capsys):
+    status, out, err = call(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_a_reader_that_leaves_is_no_error(tmp_path):
+    script = (
+        "import os, sys; from lag_envs import cli; r, w = os.pipe(); os.dup2(w, 1); os.close(w); os.close(r);"
+    )
+    script += "sys.exit(cli.main(['list']))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# --- the benchmark ---
+
+
+def tiny(tmp_path, **changes):
+    """Return settings for a measurement of no length."""
+    some = {"ids": (ID,), "sizes": (1, 3), "rounds": 2, "seconds": 1e-4, "cold_starts": 0}
+    return Settings(**(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes))
+
+
+def broken(n):
+    raise OSError("no luck\ntoday")
+
+
+def absent(n):
+    raise ModuleNotFoundError("No module named 'gone'", name="gone")
+
+
+def peers(*prepare):
+    return [("gone", f"Peer{i}", p) for i, p in enumerate(prepare)]
+
+
+def row(report, id, kind="vector", num_envs=1):
+    (found,) = [r for r in report["rows"] if (r["id"], r["kind"], r["num_envs"]) == (id, kind, num_envs)]
+    return found
+
+
+def test_bench_writes_json_and_goes_on_past_failing_peers(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "PEERS", [*peers(broken, absent), *benchmark.PEERS[:1]])
+    benchmark.bench(tiny(tmp_path))
+    out = capsys.readouterr().out
+    report = json.loads((tmp_path / "speed.json").read_text())
+
+    assert report["complete"]
+    assert report["date"] == "2020-02-20"
+    assert report["versions"].keys() >= {"lag_envs", "gymnasium", "numpy", "numba"}
+    assert report["machine"].keys() >= {"processor", "cores", "system", "python"}
+    for kind, n in (("made", 1), ("unwrapped", 1), ("vector", 1), ("vector", 3)):
+        ours = row(report, ID, kind, n)
+        assert len(ours["rates"]) == 2 and all(rate > 0.0 for rate in ours["rates"])
+        assert len(ours["ratio"]) == 3
+    assert row(report, "CartPole-v1", "made")["ratio"] == [1.0, 1.0, 1.0]
+    assert row(report, "Pendulum-v1", "made")["rates"]
+
+    assert row(report, "Peer0")["problem"] == "failed: OSError: no luck today"
+    assert row(report, "Peer1")["problem"] == "not installed"
+    assert row(report, "Peer1")["rates"] == []
+    lines = [line for line in out.splitlines() if "Peer0" in line]
+    assert len(lines) == 2 and all(line.endswith("failed: OSError: no luck today") for line in lines)
+
+    met = {t["target"]: t["met"] for t in report["targets"]}
+    assert met["single, made: at least 2 x CartPole-v1"] in (True, False)
+    assert met["vector, 64: at least 6 x CartPole-v1"] is None
+    assert "not measured" in out
+
+
+def test_a_peer_that_fails_later_keeps_its_samples():
+    calls = []
+
+    def fails(steps):
+        calls.append(steps)
+        if len(calls) > 4:  # two to calibrate, two for the first sample
+            raise ZeroDivisionError("late")
+        return steps
+
+    rows = [
+        Contestant("gone", f"Peer{i}", "vector", 2, lambda run=run: run) for i, run in enumerate((fails, int))
+    ]
+    assert benchmark.measure(rows, 3, 1e-9)
+    assert rows[0].problem == "failed: ZeroDivisionError: late"
+    assert [len(row.rates) for row in rows] == [1, 3]
+
+
+def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monkeypatch):
+    calls = []
+
+    def interrupted(n):
+        def run(steps):
+            calls.append(steps)
+            if len(calls) > 8:
+                raise KeyboardInterrupt
+            return steps
+
+        return run
+
+    monkeypatch.setattr(benchmark, "PEERS", peers(interrupted))
+    benchmark.bench(tiny(tmp_path, sizes=(1,), rounds=1000, seconds=1e-6, cold_starts=3))
+    report = json.loads((tmp_path / "speed.json").read_text())
+    assert not report["complete"]
+    assert report["cold_start"] == {}
+    assert row(report, ID, "made")["rates"]
+    assert "broken off" in capsys.readouterr().out
+
+
+def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "PEERS", peers(broken))
+    report = benchmark.bench(tiny(tmp_path, sizes=(1,), output=None))
+    assert "ratio" not in row(report, ID)  # nothing of its kind to compare with
+    assert "ratio" in row(report, ID, "made")
+
+
+def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
+    output = tmp_path / "speed.json"
+    command = [sys.executable, "-m", "lag_envs.cli", "bench", ID, "--quick", "--sizes", "1", "--rounds", "1"]
+    command += ["--seconds", "1e-4", "--date", "today", "--output", str(output)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    report = json.loads(output.read_text())
+    assert report["complete"]
+    assert report["date"] == "today"
+    assert str(output) in done.stdout
+
+
+def test_cold_start_times_empty_and_filled_caches(monkeypatch):
+    caches = []
+    monkeypatch.setattr(benchmark, "cold_start", lambda id, cache: caches.append(cache) or float(len(caches)))
+    times = {}
+    assert benchmark.cold_starts(ID, 3, times)
+    assert times == {"empty": [1.0, 2.0], "filled": [3.0, 4.0, 5.0]}
+    assert caches[0] != caches[1]
+    assert caches[2:] == [caches[0]] * 3
+
+
+# --- statistics on known numbers ---
+
+
+def made(library, id, kind, num_envs, rates):
+    return Contestant(library, id, kind, num_envs, lambda: None, rates)
+
+
+def test_ratios_are_taken_within_a_round():
+    # The machine is ten times slower in the second round: the ratio of medians would be 2.5.
+    assert benchmark.ratios([40.0, 4.0, 50.0], [20.0, 2.0, 10.0]) == [2.0, 2.0, 5.0]
+    assert benchmark.quartiles([2.0, 2.0, 5.0])[1] == 2.0
+
+
+def test_rows_are_compared_with_cartpole_of_their_size():
+    rows = [
+        made("gymnasium", "CartPole-v1", "made", 1, [10.0, 10.0]),
+        made("gymnasium", "CartPole-v1", "vector", 1, [1.0, 1.0]),
+        made("gymnasium", "CartPole-v1", "vector", 64, [100.0, 200.0]),
+        made("lag_envs", ID, "unwrapped", 1, [30.0, 30.0]),
+        made("lag_envs", ID, "vector", 64, [700.0, 1000.0]),
+        made("lag_envs", ID, "vector", 7, [1.0, 1.0]),
+    ]
+    results = [benchmark.summary(r, rows) for r in rows]
+    assert results[3]["ratio"] == (3.0, 3.0, 3.0)
+    assert results[4]["ratio"] == (5.5, 6.0, 6.5)
+    assert results[4]["steps_per_second"] == (775.0, 850.0, 925.0)
+    assert "ratio" not in results[5]
+
+
+@pytest.mark.parametrize(("ratio", "met"), [(6.0, True), (5.99, False)])
+def test_targets(ratio, met):
+    rows = [{"library": "lag_envs", "id": ID, "kind": "vector", "num_envs": 64, "ratio": (0.0, ratio, 9.0)}]
+    results = {t["target"]: t for t in benchmark.verdicts(rows, {"empty": [2.0, 2.4, 9.0], "filled": [1.2]})}
+    assert results["vector, 64: at least 6 x CartPole-v1"]["met"] is met
+    assert results["vector, 64: at least 6 x CartPole-v1"]["measured"] == {ID: ratio}
+    assert results["single, made: at least 2 x CartPole-v1"]["met"] is None
+    assert results["cold start, cache empty: below 2.5 s"]["met"] is True
+    assert results["cold start, cache filled: below 1.2 s"]["met"] is False
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (999.0, "999"),
+        (1e3, "1.00 k"),
+        (9.996e3, "10.0 k"),
+        (123_456.0, "123 k"),
+        (999_900.0, "1.00 M"),
+        (2e9, "2.00 G"),
+    ],
+)
+def test_rates_have_three_digits(value, text):
+    assert benchmark.short(value) == text
+
+
+def test_episodes_are_spread_out():
+    import gymnasium as gym
+
+    envs = gym.make_vec(ID, num_envs=4, duration=0.16)  # 8 steps
+    envs.reset(seed=0)
+    actions = benchmark.random_actions(4)
+    benchmark.spread_out(envs, actions)
+    ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
+    assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
+    assert max(map(sum, ended)) == 1

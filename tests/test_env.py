@@ -1,0 +1,563 @@
+"""The single environment behind Gymnasium's interface, for every id."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from rollouts import IDS, RENDERS, actions, make, trace
+
+from lag_envs.envs.single import LagrangianEnv
+from lag_envs.scenes.base import StepRefused
+
+each_id = pytest.mark.parametrize("env_id", IDS)
+
+#: A safe start for each id, and some that its task must refuse.
+STARTS = {
+    "PivotedBar-v0": ([0.1, -0.2, 2.0, 3.0], [[0.6, 0, 0, 0], [0.3, 1.5, 0, 0], [-0.3, -1.5, 0, 0]]),
+    "PivotedBarFree-v0": ([2.0, 3.0], []),
+    "PivotedBarBalance-v0": ([0.1, -0.2, 3.0, 0.5], [[0, 0, 0, 0], [0.51, 0, math.pi, 0], [0, 0, -math.pi, 0]]),
+    "InclineTilt-v0": ([0.1, -0.2, 0.05], [[0.6, 0, 0], [0, 0, 0.11], [-0.6, 0, 0]]),
+    "InclineBrake-v0": ([-1.5, 0.4], [[0.1, 0.5], [0.0, 0.5], [-1.0, -0.1], [-2e3, 0]]),
+    "CylinderInCylinderTilt-v0": ([0.3, -0.2, 1.0], [[1.1, 0, 0], [0, 0, 6.1], [-1.1, 0, 0]]),
+    "CylinderInCylinderPump-v0": ([0.3, -0.2, 1.0], [[1.4, 0, 0], [0, 0, -3.1]]),
+    "CylinderInCylinderDamping-v0": ([0.3, -0.2], [[3.0, 0.0], [2e3, 20.0]]),
+}
+TARGETS = {"InclineTilt-v0": (0.2, 0.6), "CylinderInCylinderTilt-v0": (-0.4, 1.2)}
+#: Parameters that the scene or the task must refuse.
+IMPOSSIBLE = {
+    "PivotedBar": [{"mass": 0.0}, {"mass": -1.0}, {"com_distance": math.nan}, {"inertia": -1e-9}, {"damping": -0.1},
+                   {"gravity": math.inf}, {"track": 0.0}, {"track": "long"}, {"mass": True}, {"mass": "0.2"}],
+    "PivotedBarBalance": [{"track": None}, {"track": math.inf}],
+    "Incline": [{"radius": 0.0}, {"mass": math.nan}, {"gravity": -1.0}, {"damping": math.inf}],
+    "InclineTilt": [{"control": "damping"}, {"control": "magic"}, {"tilt": 0.1}, {"target": 0.51}, {"target": math.nan}],
+    "InclineBrake": [{"control": "tilt_rate"}, {"tilt": -0.1}, {"tilt": 1.6}, {"target": 0.1}],
+    "CylinderInCylinder": [{"radius": 0.5}, {"radius": 0.6}, {"shell_radius": 0.0}, {"mass": -1.0}],
+    "CylinderInCylinderTilt": [{"control": "damping"}, {"target": 1.06}, {"target": "up"}],
+    "CylinderInCylinderPump": [{"gravity": 0.0}],
+    "CylinderInCylinderDamping": [{"gravity": 0.0}, {"control": "tilt"}],
+    "": [{"dt": 0.0}, {"dt": 2.0}, {"dt": -0.02}, {"dt": math.nan}, {"dt": "fast"}, {"duration": 0.0}, {"duration": -1.0},
+         {"duration": math.nan}, {"duration": "long"}, {"duration": [1.0]}],
+}  # fmt: skip
+
+
+# --- checkers and registration --------------------------------------------------------------------------------
+
+
+@each_id
+def test_gymnasium_checker(env_id):
+    check_env(make(env_id), skip_render_check=not RENDERS)
+
+
+@each_id
+def test_stable_baselines_checker(env_id):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(make(env_id), skip_render_check=not RENDERS)
+
+
+@each_id
+def test_made_with_all_wrappers(env_id):
+    env = gym.make(env_id)  # PassiveEnvChecker warns of what it dislikes
+    env.reset(seed=1)
+    trace(env, actions(300, 1))
+    env.close()
+
+
+def test_namespace_of_the_module():
+    code = "import gymnasium as gym; e = gym.make('lag_envs:PivotedBar-v0'); e.reset(seed=1); print(e.spec.id)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split() == ["PivotedBar-v0"]
+
+
+@each_id
+def test_spec_survives_json(env_id):
+    env = gym.make(env_id, dt=0.04, damping=0.1) if "Damping" not in env_id else gym.make(env_id, dt=0.04)
+    spec = EnvSpec.from_json(env.spec.to_json())
+    assert spec == env.spec
+    twin = gym.make(spec)
+    assert twin.spec == env.spec
+    assert twin.unwrapped.task.dt == 0.04
+    assert twin.observation_space == env.observation_space
+    for e in (env, twin):
+        e.reset(seed=3)
+    assert trace(env, actions(60, 1)) == trace(twin, actions(60, 1))
+
+
+def test_spec_of_an_endless_episode_survives_json():
+    env = gym.make("PivotedBarFree-v0", duration=math.inf)
+    spec = EnvSpec.from_json(env.spec.to_json())
+    assert spec == env.spec and spec.max_episode_steps is None
+    assert gym.make(spec).unwrapped.task.duration == math.inf
+
+
+@each_id
+def test_spaces(env_id):
+    env = make(env_id)
+    assert env.action_space == gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    space = env.observation_space
+    assert space.dtype == np.float32 and space.shape == (len(env.task.observation),)
+    assert np.isfinite(space.high).all() and (space.low == -space.high).all()
+    assert type(env).metadata["render_modes"] == ["human", "rgb_array"]
+    assert env.metadata["render_fps"] == round(1.0 / env.task.dt)
+
+
+# --- seeds, copies --------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_a_seed_gives_one_episode(env_id):
+    given = actions(700, 1)
+    first, second, other = make(env_id), make(env_id), make(env_id)
+    starts = [env.reset(seed=seed)[0] for env, seed in ((first, 7), (second, 7), (other, 8))]
+    assert starts[0].tobytes() == starts[1].tobytes()
+    assert (starts[0] != starts[2]).any()
+    history = trace(first, given)
+    assert history == trace(second, given)
+    first.reset(seed=7)
+    assert trace(first, given) == history
+
+
+@each_id
+def test_reset_without_seed_goes_on_with_fresh_episodes(env_id):
+    env, twin = make(env_id), make(env_id)
+    starts = [[e.reset(seed=5)[0].tobytes(), *(e.reset()[0].tobytes() for _ in range(20))] for e in (env, twin)]
+    assert starts[0] == starts[1]
+    assert len(set(starts[0])) == 21
+
+
+@each_id
+def test_unseeded_environments_differ(env_id):
+    assert make(env_id).reset()[0].tobytes() != make(env_id).reset()[0].tobytes()
+
+
+@pytest.mark.parametrize("seed", [0, 2**32 - 1, 2**63, 2**64 + 5])
+def test_any_seed(seed):
+    env = make("PivotedBar-v0")
+    assert env.reset(seed=seed)[0].tobytes() == env.reset(seed=seed)[0].tobytes()
+    assert env.np_random_seed == seed
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "one"])
+def test_bad_seed(seed):
+    env, twin = running_twins("PivotedBar-v0")
+    with pytest.raises((gym.error.Error, TypeError)):
+        env.reset(seed=seed)
+    assert trace(env, actions(30, 1)) == trace(twin, actions(30, 1))
+
+
+@each_id
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"])
+def test_copies_go_on_alike(env_id, clone):
+    env = gym.make(env_id)
+    env.reset(seed=2)
+    trace(env, actions(37, 1))
+    twin = clone(env)
+    assert (twin.unwrapped.state == env.unwrapped.state).all()
+    assert trace(env, actions(300, 1, seed=1)) == trace(twin, actions(300, 1, seed=1))
+    assert twin.spec == env.spec
+
+
+def test_copies_are_independent():
+    env = make("PivotedBar-v0")
+    env.reset(seed=2)
+    before = env.state
+    twin = copy.deepcopy(env)
+    trace(twin, actions(5, 1))
+    assert (env.state == before).all()
+
+
+# --- parameters -----------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_unknown_keyword(env_id):
+    with pytest.raises(TypeError, match=r"unknown keyword 'colour'; this environment takes .*mass"):
+        make(env_id, colour="red")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [(env_id, options) for env_id in IDS for part, many in IMPOSSIBLE.items() if env_id.startswith(part) for options in many],
+)  # fmt: skip
+def test_impossible_parameters(env_id, options):
+    (name,) = options
+    with pytest.raises(ValueError, match=name):
+        make(env_id, **options)
+
+
+def test_bad_render_mode():
+    with pytest.raises(ValueError, match="render_mode must be one of human, rgb_array or None, got 'ascii'"):
+        LagrangianEnv("lag_envs.tasks.pivoted_bar:SwingUp", render_mode="ascii")
+
+
+def test_parameters_reach_the_scene():
+    env = make("PivotedBar-v0", mass=0.3, com_distance=0.4, inertia=0.01, damping=0.0, gravity=1.6, track=1.0)
+    scene = env.scene
+    assert (scene.mass, scene.com_distance, scene.inertia, scene.damping, scene.gravity, scene.track) == (
+        0.3, 0.4, 0.01, 0.0, 1.6, 1.0,
+    )  # fmt: skip
+    assert env.scene is env.task.scene
+
+
+@each_id
+def test_steps_are_those_of_simulate(env_id):
+    env = make(env_id)
+    env.reset(seed=1, options={"state": STARTS[env_id][0]})
+    for action in actions(40, 1):
+        before = env.state
+        _, _, terminated, truncated, _ = env.step(action)
+        after = env.scene.simulate(before, [env.control], env.task.dt)[1]
+        moved = env.state - after
+        if "Balance" in env_id or "InCylinderDamping" in env_id:
+            moved[-1] -= round(moved[-1] / 1.5) * 1.5 if "Damping" in env_id else moved[-1]  # a kick
+        np.testing.assert_allclose(moved, 0.0, atol=2e-15)
+        if terminated or truncated:
+            break
+
+
+# --- what a step returns --------------------------------------------------------------------------------------
+
+
+@each_id
+def test_types(env_id):
+    env = make(env_id)
+    observation, info = env.reset(seed=1)
+    assert type(observation) is np.ndarray and observation.dtype == np.float32 and info == {}
+    for action in actions(5, 1):
+        observation, reward, terminated, truncated, info = env.step(action)
+        assert type(observation) is np.ndarray and observation.dtype == np.float32
+        assert type(reward) is float and type(terminated) is bool and type(truncated) is bool and info == {}
+    assert env.state.dtype == np.float64 and type(env.control) is float
+    assert env.target is None or type(env.target) is float
+
+
+@each_id
+def test_nothing_is_shared(env_id):
+    env = make(env_id, diagnostics=True)
+    arrays, infos = [env.reset(seed=1)[0]], []
+    for action in actions(5, 1):
+        observation, *_, info = env.step(action)
+        arrays += [observation, env.state]
+        infos.append(info)
+    kept = [a.copy() for a in arrays]
+    env.step(actions(1, 1)[0])
+    for i, a in enumerate(arrays):
+        assert (a == kept[i]).all()
+        assert not any(np.shares_memory(a, b) for b in arrays[:i])
+    assert len({id(info) for info in infos}) == len(infos)
+    state = env.state
+    env.state[:] = 7.0
+    assert (env.state == state).all()
+
+
+@each_id
+@pytest.mark.parametrize("options", [{}, {"dt": 0.1}, {"dt": 1.0, "duration": 1.0}], ids=["usual", "slow", "one step"])
+def test_observations_stay_in_the_space(env_id, options):
+    env = make(env_id, **options)
+    given = actions(3000, 1, seed=4)
+    for policy in (lambda o, i: given[i], lambda o, i: np.sign(o[-1:]), lambda o, i: -np.sign(o[:1]), lambda o, i: np.sign(o[1:2])):
+        observation, _ = env.reset(seed=3)
+        for i in range(600):
+            assert observation in env.observation_space
+            observation, _, terminated, truncated, _ = env.step(policy(observation, i))
+            assert observation in env.observation_space
+            if terminated or truncated:
+                observation, _ = env.reset()
+
+
+@each_id
+@pytest.mark.parametrize("dt", [None, 1.0])
+def test_fastest_starts_stay_in_the_space(env_id, dt):
+    env = make(env_id, dt=dt, duration=dt)
+    rng = np.random.default_rng(0)
+    n = len(env.scene.state_names)
+    tried = 0
+    for _ in range(300):
+        state = np.array(STARTS[env_id][0]) * rng.choice([-1.0, 1.0, 1.8], n)
+        fast = [unit.endswith("/s") for unit in env.scene.state_units]
+        state[fast] = np.where(rng.random(sum(fast)) < 0.5, state[fast], rng.choice([-100.0, 100.0], sum(fast)))
+        try:
+            observation, _ = env.reset(options={"state": state})
+        except ValueError:
+            continue
+        tried += 1
+        assert observation in env.observation_space
+        for _ in range(5):
+            observation, _, terminated, truncated, _ = env.step(rng.choice([-1.0, 1.0], 1))
+            assert observation in env.observation_space
+            if terminated or truncated:
+                break
+    assert tried > 20
+
+
+def test_endless_episodes_are_bounded_by_float32():
+    env = make("PivotedBar-v0", duration=math.inf, track=math.inf)
+    big = np.finfo(np.float32).max
+    assert env.observation_space.high.tolist() == [big, big, 1.0, 1.0, big]
+    assert env.observation_space.contains(env.reset(seed=1)[0])
+
+
+# --- actions --------------------------------------------------------------------------------------------------
+
+BAD = [
+    [math.nan], [math.inf], [-math.inf], np.array([np.nan], dtype=np.float32), 0.5, np.float32(0.5), [], [0.1, 0.2],
+    [[0.1]], np.zeros((1, 1)), [1j], np.array([0.5 + 0j]), ["up"], "up", ["0.5"], None, [None], {}, object(), [[0.1], [0.2, 0.3]],
+    np.array([np.datetime64("2020-01-01")]),
+]  # fmt: skip
+
+
+def running_twins(env_id, **options):
+    """Return two environments in the midst of one episode."""
+    twins = make(env_id, **options), make(env_id, **options)
+    for env in twins:
+        env.reset(seed=11)
+        env.step(np.array([0.25]))
+    return twins
+
+
+@each_id
+def test_bad_actions_leave_the_environment_as_it_was(env_id):
+    env, twin = running_twins(env_id)
+    for action in BAD:
+        with pytest.raises(ValueError, match="action|inhomogeneous"):
+            env.step(action)
+    assert trace(env, actions(50, 1)) == trace(twin, actions(50, 1))
+
+
+@each_id
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        (np.array([3.5]), 1.0), ([-1e300], -1.0), ([1], 1.0), (np.array([1], dtype=np.int8), 1.0), ([True], 1.0),
+        (np.array([False]), 0.0), ((0.3,), 0.3), (np.array([0.5], dtype=np.float16), 0.5),
+        (np.array([0.3], dtype=np.longdouble), 0.3), (np.array([0.3], dtype=">f8"), 0.3), (np.array([2], dtype=np.uint64), 1.0),
+    ],
+)  # fmt: skip
+def test_other_actions_mean_their_value(env_id, given, meant):
+    env, twin = running_twins(env_id)
+    assert trace(env, [given]) == trace(twin, [np.array([meant])])
+
+
+@each_id
+def test_actions_are_not_rounded(env_id):
+    env, twin = running_twins(env_id)
+    env.step(np.array([0.3]))
+    twin.step(np.array([0.3], dtype=np.float32))
+    assert 0.0 < abs(env.control - twin.control) < 1e-7 * env.task.limit_control
+
+
+@each_id
+def test_the_action_is_not_changed(env_id):
+    env, _ = running_twins(env_id)
+    action = np.array([3.0], dtype=np.float32)
+    env.step(action)
+    assert action.tolist() == [3.0]
+
+
+# --- resets ---------------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_step_before_reset(env_id):
+    env = make(env_id)
+    with pytest.raises(ResetNeeded, match="no episode has begun"):
+        env.step(np.zeros(1))
+    env.reset(seed=1)
+    env.step(np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "start", "action"),
+    [
+        ("PivotedBarBalance-v0", [0.0, 0.0, math.pi + 0.34, 3.0], 0.0),
+        ("InclineTilt-v0", [0.499, 1.0, 0.0], 0.0),
+        ("InclineBrake-v0", [-0.001, 1.0], -1.0),
+        ("CylinderInCylinderTilt-v0", [1.049, 1.0, 0.0], 0.0),
+        ("CylinderInCylinderPump-v0", [1.299, 2.0, 0.0], 0.0),
+        ("CylinderInCylinderDamping-v0", [2.0, 3.4], 1.0),
+    ],
+)
+def test_step_after_termination(env_id, start, action):
+    env = make(env_id)
+    env.reset(seed=1, options={"state": start})
+    terminated = False
+    for _ in range(20):
+        _, _, terminated, truncated, _ = env.step(np.array([action]))
+        if terminated:
+            break
+    assert terminated and not truncated
+    state = env.state
+    with pytest.raises(ResetNeeded, match="terminated"):
+        env.step(np.zeros(1))
+    assert (env.state == state).all()
+    env.reset()
+    env.step(np.zeros(1))
+
+
+@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarFree-v0"])
+def test_going_on_after_truncation_is_allowed(env_id):
+    env = make(env_id, duration=0.1)
+    env.reset(seed=1)
+    assert [env.step(np.zeros(1))[3] for _ in range(7)] == [False] * 4 + [True] * 3
+
+
+@each_id
+def test_options_state(env_id):
+    env = make(env_id)
+    start = STARTS[env_id][0]
+    observation, _ = env.reset(seed=1, options={"state": start})
+    assert env.state.tolist() == start
+    assert env.control == 0.0
+    env.step(np.ones(1))
+    again, _ = env.reset(options={"state": np.array(start, dtype=np.float64)})
+    n = len(observation) - (env.target is not None)
+    assert again[:n].tobytes() == observation[:n].tobytes()
+    assert env.reset(options={})[0].tobytes() != observation.tobytes()
+
+
+@each_id
+def test_unsafe_starts_are_refused(env_id):
+    env, twin = running_twins(env_id)
+    good, unsafe = STARTS[env_id]
+    fast = [101.0 if unit.endswith("/s") else x for x, unit in zip(good, env.scene.state_units, strict=True)]
+    for state in [*unsafe, fast, good[:-1], [*good, 0.0], [math.nan, *good[1:]], [*good[:-1], math.inf], "up", [good], 1.0]:
+        with pytest.raises(ValueError, match=r"\w"):
+            env.reset(seed=1, options={"state": state})
+    for options in ({"speed": 1.0}, {"reset_mask": np.array([True])}):
+        with pytest.raises(ValueError, match="unknown reset option"):
+            env.reset(options=options)
+    assert env.control == twin.control
+    assert trace(env, actions(50, 1)) == trace(twin, actions(50, 1))
+
+
+@each_id
+def test_targets(env_id):
+    if env_id not in TARGETS:
+        env, twin = running_twins(env_id)
+        assert env.target is None
+        with pytest.raises(ValueError, match="no target"):
+            env.reset(options={"target": 0.1})
+        assert trace(env, actions(20, 1)) == trace(twin, actions(20, 1))
+        with pytest.raises(ValueError, match="no target"):
+            make(env_id, target=0.1)
+        return
+    good, bad = TARGETS[env_id]
+    env, twin = running_twins(env_id)
+    for target in (bad, math.nan, "high", [0.1]):
+        with pytest.raises(ValueError, match="target"):
+            env.reset(options={"target": target})
+    assert trace(env, actions(20, 1)) == trace(twin, actions(20, 1))
+    observation, _ = env.reset(options={"target": good})
+    assert env.target == good and observation[-1] == np.float32(good)
+    env.reset()
+    assert env.target != good
+    fixed = make(env_id, target=good)
+    assert {fixed.reset()[0][-1] for _ in range(5)} == {np.float32(good)}
+    fixed.reset(options={"target": 0.05})
+    assert fixed.target == 0.05
+    fixed.reset()
+    assert fixed.target == good
+    # A fixed target changes no other draw.
+    assert (fixed.reset(seed=3)[0][:-1] == env.reset(seed=3)[0][:-1]).all()
+
+
+# --- time -----------------------------------------------------------------------------------------------------
+
+
+def steps_until_truncated(env, action=0.0):
+    env.reset(seed=1)
+    for n in range(1, 100_000):
+        *_, terminated, truncated, _ = env.step(np.array([action]))
+        if truncated:
+            return n
+        if terminated:
+            env.reset(seed=1)
+            return None
+    return None
+
+
+@each_id
+def test_episodes_keep_their_seconds(env_id):
+    env = make(env_id)
+    seconds = env.task.duration
+    assert seconds == 10.0
+    assert gym.make(env_id).spec.max_episode_steps == env.task.limit == round(seconds / env.task.dt)
+    for dt in (0.01, 0.04, 0.1):
+        assert gym.make(env_id, dt=dt).spec.max_episode_steps == round(seconds / dt)
+    assert make(env_id, dt=0.1, duration=0.3).task.limit == 3
+
+
+@pytest.mark.parametrize("options", [{}, {"dt": 0.1}, {"duration": 0.06}, {"dt": 0.03, "duration": 0.1}], ids=str)
+def test_truncation_comes_in_time(options):
+    for env_id in ("PivotedBar-v0", "CylinderInCylinderPump-v0"):
+        env = make(env_id, **options)
+        assert steps_until_truncated(env) == env.task.limit == round(env.task.duration / env.task.dt)
+
+
+def test_max_episode_steps_shortens():
+    assert steps_until_truncated(gym.make("PivotedBar-v0", max_episode_steps=7)) == 7
+    assert gym.make("PivotedBar-v0", max_episode_steps=7).spec.max_episode_steps == 7
+    assert steps_until_truncated(gym.make("PivotedBar-v0", max_episode_steps=2000)) == 500
+    assert steps_until_truncated(gym.make("PivotedBar-v0", max_episode_steps=-1)) == 500
+    assert steps_until_truncated(gym.make("PivotedBar-v0", duration=20.0)) == 1000
+
+
+def test_an_endless_episode():
+    env = gym.make("PivotedBarFree-v0", duration=math.inf)
+    assert env.spec.max_episode_steps is None
+    env.reset(seed=1)
+    assert not any(env.step(np.zeros(1))[3] for _ in range(2000))
+
+
+@pytest.mark.parametrize("env_id", [i for i in IDS if i != "InclineBrake-v0"])
+def test_running_rewards_scale_with_the_interval(env_id):
+    start = STARTS[env_id][0]
+    rates = []
+    for dt in (1e-6, 2e-6):
+        env = make(env_id, dt=dt, duration=1.0)
+        env.reset(seed=1, options={"state": start})
+        rates.append(env.step(np.array([0.5]))[1] / dt)
+    assert rates[0] == pytest.approx(rates[1], rel=1e-3)
+
+
+# --- diagnostics ----------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_diagnostics(env_id):
+    env = make(env_id, diagnostics=True)
+    _, info = env.reset(seed=1)
+    names = {"control", "energy", *env.scene.forces(env.state)}
+    assert set(info) == names and info["control"] == 0.0
+    for action in actions(5, 1):
+        *_, info = env.step(action)
+        assert set(info) == names
+        assert info["control"] == env.control
+        assert info["energy"] == env.scene.energy(env.state, env.control)["total"]
+        for name, value in env.scene.forces(env.state, env.control).items():
+            assert info[name] == value
+    if not env_id.startswith("PivotedBar"):
+        assert {"normal", "friction", "needed_friction"} <= names
+
+
+# --- steps that cannot be taken -------------------------------------------------------------------------------
+
+
+def test_a_refused_step_changes_nothing():
+    env = make("PivotedBarFree-v0", com_distance=1e-9, inertia=1e-30, gravity=1e3, mass=1.0, dt=1.0, damping=0.0)
+    env.reset(seed=1)
+    state = env.state
+    for _ in range(2):
+        with pytest.raises(StepRefused, match="the step was refused: from \\(theta="):
+            env.step(np.ones(1))
+        assert (env.state == state).all()
+    env.reset(seed=2)

@@ -1,0 +1,538 @@
+"""The native vector environment against Gymnasium's own of the single one: the same bits."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from rollouts import IDS, actions, make
+
+from lag_envs.scenes.base import StepRefused
+
+each_id = pytest.mark.parametrize("env_id", IDS)
+MODES = ["NextStep", "SameStep", "Disabled"]
+each_mode = pytest.mark.parametrize("mode", MODES)
+
+#: Parameters, one per environment, that need one substep, many, and the treatment of stiff damping.
+MIXED = {
+    "PivotedBar-v0": {"damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02], "gravity": [9.81, 0.0, 1e3, 9.81, 9.81, 50.0, 1.6]},
+    "PivotedBarFree-v0": {"com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0], "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0]},
+    "PivotedBarBalance-v0": {"damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02], "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5]},
+    "InclineTilt-v0": {"damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1], "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3]},
+    "InclineBrake-v0": {"tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5], "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1]},
+    "CylinderInCylinderTilt-v0": {"radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2], "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1]},
+    "CylinderInCylinderPump-v0": {"gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81], "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1]},
+    "CylinderInCylinderDamping-v0": {"gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81], "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1]},
+}  # fmt: skip
+
+
+def pair(env_id, n, mode="NextStep", **options):
+    """Return the native vector environment and Gymnasium's of the single one."""
+    sync = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": AutoresetMode(mode)}}
+    return (
+        gym.make_vec(env_id, num_envs=n, autoreset_mode=mode, **options),
+        gym.make_vec(env_id, num_envs=n, disable_env_checker=True, **sync, **options),
+    )
+
+
+def mixed_pair(env_id, mode="NextStep", **options):
+    """Return the native environment with different parameters, and Gymnasium's of seven single ones."""
+
+    def one(i):
+        own = {name: values[i] for name, values in MIXED[env_id].items()}
+        return lambda: gym.make(env_id, disable_env_checker=True, **own, **options)
+
+    sync = SyncVectorEnv([one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different")
+    return gym.make_vec(env_id, num_envs=7, autoreset_mode=mode, **MIXED[env_id], **options), sync
+
+
+def assert_same(a, b):
+    """Compare infos, observations, rewards, flags: the same keys, types of numbers and bits."""
+    if isinstance(a, dict):
+        assert isinstance(b, dict) and a.keys() == b.keys()
+        for key in a:
+            assert_same(a[key], b[key])
+    elif isinstance(a, tuple):
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    elif isinstance(a, np.ndarray) and a.dtype != object:
+        assert a.dtype == b.dtype and a.shape == b.shape
+        assert a.tobytes() == b.tobytes(), np.argwhere(a != b)
+    elif isinstance(a, np.ndarray):
+        assert b.dtype == object
+        for x, y in zip(a, b, strict=True):
+            assert_same(x, y)
+    else:
+        assert a is b is None
+
+
+def assert_alike(native, sync, steps, seed=0):
+    """Step both with the same actions; with autoreset disabled, reset what is over, and sometimes something else."""
+    n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+    rng = np.random.default_rng(seed)
+    given = actions(steps, n, 1, seed=seed)
+    resets = 0
+    for action in given:
+        mine, theirs = native.step(action), sync.step(action)
+        assert_same(mine, theirs)
+        over = mine[2] | mine[3]
+        resets += over.sum()
+        if disabled and (over.any() or rng.random() < 0.02):
+            mask = over | (rng.random(n) < 0.1)
+            mask[rng.integers(n)] = True
+            seeds = [int(rng.integers(1000)) if rng.random() < 0.2 else None for _ in range(n)]
+            # Gymnasium's pops the mask from the dict.
+            assert_same(*(e.reset(seed=seeds, options={"reset_mask": mask.copy()}) for e in (native, sync)))
+    return resets
+
+
+# --- the same bits --------------------------------------------------------------------------------------------
+
+
+@each_id
+@pytest.mark.parametrize(("n", "steps"), [(1, 3000), (7, 2000), (64, 600)])
+def test_same_bits(env_id, n, steps):
+    native, sync = pair(env_id, n)
+    assert_same(native.reset(seed=17), sync.reset(seed=17))
+    assert assert_alike(native, sync, steps) > n // 2
+
+
+@each_id
+@each_mode
+@pytest.mark.parametrize(("n", "steps"), [(7, 700), (65, 150), (130, 80)])
+def test_same_bits_in_every_mode(env_id, mode, n, steps):
+    native, sync = pair(env_id, n, mode, duration=1.0)
+    assert_same(native.reset(seed=3), sync.reset(seed=3))
+    assert assert_alike(native, sync, steps) > n // 2
+    # Episodes go on where no new seed is given.
+    assert_same(native.reset(), sync.reset())
+    assert_alike(native, sync, 20, seed=1)
+
+
+@pytest.mark.slow
+@each_id
+@each_mode
+@pytest.mark.parametrize(("n", "steps"), [(1, 20_000), (7, 10_000), (64, 4_000), (130, 2_000)])
+def test_same_bits_for_long(env_id, mode, n, steps):
+    native, sync = pair(env_id, n, mode)
+    assert_same(native.reset(seed=17), sync.reset(seed=17))
+    assert assert_alike(native, sync, steps, seed=2) >= n
+
+
+@each_id
+@each_mode
+def test_same_bits_where_parameters_differ(env_id, mode):
+    native, sync = mixed_pair(env_id, mode, duration=5.0)
+    assert_same(native.reset(seed=5), sync.reset(seed=5))
+    assert assert_alike(native, sync, 600) > 0
+    for i, env in enumerate(sync.envs):
+        assert env.unwrapped.state.tobytes() == native.state[i].tobytes()
+        assert native.control[i] == env.unwrapped.control
+        assert native.target is None or native.target[i] == env.unwrapped.target
+        space = native.single_observation_space
+        assert (space.high >= env.observation_space.high).all() and (space.low <= env.observation_space.low).all()
+
+
+@each_id
+def test_same_bits_with_a_coarse_step(env_id):
+    native, sync = pair(env_id, 7, dt=0.2, duration=4.0)  # more than one substep here and there
+    assert_same(native.reset(seed=5), sync.reset(seed=5))
+    assert_alike(native, sync, 300)
+
+
+@each_id
+@each_mode
+def test_same_diagnostics(env_id, mode):
+    native, sync = pair(env_id, 5, mode, diagnostics=True, duration=0.5)
+    assert_same(native.reset(seed=3), sync.reset(seed=3))
+    assert assert_alike(native, sync, 80) > 0
+
+
+@each_id
+@each_mode
+def test_max_episode_steps(env_id, mode):
+    native, sync = pair(env_id, 3, mode, max_episode_steps=9)
+    assert_same(native.reset(seed=3), sync.reset(seed=3))
+    assert assert_alike(native, sync, 60) >= 12
+
+
+@each_id
+def test_a_sub_environment_is_the_single_one(env_id):
+    native = gym.make_vec(env_id, num_envs=5)
+    native.reset(seed=40)
+    env = make(env_id)
+    env.reset(seed=43)
+    for action in actions(30, 5, 1):
+        mine = native.step(action)
+        theirs = env.step(action[3])
+        assert mine[0][3].tobytes() == theirs[0].tobytes() and mine[1][3] == theirs[1]
+        if theirs[2] or theirs[3]:
+            break
+
+
+@each_id
+def test_states_and_targets_by_hand(env_id):
+    single = make(env_id)
+    starts = []
+    for seed in range(6):
+        single.reset(seed=seed)
+        starts.append(single.state)
+    options = {"state": np.array(starts)}
+    if single.target is not None:
+        options["target"] = np.linspace(-0.2, 0.2, 6)
+    native = gym.make_vec(env_id, num_envs=6)
+    observations, _ = native.reset(seed=0, options=options)
+    assert native.state.tobytes() == options["state"].tobytes()
+    given = actions(1, 6, 1)[0]
+    stepped = native.step(given)[0]
+    for i in range(6):
+        own = {name: values[i] for name, values in options.items()}
+        assert single.reset(seed=i, options=own)[0].tobytes() == observations[i].tobytes()
+        assert single.step(given[i])[0].tobytes() == stepped[i].tobytes()
+
+
+# --- autoreset ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", [*MODES, *AutoresetMode, "NEXT_STEP", "next_step", "same_step", "DISABLED"], ids=str)
+def test_mode_as_string_or_enum(mode):
+    envs = gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode)
+    wanted = AutoresetMode[mode.upper()] if isinstance(mode, str) and mode not in MODES else AutoresetMode(mode)
+    assert envs.metadata["autoreset_mode"] is wanted
+    assert "autoreset_mode" not in gym.make_vec("PivotedBar-v0", num_envs=2).__class__.metadata
+
+
+@pytest.mark.parametrize("mode", ["never", None, 1, ""])
+def test_unknown_mode(mode):
+    with pytest.raises(ValueError, match="autoreset_mode must be one of"):
+        gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode)
+
+
+def test_metadata_belongs_to_the_instance():
+    a, b = (gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode) for mode in ("NextStep", "Disabled"))
+    assert a.metadata is not b.metadata
+    assert a.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert a.metadata["render_fps"] == 50
+
+
+def test_disabled_asks_for_a_reset():
+    envs = gym.make_vec("PivotedBar-v0", num_envs=3, autoreset_mode="Disabled", duration=0.1)
+    envs.reset(seed=1)
+    for _ in range(3):
+        envs.step(np.zeros((3, 1)))
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    for _ in range(2):
+        *_, truncated, _ = envs.step(np.zeros((3, 1)))
+    assert truncated.tolist() == [True, False, True]
+    state = envs.state
+    with pytest.raises(ResetNeeded, match=r"environments \[0, 2\] are over"):
+        envs.step(np.zeros((3, 1)))
+    assert (envs.state == state).all()
+    envs.reset(options={"reset_mask": np.array([True, False, False])})
+    with pytest.raises(ResetNeeded, match=r"environments \[2\] are over"):
+        envs.step(np.zeros((3, 1)))
+    envs.reset(options={"reset_mask": truncated})
+    assert truncated.tolist() == [True, False, True]
+    envs.step(np.zeros((3, 1)))
+
+
+def test_the_mask_is_read_only():
+    envs = gym.make_vec("PivotedBar-v0", num_envs=3)
+    envs.reset(seed=1)
+    options = {"reset_mask": np.array([True, False, False])}
+    kept = envs.state
+    envs.reset(options=options)
+    assert options["reset_mask"].tolist() == [True, False, False] and list(options) == ["reset_mask"]
+    assert ((envs.state != kept).any(axis=1) == options["reset_mask"]).all()
+
+
+def test_masked_rows_are_not_looked_at():
+    envs = gym.make_vec("InclineTilt-v0", num_envs=3)
+    first, _ = envs.reset(seed=1)
+    kept = envs.state
+    mask = np.array([False, True, False])
+    state, target = np.full((3, 3), np.nan), np.full(3, 1e9)
+    state[1], target[1] = [0.1, 0.2, 0.05], -0.25
+    observations, _ = envs.reset(options={"state": state, "target": target, "reset_mask": mask})
+    assert observations[1].tolist() == np.array([0.1, 0.2, 0.05, -0.25], dtype=np.float32).tolist()
+    assert (observations[~mask] == first[~mask]).all() and (envs.state[~mask] == kept[~mask]).all()
+    # A target by hand holds for one episode.
+    envs.reset(options={"reset_mask": mask})
+    assert envs.target[1] != -0.25
+
+
+# --- seeds ----------------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_seeds(env_id):
+    native, sync = pair(env_id, 5)
+    for seed in (9, [3, 1, 4, 1, 5], [7, None, 2**40, None, 0], None, 2**63, 0):
+        assert_same(native.reset(seed=seed), sync.reset(seed=seed))
+        assert_alike(native, sync, 5)
+    a, b = (native.reset(seed=[8, 8, 9, 10, 8])[0] for _ in range(2))
+    assert (a == b).all() and (a[0] == a[1]).all() and (a[0] == a[4]).all() and (a[0] != a[2]).any()
+    assert (native.reset(seed=np.array([8, 8, 9, 10, 8]))[0] == a).all()
+
+
+@each_id
+def test_unseeded_environments_differ(env_id):
+    runs = [gym.make_vec(env_id, num_envs=4).reset(seed=seed)[0] for seed in (None, None, [1, None, None, 2], [1, None, None, 2])]
+    assert len({row.tobytes() for row in np.concatenate([runs[0], runs[1], runs[2][1:3], runs[3][1:3]])}) == 12
+    assert (runs[2][[0, 3]] == runs[3][[0, 3]]).all()
+
+
+@pytest.mark.parametrize("seed", [-1, [1, 2], [1, 2, -3], [1, 2, 3, 4]])
+def test_bad_seeds(seed):
+    envs, twin = running(3), running(3)
+    with pytest.raises((ValueError, gym.error.Error)):
+        envs.reset(seed=seed)
+    assert (envs.state == twin.state).all()
+    assert_same(envs.reset(), twin.reset())
+
+
+# --- what is returned -----------------------------------------------------------------------------------------
+
+
+@each_id
+@each_mode
+def test_nothing_is_shared(env_id, mode):
+    envs = gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, diagnostics=True, duration=0.3)
+    kept = []
+    for _ in range(2):
+        arrays = [envs.reset(seed=1)[0]]
+        for action in actions(40, 3, 1):
+            *out, info = envs.step(action)
+            over = out[2] | out[3]
+            arrays += [*out, envs.state, envs.control, *(v for v in info.values() if isinstance(v, np.ndarray))]
+            arrays += [row for row in info.get("final_obs", ()) if row is not None]
+            if mode == "Disabled" and over.any():
+                arrays.append(envs.reset(options={"reset_mask": over})[0])
+        kept.append((arrays, [a.copy() for a in arrays]))
+    for arrays, copies in kept:
+        for a, b in zip(arrays, copies, strict=True):
+            assert_same(a, b)
+    whole = [a for a in kept[0][0] if a.dtype != object]
+    spans = sorted((a.__array_interface__["data"][0], a.nbytes) for a in whole)
+    assert all(start + size <= following for (start, size), (following, _) in zip(spans, spans[1:], strict=False))
+
+
+@each_id
+def test_spaces_and_types(env_id):
+    native, sync = pair(env_id, 4)
+    for name in ("single_action_space", "single_observation_space", "action_space", "observation_space"):
+        assert getattr(native, name) == getattr(sync, name)
+    observations, infos = native.reset(seed=1)
+    assert observations in native.observation_space and infos == {}
+    observations, rewards, terminations, truncations, infos = native.step(native.action_space.sample())
+    assert observations in native.observation_space and infos == {}
+    assert rewards.dtype == np.float64 and terminations.dtype == truncations.dtype == np.bool_
+    assert native.state.shape == (4, len(native.unwrapped.scene.state_names))
+    assert native.num_envs == 4 and native.unwrapped is native
+    native.close()
+
+
+@each_id
+def test_observations_stay_in_the_space(env_id):
+    envs = gym.make_vec(env_id, num_envs=100, autoreset_mode="SameStep")
+    observations, _ = envs.reset(seed=1)
+    for action in actions(400, 100, 1, seed=5):
+        assert observations in envs.observation_space
+        observations, *_, infos = envs.step(action)
+        for last in infos.get("final_obs", ()):
+            assert last is None or last in envs.single_observation_space
+
+
+# --- copies and specs -----------------------------------------------------------------------------------------
+
+
+@each_id
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"])
+def test_copies_go_on_alike(env_id, clone):
+    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **MIXED[env_id])
+    envs.reset(seed=2)
+    for action in actions(37, 7, 1):
+        envs.step(action)
+    twin = clone(envs)
+    before = twin.state
+    for action in actions(60, 7, 1, seed=1):
+        mine = envs.step(action)
+        assert (twin.state == before).all()  # nothing in common
+        assert_same(mine, twin.step(action))
+        before = twin.state
+    assert twin.metadata == envs.metadata and twin.spec == envs.spec
+
+
+@each_id
+def test_spec_survives_json(env_id):
+    envs = gym.make_vec(env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **MIXED[env_id])
+    spec = EnvSpec.from_json(envs.spec.to_json())
+    assert spec == envs.spec
+    twin = gym.make_vec(spec)
+    assert twin.num_envs == 7 and twin.metadata == envs.metadata
+    assert_same(envs.reset(seed=1), twin.reset(seed=1))
+    for action in actions(40, 7, 1):
+        assert_same(envs.step(action), twin.step(action))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_record_episode_statistics(mode):
+    envs = RecordEpisodeStatistics(gym.make_vec("InclineBrake-v0", num_envs=4, autoreset_mode=mode, duration=1.0))
+    envs.reset(seed=1)
+    returns, recorded = np.zeros(4), 0
+    for action in actions(300, 4, 1):
+        _, rewards, terminations, truncations, infos = envs.step(action)
+        returns += rewards
+        over = terminations | truncations
+        if over.any():
+            recorded += over.sum()
+            assert (infos["_episode"] == over).all()
+            np.testing.assert_allclose(infos["episode"]["r"][over], returns[over], rtol=1e-6)
+            returns[over] = 0.0
+            if mode == "Disabled":
+                envs.reset(options={"reset_mask": over})
+    assert recorded > 10
+
+
+# --- what is refused ------------------------------------------------------------------------------------------
+
+
+def running(n, env_id="PivotedBar-v0", **options):
+    envs = gym.make_vec(env_id, num_envs=n, **options)
+    envs.reset(seed=1)
+    envs.step(np.full((n, 1), 0.25))
+    return envs
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", [0, 63, 64, 99])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_that_are_not_finite_step_nothing(value, place, dtype):
+    envs, twin = running(100), running(100)
+    action = np.zeros((100, 1), dtype=dtype)
+    action[place] = value
+    with pytest.raises(ValueError, match=rf"must be finite, got .* for environment {place}$"):
+        envs.step(action)
+    assert (envs.state == twin.state).all() and (envs.control == twin.control).all()
+    for action in actions(20, 100, 1):
+        assert_same(envs.step(action), twin.step(action))
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.zeros(3), np.zeros((3, 2)), np.zeros((2, 1)), np.zeros((1, 3)), 0.5, None, "up", np.zeros((3, 1), dtype=complex),
+     np.array([["a"], ["b"], ["c"]]), [[0.1], [0.2], [None]], [[0.1], [0.2], [0.3, 0.4]]],
+)  # fmt: skip
+def test_bad_actions(action):
+    envs, twin = running(3), running(3)
+    with pytest.raises(ValueError, match="actions|inhomogeneous"):
+        envs.step(action)
+    assert_same(envs.step(np.zeros((3, 1))), twin.step(np.zeros((3, 1))))
+
+
+def test_other_actions_mean_their_value():
+    envs, twin = running(3), running(3)
+    fine = np.array([[0.3], [-1.0], [1.0]])
+    for action in (
+        [[0.3], [-5], [1e300]], np.array([[0.3], [-1.0], [1.0]], dtype=">f8"), np.array([[0.3], [-1.0], [1.0]], dtype=np.longdouble),
+        np.asfortranarray(fine), np.array([[0.3, 9.0], [-1.0, 9.0], [1.0, 9.0]])[:, :1],
+    ):  # fmt: skip
+        assert_same(envs.step(action), twin.step(fine))
+    assert_same(envs.step(np.array([[1], [0], [1]], dtype=bool)), twin.step(np.array([[1.0], [0.0], [1.0]])))
+
+
+def test_step_before_reset():
+    envs = gym.make_vec("PivotedBar-v0", num_envs=2)
+    with pytest.raises(ResetNeeded, match="no episode has begun"):
+        envs.step(np.zeros((2, 1)))
+    with pytest.raises(ResetNeeded, match="first reset must reset every environment"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(options={"reset_mask": np.array([True, True])})
+    envs.step(np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"reset_mask": [True, False, False]}, TypeError, "reset_mask"),
+        ({"reset_mask": np.array([1, 0, 0])}, TypeError, "reset_mask"),
+        ({"reset_mask": np.array([True, False])}, ValueError, "reset_mask"),
+        ({"reset_mask": np.zeros(3, dtype=bool)}, ValueError, "at least one"),
+        ({"state": np.zeros((2, 4))}, ValueError, "state"),
+        ({"state": [0.0, 0.0, 0.0, 0.0]}, ValueError, "state"),
+        ({"state": [[0, 0, 0, 0], [0, 0, 0, 0], [0.6, 0, 0, 0]]}, ValueError, "track"),
+        ({"state": [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, math.nan, 0]]}, ValueError, "finite"),
+        ({"state": "up"}, ValueError, "state"),
+        ({"target": np.zeros(3)}, ValueError, "no target"),
+        ({"colour": 1}, ValueError, "unknown reset option 'colour'"),
+    ],
+)  # fmt: skip
+def test_bad_options_reset_nothing(options, error, match):
+    envs, twin = running(3), running(3)
+    with pytest.raises(error, match=match):
+        envs.reset(seed=5, options=options)
+    assert (envs.state == twin.state).all()
+    for action in actions(20, 3, 1):
+        assert_same(envs.step(action), twin.step(action))
+
+
+@pytest.mark.parametrize("n", [0, -1, 1.5, True, "3", math.nan])
+def test_bad_number_of_environments(n):
+    with pytest.raises(ValueError):
+        gym.make_vec("PivotedBar-v0", num_envs=n)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options", "match"),
+    [
+        ("PivotedBar-v0", {"mass": [0.1, 0.2]}, "mass must be one value or 3, one per environment, got 2"),
+        ("PivotedBar-v0", {"mass": np.ones((3, 1))}, "mass"),
+        ("PivotedBar-v0", {"mass": [0.1, 0.2, -0.3]}, "mass must be above 0 kg, got -0.3 kg"),
+        ("PivotedBar-v0", {"dt": [0.01, 0.02, 0.03]}, "dt must be the same"),
+        ("PivotedBar-v0", {"duration": [1.0, 2.0, 3.0]}, "duration must be the same"),
+        ("PivotedBar-v0", {"track": [None, 0.5, 0.5]}, "track"),
+        ("PivotedBar-v0", {"track": [0.5, math.inf, 0.5]}, "track"),
+        ("InclineTilt-v0", {"control": ["tilt", "tilt", "tilt_rate"]}, "control must be the same"),
+        ("InclineTilt-v0", {"target": [0.1, 0.2, 0.7]}, "target"),
+        ("InclineTilt-v0", {"target": [0.1, 0.2, None]}, "target"),
+        ("PivotedBar-v0", {"max_episode_steps": 0}, "max_episode_steps"),
+        ("PivotedBar-v0", {"max_episode_steps": True}, "max_episode_steps"),
+    ],
+)
+def test_bad_parameters(env_id, options, match):
+    with pytest.raises(ValueError, match=match):
+        gym.make_vec(env_id, num_envs=3, **options)
+
+
+def test_unknown_keyword():
+    with pytest.raises(TypeError, match="unknown keyword 'colour'"):
+        gym.make_vec("PivotedBar-v0", num_envs=2, colour="red")
+
+
+@each_mode
+def test_a_refused_environment_does_not_stop_the_others(mode):
+    extreme = {"com_distance": [0.3, 1e-9, 0.4], "inertia": [None, 1e-30, None], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
+    mild = {"com_distance": [0.3, 0.4], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
+    envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme)
+    twin = gym.make_vec("PivotedBarFree-v0", num_envs=2, autoreset_mode=mode, **mild)
+    envs.reset(seed=[1, 2, 3])
+    twin.reset(seed=[1, 3])
+    stuck = envs.state[1]
+    for action in actions(5, 3, 1):
+        with pytest.raises(StepRefused, match="the step of environment 1 was refused"):
+            envs.step(action)
+        twin.step(action[[0, 2]])
+        assert (envs.state[[0, 2]] == twin.state).all()
+        assert (envs.state[1] == stuck).all()
+    # Once its state is one from which it can go on, it does.
+    envs.reset(options={"state": np.zeros((3, 2)), "reset_mask": np.array([False, True, False])})
+    with pytest.raises(StepRefused):
+        envs.step(np.ones((3, 1)))
