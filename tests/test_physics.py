@@ -1,4 +1,4 @@
-"""Physics: everything that is computed is derived again, from energies by Euler-Lagrange or from places by Newton."""
+"""Physics: what is computed is derived again, from energies by Euler-Lagrange or from places by Newton."""
 
 import dataclasses
 import math
@@ -18,6 +18,14 @@ from lag_envs.stepping.pendulum import Drive
 from lag_envs.stepping.slope import Pull, Turn
 
 U, TAU, SPIN = sympy.symbols("u tau psi_dot", real=True)
+
+
+def vanishes(expression):
+    """Tell whether an expression, rational but for sines and cosines, is identically zero."""
+    expression = sympy.numer(sympy.together(sympy.nsimplify(expression))).expand()
+    for cosine in expression.atoms(cos):
+        expression = expression.subs(cosine**2, 1 - sin(*cosine.args) ** 2).expand()
+    return expression == 0
 
 
 def controls(scene):
@@ -45,7 +53,7 @@ PARAMETERS = [
 
 
 def moved(scene):
-    """Return the prescribed coordinate's value, rate and acceleration as functions of the time tau in a step."""
+    """Return the prescribed coordinate's value, rate and acceleration at the time tau within a step."""
     if isinstance(scene, PivotedBar):
         return {"s": (U * TAU**2 / 2, U * TAU, U)}
     if isinstance(scene, CylinderInCylinder):
@@ -98,12 +106,12 @@ def normal_form(scene):
 def test_stepping_is_euler_lagrange(scene):
     """The held coefficients, from `drive`, give the acceleration that follows from kinetic - potential."""
     derived = prescribe(lagrange.acceleration(scene, U), scene)
-    assert sympy.simplify(sympy.nsimplify(normal_form(scene)) - derived) == 0
+    assert vanishes(normal_form(scene) - derived)
 
 
 @variants()
 def test_power_balance(scene):
-    """dE/dt is the power of the prescribed coordinate's force less the drag's, for any motion that obeys the laws."""
+    """dE/dt is the power of the forces in both coordinates' equations less the drag's loss."""
     q, v = coordinates(scene)
     twin = symbolic(scene)
     energy = sympy.nsimplify(twin.kinetic(q, v, sympy) + twin.potential(q, sympy))
@@ -113,28 +121,23 @@ def test_power_balance(scene):
 
 
 def test_momentum_is_continuous():
-    """When the rate of the tilt jumps, dL/dx' and so w = x' + R phi' does not; nor does theta' - kK(R/a)psi'."""
-    q, v = coordinates(Incline())
-    momentum = lagrange.lagrangian(Incline()).diff(v.x)
-    twin = symbolic(Incline())
-    assert sympy.simplify(momentum / (v.x + twin.radius * v.phi)).free_symbols <= {twin.mass, twin.radius, twin.inertia}
-    shell = CylinderInCylinder()
-    q, v = coordinates(shell)
-    momentum = lagrange.lagrangian(shell).diff(v.theta)
+    """When phi' jumps, dL/dx' and so w = x' + R phi' does not; nor does theta' - kK(R/a)psi' with psi'."""
+    incline, shell = Incline(control="tilt_rate"), CylinderInCylinder()
     push = symbolic(shell).constants()["push"]
-    assert sympy.simplify(momentum / momentum.coeff(v.theta) - momentum.coeff(v.theta)) != 0
-    per_rate = sympy.expand(momentum).coeff(v.psi) / sympy.expand(momentum).coeff(v.theta)
-    assert sympy.simplify(per_rate + sympy.nsimplify(push)) == 0
-    assert q.theta.diff(t) == v.theta
+    for scene, carried in ((incline, symbolic(incline).radius), (shell, -push)):
+        v = coordinates(scene)[1]
+        free, prescribed = (getattr(v, c) for c in scene.coordinates)
+        momentum = lagrange.lagrangian(scene).diff(free).expand()
+        assert vanishes(momentum - momentum.coeff(free) * (free + carried * prescribed))
 
 
 # --- Newton ------------------------------------------------------------------------------------------------
 
 
 def newton(scene):
-    """Return reaction forces from the acceleration of the centre of mass and the spin's, and what must vanish.
+    """Return reaction forces from the accelerations of centre of mass and spin, and what must vanish.
 
-    Written for any motion of both coordinates, drag c at the axis between the cylinder and what it rolls on.
+    Written for any motion of both coordinates; the drag c acts between the axis and what it rolls on.
     """
     q, v = coordinates(scene)
     p = symbolic(scene)
@@ -165,7 +168,8 @@ def newton(scene):
     force = p.mass * ((arm * out).diff(t, 2) + sympy.Matrix([0, g]))
     friction = p.inertia * ((p.shell_radius * v.psi - arm * v.theta) / p.radius).diff(t) / p.radius
     drag = c * (v.theta - v.psi)
-    return {"normal": -force.dot(out), "friction": friction, "drive_torque": friction * p.shell_radius - drag}, {
+    torque = friction * p.shell_radius - drag
+    return {"normal": -force.dot(out), "friction": friction, "drive_torque": torque}, {
         "theta": arm * (force.dot(along) - friction) + drag
     }
 
@@ -174,34 +178,35 @@ def newton(scene):
 def test_newton_is_euler_lagrange(scene):
     """Newton's and Euler's laws, with the contact's forces, give the free coordinate's equation of motion."""
     for coordinate, residual in newton(scene)[1].items():
-        assert sympy.simplify(residual - euler_lagrange(scene, coordinate, U)) == 0
+        assert vanishes(residual - euler_lagrange(scene, coordinate, U))
 
 
 @variants()
 def test_drive_force_is_euler_lagrange(scene):
-    """What moves the support, the plane or the shell: Newton's force is the prescribed coordinate's residual."""
+    """Newton's force on support, plane or shell is the prescribed coordinate's residual."""
     forces, laws = newton(scene)
     force = forces.get("drive_torque", forces.get("support_horizontal"))
     residual = euler_lagrange(scene, scene.coordinates[1], U)
     free = getattr(coordinates(scene)[0], scene.coordinates[0]).diff(t, 2)
-    (solution,) = sympy.solve(laws[scene.coordinates[0]], free)
-    assert sympy.simplify((force - residual).subs(free, solution)) == 0
+    law = laws[scene.coordinates[0]].expand()
+    difference = (force - residual).expand()
+    assert vanishes(difference * law.coeff(free) - law * difference.coeff(free))
 
 
 @variants()
 def test_forces_are_newton(scene):
     """The numbers of `reactions` for random bodies and motions, accelerated in both coordinates."""
     q, v = coordinates(scene)
-    names = [f.name for f in dataclasses.fields(scene) if "unit" in f.metadata and getattr(scene, f.name) is not None]
-    symbols = [getattr(symbolic(scene), n) for n in names]
+    twin = vars(symbolic(scene))
+    names = [n for n, value in twin.items() if isinstance(value, sympy.Symbol)]
+    symbols = [twin[n] for n in names]
     functions = [getattr(space, c) for space in (q, v) for c in scene.coordinates]
     rates = [getattr(v, c).diff(t) for c in scene.coordinates]
     variables = sympy.symbols(f"z:{len(functions) + len(rates)}")
     # Derivatives before what they derive from.
     table = dict(reversed(list(zip([*functions, *rates], variables, strict=True))))
-    formulas = {
-        n: sympy.lambdify([*symbols, U, *variables], f.subs(list(table.items()))) for n, f in newton(scene)[0].items()
-    }
+    expressions = {n: f.subs(list(table.items())) for n, f in newton(scene)[0].items()}
+    formulas = {n: sympy.lambdify([*symbols, U, *variables], f) for n, f in expressions.items()}
     rng = np.random.default_rng(5)
     n = len(scene.coordinates)
     checked = set()
@@ -212,9 +217,8 @@ def test_forces_are_newton(scene):
         body = dataclasses.replace(scene, **numbers)
         u = rng.uniform(0.0, 1.0)
         values = rng.uniform(-2.0, 2.0, 3 * n)
-        motion = Motion(
-            *(SimpleNamespace(**dict(zip(scene.coordinates, part, strict=True))) for part in values.reshape(3, n))
-        )
+        parts = [dict(zip(scene.coordinates, part, strict=True)) for part in values.reshape(3, n)]
+        motion = Motion(*(SimpleNamespace(**part) for part in parts))
         reactions = body.reactions(motion, u)
         for force, formula in formulas.items():
             if force == "drive_torque":
@@ -293,7 +297,7 @@ def test_energy_balance(scene):
     assert rate[0] / dt == pytest.approx(float(power["drive"] - power["drag"]), rel=0.5)
 
 
-# --- the lecture's results -------------------------------------------------------------------------------------
+# --- the lecture's results ---------------------------------------------------------------------------------
 
 
 def test_incline_of_the_lecture():
@@ -302,8 +306,8 @@ def test_incline_of_the_lecture():
     p = symbolic(scene)
     phi = sympy.Symbol("phi", real=True)
     free = prescribe(lagrange.acceleration(scene), scene).subs(p.tilt, phi).subs(p.damping, 0)
-    assert sympy.simplify(free - p.gravity * sin(phi) / (1 + p.inertia / (p.mass * p.radius**2))) == 0
-    assert sympy.simplify(free.subs(p.inertia, p.mass * p.radius**2 / 2) - 2 * p.gravity * sin(phi) / 3) == 0
+    assert vanishes(free - p.gravity * sin(phi) / (1 + p.inertia / (p.mass * p.radius**2)))
+    assert vanishes(free.subs(p.inertia, p.mass * p.radius**2 / 2) - 2 * p.gravity * sin(phi) / 3)
     fast = Incline(tilt=0.3, damping=50.0).simulate([0.0, 0.0], [0.0] * 20, 1.0)[-1, 1]
     assert fast == pytest.approx(9.81 * math.sin(0.3) / 50.0, rel=1e-14)
 
@@ -312,7 +316,8 @@ def test_incline_of_the_lecture():
 def test_needed_friction_of_the_lecture(share, tilt):
     """mu = K/(1 + K) tan(phi) on a fixed plane without drag, F = kK m g sin(theta) in a fixed shell."""
     plane = Incline(mass=2.0, radius=0.3, inertia=share * 2.0 * 0.09, tilt=tilt)
-    assert plane.forces([0.4, 1.0])["needed_friction"] == pytest.approx(share / (1 + share) * math.tan(tilt), rel=1e-14)
+    needed = plane.forces([0.4, 1.0])["needed_friction"]
+    assert needed == pytest.approx(share / (1 + share) * math.tan(tilt), rel=1e-14)
     shell = CylinderInCylinder(mass=2.0, radius=0.1, inertia=share * 2.0 * 0.01, control="damping")
     friction = shell.forces([tilt, 1.0])["friction"]
     assert friction == pytest.approx(share / (1 + share) * 2.0 * 9.81 * math.sin(tilt), rel=1e-13)
@@ -324,9 +329,10 @@ def test_shell_of_the_lecture():
     p = symbolic(scene)
     theta = coordinates(scene)[0].theta
     arm = p.shell_radius - p.radius
-    stiffness = -prescribe(lagrange.acceleration(scene), scene).diff(theta).subs(theta.diff(t), 0).subs(theta, 0)
+    free = prescribe(lagrange.acceleration(scene), scene)
+    stiffness = -free.diff(theta).subs(theta.diff(t), 0).subs(theta, 0)
     expected = p.mass * p.gravity * arm / (p.mass * arm**2 + p.inertia * (arm / p.radius) ** 2)
-    assert sympy.simplify(stiffness - expected) == 0
+    assert vanishes(stiffness - expected)
     frequency = math.sqrt(2 * 9.81 / (3 * 0.4)) / (2 * math.pi)
     period = CylinderInCylinder().simulate([1e-6, 0.0, 0.0], [0.0] * 64, 1.0 / frequency / 64)
     assert period[-1, :2] == pytest.approx([1e-6, 0.0], abs=1e-15)
@@ -358,20 +364,20 @@ def test_contact_is_lost():
     assert forces["needed_friction"][0] == math.inf
 
 
-# --- parameters ------------------------------------------------------------------------------------------------
+# --- parameters --------------------------------------------------------------------------------------------
 
 
 def refuses(scene, rule, **keywords):
+    """Return the message of the ValueError."""
     with pytest.raises(ValueError, match=rule) as error:
         scene(**keywords)
-    (value,) = list(keywords.values())[-1:]
-    return str(error.value), value
+    return str(error.value)
 
 
 @pytest.mark.parametrize(("scene", "field"), PARAMETERS)
 def test_every_parameter_is_checked(scene, field):
     for bad in (math.nan, math.inf, -math.inf, 10**400):
-        message, _ = refuses(scene, f"^{field.name} must be finite, got", **{field.name: bad})
+        message = refuses(scene, f"^{field.name} must be finite, got", **{field.name: bad})
         assert str(bad)[:5] in message
     for bad in (True, np.True_, "1", 1j, [1.0], np.array([1.0]), object):
         refuses(scene, f"^{field.name} must be a real number, got", **{field.name: bad})
@@ -380,7 +386,8 @@ def test_every_parameter_is_checked(scene, field):
     for limit, rule, beyond in ((above, "above", 0.0), (least, "at least", -1e-9), (below, "below", 0.0)):
         if limit is not None:
             bad = limit + beyond
-            assert f"{bad:g} {unit}" in refuses(scene, f"^{field.name} must be {rule} {limit:g}", **{field.name: bad})[0]
+            message = refuses(scene, f"^{field.name} must be {rule} {limit:g}", **{field.name: bad})
+            assert f"{bad:g} {unit}" in message
     refuses(scene, f"^{field.name} must be (at most|below)", **{field.name: 1e70})
     if above == 0.0:
         refuses(scene, f"^{field.name} must be at least", **{field.name: 1e-70})
@@ -443,9 +450,9 @@ def test_lagrangian(scene):
     """`lagrangian` is T - V of the very functions, in functions of time."""
     q, v = coordinates(scene)
     twin = symbolic(scene)
-    difference = scene.lagrangian() - (twin.kinetic(q, v, sympy) - twin.potential(q, sympy))
-    assert sympy.simplify(sympy.nsimplify(difference)) == 0
-    assert scene.lagrangian().has(getattr(v, scene.coordinates[0])) and not scene.lagrangian().atoms(sympy.Float)
+    assert vanishes(scene.lagrangian() - (twin.kinetic(q, v, sympy) - twin.potential(q, sympy)))
+    assert scene.lagrangian().has(getattr(v, scene.coordinates[0]))
+    assert not scene.lagrangian().atoms(sympy.Float)
 
 
 def test_lagrangian_of_the_bar():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import signal
 import subprocess
 import sys
@@ -553,7 +554,7 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(row[j]) for row in rows if j < len(row)) for j in range(max(map(len, rows)))]
     return [
         "  ".join(
-            cell.rjust(width) if cell[:1].isdigit() else cell.ljust(width)
+            cell.rjust(width) if re.fullmatch(r"[\d.,]+( [kMG])?", cell) else cell.ljust(width)
             for cell, width in zip(row, widths, strict=False)
         ).rstrip()
         for row in rows
@@ -607,26 +608,29 @@ def in_own_process(settings: Settings) -> int:
     """Run `bench` in a process of its own, on one core and without threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark", json.dumps(asdict(settings))]
     child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
-    breaks = 0
-    while True:
-        try:
-            return child.wait()
-        except KeyboardInterrupt:
-            breaks += 1
-            if breaks > 1:
-                child.kill()
-            elif os.name == "posix":
-                child.send_signal(signal.SIGINT)  # it may have come to this process alone
+
+    def pass_on(*_: Any) -> None:
+        if os.name == "posix":  # elsewhere the terminal tells the child itself
+            child.send_signal(signal.SIGINT)
+
+    before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        return child.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _break_off(*_: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # what was measured is still to be written
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # what was measured is still to be written
     raise KeyboardInterrupt
 
 
 def main() -> int:
     """Measure as the settings on the command line say."""
-    signal.signal(signal.SIGINT, _break_off)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _break_off)
     warnings.simplefilter("ignore")  # of the peers
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})

@@ -64,5 +64,6 @@ def acceleration(scene: Scene, control: Any = 0) -> sympy.Expr:
     """Return the free coordinate's acceleration, solved from its Euler-Lagrange equation."""
     free = scene.coordinates[0]
     second = getattr(coordinates(scene)[0], free).diff(t, 2)
-    (solution,) = sympy.solve(euler_lagrange(scene, free, control), second)
-    return sympy.simplify(solution)
+    equation = euler_lagrange(scene, free, control)
+    inertia = equation.coeff(second)
+    return sympy.factor_terms((inertia * second - equation).expand() / inertia)

@@ -142,7 +142,7 @@ class Program:
         body = [
             *self._constants_one(), *_load(self._at_one, rows),
             *_next_episode("0", "1", "2"), *self._start, *self.observe,
-            *_store(self._at_one, [*self.y, *self.g, "n"]),
+            *_store(self._at_one, [*self.y, *self.g, "u", "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return _function("start_one", "f, obs, ids, state_given, target_given", body)
@@ -180,7 +180,7 @@ class Program:
             *self.sample,
             "if not state_given:", *_indent([f"y{i} = s{i}" for i in range(self.n_state)]),
             *(["if not target_given:", f"    g = s{self.n_state}"] if self.g else []),
-            *self.lift, "n = 0.0",
+            *self.lift, "u = 0.0", "n = 0.0",
         ]  # fmt: skip
 
     # --- a batch: blocks of rows of 64 environments -----------------------------------------------------------
@@ -217,6 +217,7 @@ class Program:
                 f"{', '.join(z)}, status = advance({call})",
                 "if status < 0:",
                 "    refused = first + i + np.uint64(1)",
+                f"    {_at('over')} = 0.0",
                 "else:",
                 *_indent([
                     *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
@@ -233,7 +234,7 @@ class Program:
                 *_load(_at, [*varying, *self.g]),
                 *_next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given = False", *self._start, "r = 0.0", "over = 0.0", *self.observe,
-                *_store(_at, [*y, *self.g, "n", "over", "r", *self.o]),
+                *_store(_at, [*y, *self.g, "u", "n", "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
@@ -279,10 +280,10 @@ class Program:
         start = [
             "if mask[first + i] or whole:",
             *_indent([
-                *_load(_at, [*varying, *self.y, *self.g, "n"]),
+                *_load(_at, [*varying, *self.y, *self.g, "u", "n"]),
                 "if mask[first + i]:",
                 *_indent([*_next_episode("first + i", "second + first + i", "last + first + i"), *self._start]),
-                *self.observe, *_store(_at, [*self.y, *self.g, "n"]), *_observations(self.o, "{}"),
+                *self.observe, *_store(_at, [*self.y, *self.g, "u", "n"]), *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip
         body = [

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT, STRIP = 640, 432, 48
 #: Pictures are painted this much larger, then scaled down, for smooth edges.
 FINE = 2
+FAR = 8_000.0
 
 PAPER, STRIP_PAPER, INK = "#ffffff", "#f2f2f2", "#303030"
 
@@ -139,7 +140,7 @@ class Viewer:
         _desk.remove(self)
 
     def _turn(self, state: list[float]) -> None:
-        """Integrate what turns without being in the state; exact if its rate is linear and each step drawn."""
+        """Integrate what turns but is not in the state; exact if its rate is linear and each step drawn."""
         rate = self._task.scene.turning(state)
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
@@ -171,7 +172,7 @@ class Pen:
     def __init__(self, surface: pygame.Surface, window: Window) -> None:
         self._surface = surface
         width, height = surface.get_size()
-        self.scale = min(width / (window.right - window.left), height / (window.top - window.bottom))
+        self.scale = 1.0 / max((window.right - window.left) / width, (window.top - window.bottom) / height)
         self._left = 0.5 * (width - self.scale * (window.left + window.right))
         self._top = 0.5 * (height + self.scale * (window.bottom + window.top))
 
@@ -191,7 +192,7 @@ class Pen:
                     self._magnify(shape, [x for x in shapes if not isinstance(x, s.Lens)])
 
     def _place(self, points: Sequence[Point]) -> list[Point]:
-        return [(self._left + self.scale * x, self._top - self.scale * y) for x, y in points]
+        return _near([(self._left + self.scale * x, self._top - self.scale * y) for x, y in points])
 
     def _area(self, points: list[Point], style: Style) -> None:
         half = 0.5 * FINE * style.width
@@ -243,7 +244,7 @@ class Pen:
         self._fill([*there, *reversed(back)], colour)
 
     def _fill(self, points: list[Point], colour: str) -> None:
-        draw = _pygame().draw
+        draw, points = _pygame().draw, _near(points)
         draw.polygon(self._surface, colour, points)
         draw.aalines(self._surface, colour, True, points)
 
@@ -337,9 +338,16 @@ _desk = _Desk()
 # --- geometry, in pixels ------------------------------------------------------------------------------------
 
 
+def _near(points: list[Point]) -> list[Point]:
+    """Move points that are far outside nearer: pygame goes through all rows and columns of what it draws."""
+    return [(min(max(x, -FAR), FAR), min(max(y, -FAR), FAR)) for x, y in points]
+
+
 def _rim(centre: Point, radius: float) -> list[Point]:
     """Return points of a circle, as many as its size asks for; the last is the first."""
-    return s.arc(centre, radius, 0.0, 2.0 * math.pi, max(12, math.ceil(4.0 * math.sqrt(max(radius, 0.0)))))
+    return s.arc(
+        centre, radius, 0.0, 2.0 * math.pi, min(max(12, math.ceil(4.0 * math.sqrt(max(radius, 0.0)))), 200)
+    )
 
 
 def _between(a: Point, b: Point, share: float) -> Point:

@@ -119,7 +119,6 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._rows[self._row["g"]] = given_target
         observation = np.empty(self._size, dtype=np.float32)
         self._program.start_one(self._rows, observation, self._ids, given_state is not None, given_target is not None)
-        self._rows[self._row["u"]] = 0.0
         self._ready = True
         if self.render_mode == "human":
             self.render()

@@ -180,7 +180,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._write("g", lanes, np.array([self._tasks[i].target for i in lanes]))
         observations = np.empty((self.num_envs, len(self._program.o)), dtype=np.float32)
         self._start(observations, mask, True, state is not None, target is not None or self._targets_given)
-        self._write("u", lanes, 0.0)
         self._started = True
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
         return observations, self._infos(mask)
@@ -220,7 +219,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         observations = np.empty(n * len(program.o), dtype=np.float32)
         rewards = np.empty(n)
         ended = np.empty(2 * n, dtype=np.bool_)
-        restarted = self._read("n") < 0.0 if self.diagnostics and self._over else None
         status, over = program.step_all(
             self._memory, self._ids, self._par, actions, observations, rewards, ended, self._targets_given, n
         )
@@ -231,7 +229,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._refuse(status - 1)
         observations = observations.reshape(n, -1)
         terminations, truncations = ended[:n], ended[n:]
-        infos = self._infos(None, restarted) if self.diagnostics else {}
+        infos = self._infos(None) if self.diagnostics else {}
         if self._over and self._mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
         return observations, rewards, terminations, truncations, infos
@@ -303,18 +301,15 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         last = {k: v if k.startswith("_") else np.where(over, v, 0) for k, v in infos.items()}
         last |= {k: over & v for k, v in last.items() if k.startswith("_")}
         self._start(observations, over, False, False, self._targets_given)
-        self._write("u", self._lanes[over], 0.0)
         self._over = 0
         infos = self._infos(None) if self.diagnostics else {}
         ends = {"final_obs": final, "_final_obs": over.copy(), "final_info": last, "_final_info": over.copy()}
         return observations, infos | ends
 
-    def _infos(self, mask: NDArray[np.bool_] | None, restarted: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+    def _infos(self, mask: NDArray[np.bool_] | None) -> dict[str, Any]:
         if not self.diagnostics:
             return {}
         mask = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
-        if restarted is not None:
-            self._write("u", self._lanes[restarted], 0.0)
         infos: dict[str, Any] = {}
         states, controls = self.state, self.control
         for i in self._lanes[mask]:

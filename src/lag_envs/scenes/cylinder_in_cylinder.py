@@ -29,7 +29,19 @@ from numpy.typing import ArrayLike
 
 from lag_envs.scenes.base import Motion, Scene, parameter
 from lag_envs.scenes.incline import _ratio
-from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window, arc, polar, roller
+from lag_envs.scenes.shapes import (
+    Arrow,
+    Circle,
+    Line,
+    Moment,
+    Point,
+    Polygon,
+    Shape,
+    Window,
+    arc,
+    polar,
+    roller,
+)
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, pendulum_flow
 
@@ -207,7 +219,7 @@ class CylinderInCylinder(Scene):
         """Return shell, cylinder and angle; what has turned is the shell."""
         theta, psi, big, small, origin = now.state[0], now.turned, self.shell_radius, self.radius, (0.0, 0.0)
         up, centre, rim, part = 0.5 * math.pi, self.place(theta), 1.1 * self.shell_radius, math.pi / 12
-        stave = (up + psi - part, up + psi + part)
+        first, last = up + psi - part, up + psi + part
         joints = [up + psi + part * i for i in range(3, 22, 2)]
         angle, ratio = up + (big * psi - self.arm * theta) / small, self.inertia / (self.mass * small * small)
         if self.control == "tilt":
@@ -218,7 +230,7 @@ class CylinderInCylinder(Scene):
         return [
             Circle(origin, rim, "ground"),
             *(Line([polar(origin, big, a), polar(origin, rim, a)], "ground") for a in joints),
-            Polygon([*arc(origin, rim, *stave), *arc(origin, big, *reversed(stave))], "frame"),
+            Polygon([*arc(origin, rim, first, last), *arc(origin, big, last, first)], "frame"),
             Circle(origin, big, "hole"),
             Line([origin, (0.0, -big)], "guide"),
             Line([origin, centre], "guide"),

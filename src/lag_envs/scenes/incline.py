@@ -231,7 +231,7 @@ class Incline(Scene):
         phi, radius = self.tilt, self.radius
         left, right = self.place(low, 0.0, phi), self.place(high, 0.0, phi)
         depth = min(left[1], right[1]) - (high - low)
-        marks = shapes.ticks(low, high, shapes.round_length(10.0 * radius))
+        marks = shapes.ticks(low, high, shapes.round_length((high - low) / 15.0))
         return [
             Polygon([left, right, (right[0], depth), (left[0], depth)], "ground"),
             *(Line([self.place(x, 0.0, phi), self.place(x, -0.6 * radius, phi)], "ground") for x in marks),

@@ -226,7 +226,7 @@ class PivotedBar(Scene):
             return [Line([(-2.0 * self.reach, 0.0), (2.0 * self.reach, 0.0)], "guide")]
         endless, size = math.isinf(self.track), 0.035 * self.reach
         low, high = (s - 3.0 * self.reach, s + 3.0 * self.reach) if endless else (-self.track, self.track)
-        step = shapes.round_length(0.2 * min(self.reach, high - low))
+        step = shapes.round_length(0.1 * (high - low))
         rail: list[Shape] = [Line([(x, 0.0), (x, -size)], "ground") for x in shapes.ticks(low, high, step)]
         rail.append(Line([(low, 0.0), (high, 0.0)], "frame"))
         if not endless:

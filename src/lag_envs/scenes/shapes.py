@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 
 Point = tuple[float, float]
 
-#: ``body`` moves by the laws of the scene, ``mark`` is painted on it and ``hole`` is cut out of it; ``ground`` and
-#: ``frame`` carry it; ``guide`` is a line of thought, such as an angle's zero; ``target``, ``limit`` and ``action``
-#: belong to the task.
+#: ``body`` moves by the laws of the scene, ``mark`` is painted on it and ``hole`` cut out of it; ``ground``
+#: and ``frame`` carry it; ``guide`` is a line of thought, such as an angle's zero; ``target``, ``limit`` and
+#: ``action`` belong to the task.
 Role = Literal["body", "mark", "hole", "ground", "frame", "guide", "target", "limit", "action"]
 
 
@@ -104,7 +104,7 @@ def polar(centre: Point, radius: float, angle: float) -> Point:
 
 
 def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> list[Point]:
-    """Return points [m] along a circle from one angle to another [rad], n pieces or as many as look smooth."""
+    """Return points [m] along a circle between two angles [rad], in n pieces or as many as look smooth."""
     n = n or 1 + math.ceil(abs(end - start) / 0.1)
     return [polar(centre, radius, start + (end - start) * i / n) for i in range(n + 1)]
 

@@ -16,19 +16,21 @@ for Numba. Three things happen on the way:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-_BINARY = {"+": "{} + {}", "-": "{} - {}", "*": "{} * {}", "/": "{} / {}"}
-_OTHER = {
-    "neg": "-{}",
-    "<": "{} < {}",
-    "<=": "{} <= {}",
-    "&": "{} & {}",
-    "|": "{} | {}",
-    "~": "not {}",
+_CODE = {
+    "+": "({} + {})",
+    "-": "({} - {})",
+    "*": "({} * {})",
+    "/": "({} / {})",
+    "neg": "(-{})",
+    "<": "({} < {})",
+    "<=": "({} <= {})",
+    "&": "({} & {})",
+    "|": "({} | {})",
+    "~": "(not {})",
     "where": "select({}, {}, {})",
-    "fma": "fma({}, {}, {})",
     "sqrt": "math.sqrt({})",
     "exp": "exp({})",
     "sin": "math.sin({})",
@@ -55,6 +57,8 @@ _FLOAT = {
     "abs": abs,
     "floor": math.floor,
 }
+
+_LONGEST = 160  # characters of an expression that is still moved into another
 
 
 class Number:
@@ -179,27 +183,21 @@ class Trace:
 
         for value in outputs.values():
             visit(value)
-        fused = {}
-        swallowed = set()
-        for node in self._nodes:
-            if node.name in uses and node.op in ("+", "-"):
-                fusion = _fuse(node, uses)
-                if fusion is not None:
-                    product, fused[node.name] = fusion
-                    swallowed.add(product.name)
+        text: dict[str, str] = {}
+
+        def show(value: Any) -> str:
+            return text.get(value.name, value.name) if isinstance(value, Number) else _literal(value)
+
         lines = []
         for node in self._nodes:
-            if node.name in uses and node.name not in swallowed:
-                lines.append(f"{node.name} = {fused.get(node.name) or _print(node)}")
-        # An output that is one plain operation takes its name at once.
-        names = {v.name: k for k, v in outputs.items() if isinstance(v, Number) and uses[v.name] == 1 and v.op}
-        if len(names) == 1 and lines:
-            (old, new), = names.items()
-            if lines[-1].startswith(f"{old} = "):
-                lines[-1] = lines[-1].replace(f"{old} = ", f"{new} = ", 1)
-                outputs = {k: v for k, v in outputs.items() if k != new}
-        lines += [f"{name} = {_show(value)}" for name, value in outputs.items()]
-        return lines
+            if node.name in uses:
+                code = _print(node, uses, show)
+                # What is used once moves to where it is used: fewer names are quicker to compile.
+                if uses[node.name] == 1 and len(code) < _LONGEST:
+                    text[node.name] = code
+                else:
+                    lines.append(f"{node.name} = {_bare(code)}")
+        return lines + [f"{name} = {_bare(show(value))}" for name, value in outputs.items()]
 
     # The functions that a formula may call, named as in NumPy.
 
@@ -315,29 +313,23 @@ def _simplify(op: str, args: tuple) -> Any:
     return None
 
 
-def _fuse(node: Number, uses: dict[str, int]) -> tuple[Number, str] | None:
-    """Return the product that this sum swallows, and the fused operation's code."""
-    a, b = node.args
-
-    def product(v: Any) -> bool:
-        return isinstance(v, Number) and v.op == "*" and uses[v.name] == 1
-
-    if product(a):
-        sign = "" if node.op == "+" else "-"
-        return a, f"fma({_show(a.args[0])}, {_show(a.args[1])}, {sign}{_show(b)})"
-    if product(b):
-        sign = "" if node.op == "+" else "-"
-        return b, f"fma({sign}{_show(b.args[0])}, {_show(b.args[1])}, {_show(a)})"
-    return None
+def _print(node: Number, uses: dict[str, int], show: Callable[[Any], str]) -> str:
+    """Return an operation as code; a sum swallows a product that nobody else uses."""
+    op, (a, b) = str(node.op), (*node.args, None)[:2]
+    if op in ("+", "-"):
+        sign = "" if op == "+" else "-"
+        for product, other, template in ((a, b, "fma({}, {}, " + sign + "{})"), (b, a, "fma(" + sign + "{}, {}, {})")):
+            if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
+                return template.format(*map(show, product.args), show(other))
+    return _CODE[op].format(*map(show, node.args))
 
 
-def _show(value: Any) -> str:
-    if isinstance(value, Number):
-        return value.name
+def _bare(code: str) -> str:
+    """Return code without the parentheses around all of it."""
+    return code[1:-1] if code.startswith("(") else code
+
+
+def _literal(value: float | bool) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return {"inf": "math.inf", "-inf": "-math.inf"}.get(str(value), "math.nan")
-    return f"({value!r})" if isinstance(value, float) and value < 0 else repr(value)
-
-
-def _print(node: Number) -> str:
-    return (_BINARY | _OTHER)[str(node.op)].format(*map(_show, node.args))
+    return f"({value!r})" if value < 0 else repr(value)

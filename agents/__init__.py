@@ -1,0 +1,1 @@
+"""Agents for the environments of `lag_envs`: classical controllers and learners."""

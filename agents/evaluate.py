@@ -1,0 +1,52 @@
+"""Returns and scores of agents over fresh episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+#: Mean returns of the random policy and of the best one known, where known for the task as a whole.
+KNOWN_RETURNS = {
+    "PivotedBar-v0": (0.6, 421.0),
+    "PivotedBarFree-v0": (-2.9, 421.0),
+    "InclineBrake-v0": (-4.27, -1.72),
+    "CylinderInCylinderDamping-v0": (283.0, 361.0),
+}
+
+
+def evaluate(env: gym.Env, agent: Any, seeds: Iterable[int]) -> NDArray[np.float64]:
+    """Return an agent's return in one episode for each seed.
+
+    Parameters
+    ----------
+    env : Env
+        A single environment.
+    agent : object
+        Anything with the `predict` of Stable-Baselines3; it is asked for its deterministic action.
+    seeds : iterable of int
+        What the episodes are reset with.
+    """
+    returns = []
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        state, over, total = None, False, 0.0
+        start = np.ones(1, np.bool_)
+        while not over:
+            action, state = agent.predict(observation, state, start, deterministic=True)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            total += float(reward)
+            over, start = terminated or truncated, np.zeros(1, np.bool_)
+        returns.append(total)
+    return np.array(returns)
+
+
+def score(env_id: str, mean_return: float) -> float | None:
+    """Return how far a mean return lies on the way from the random policy (0) to the best known one (1)."""
+    if env_id not in KNOWN_RETURNS:
+        return None
+    random, best = KNOWN_RETURNS[env_id]
+    return (mean_return - random) / (best - random)

@@ -1,0 +1,199 @@
+"""The native vector environments as Stable-Baselines3 sees vector environments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+import lag_envs  # noqa: F401  (registers the environments)
+
+
+def make_sb3_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> SB3VecEnv:
+    """Return a native vector environment for Stable-Baselines3.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment.
+    num_envs : int
+        Number of environments.
+    spread : int, default 0
+        See `SB3VecEnv`.
+    **options
+        Parameters of the environment.
+
+    Examples
+    --------
+    >>> env = make_sb3_vec_env("PivotedBar-v0", 3, damping=0.0)
+    >>> _ = env.seed(1)
+    >>> env.reset().shape
+    (3, 5)
+    """
+    return SB3VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), spread=spread)
+
+
+class SB3VecEnv(VecEnv):
+    """A Gymnasium vector environment as Stable-Baselines3's `VecEnv`.
+
+    What it returns equals `DummyVecEnv` over the single environments, bit for bit, except that the infos of
+    environments whose episode goes on hold only what the environment reports.
+
+    Parameters
+    ----------
+    env : VectorEnv
+        A vector environment that resets in the same step.
+    spread : int, default 0
+        Steps over which the beginnings of the first episodes are spread; the length of an episode is a good
+        choice. A reset then takes so many steps with random actions and meanwhile restarts the environments one
+        after the other. Else, where episodes are equally long, a learner's roll-out shows one phase of them.
+
+    Raises
+    ------
+    ValueError
+        For an environment with another autoreset mode.
+    """
+
+    def __init__(self, env: VectorEnv, *, spread: int = 0) -> None:
+        mode = env.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f'the environment must be made with autoreset_mode="SameStep", got {mode}')
+        self.env = env
+        self._spread = spread
+        self._actions: NDArray[np.floating] | None = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    # --- stepping -------------------------------------------------------------------------------------------
+
+    def reset(self) -> NDArray[np.float32]:
+        """Begin an episode in every environment, with the seeds and options that were set."""
+        observations, infos = self.env.reset(seed=self._seeds, options=self._stacked_options())
+        if self._spread:
+            observations, infos = self._spread_starts()
+        self.reset_infos = self._split(infos)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: NDArray[np.floating]) -> None:
+        """Take the actions for the next step."""
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Step all environments; those whose episode ended begin the next one."""
+        observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
+        done = terminated | truncated
+        ended = np.flatnonzero(done).tolist()
+        # The dicts are new ones, for callers may write to them; that costs some 20 ns each.
+        each = self._split(infos)
+        if ended:
+            final = infos.get("final_info", {})
+            for i in ended:
+                self.reset_infos[i] = each[i]
+                last = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
+                each[i] = _row(final, i) | last | {"terminal_observation": infos["final_obs"][i]}
+        return observations, rewards.astype(np.float32), done, each
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return a picture of each environment, where it was made with ``render_mode="rgb_array"``."""
+        frames = self.env.render() if self.render_mode is not None else None
+        return [None] * self.num_envs if frames is None else list(frames)
+
+    # --- attributes of the environments ---------------------------------------------------------------------
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the environments; a row for each where the batch keeps an array."""
+        single = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
+        return self._share(getattr(self.env, single.get(attr_name, attr_name)), indices)
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of all environments: a batch has but one of each."""
+        self._all(indices, "set")
+        setattr(self.env.unwrapped, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the batch, for all environments; return what it returned for each."""
+        self._all(indices, "call")
+        return self._share(getattr(self.env, method_name)(*method_args, **method_kwargs), None)
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        """Return False for each: wrappers of single environments cannot be in a batch."""
+        return [False for _ in self._get_indices(indices)]
+
+    # --- the rest -------------------------------------------------------------------------------------------
+
+    def _spread_starts(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        last = np.arange(self.num_envs) * self._spread // self.num_envs
+        space = self.env.action_space
+        space.seed(None if self._seeds[0] is None else int(self._seeds[0]))
+        for t in range(self._spread):
+            if t and (last == t).any():
+                self.env.reset(options={"reset_mask": last == t})
+            observations, *_, infos = self.env.step(space.sample())
+        return observations, infos
+
+    def _stacked_options(self) -> dict[str, Any] | None:
+        """Return the options of the environments as arrays of the batch."""
+        names = {name for options in self._options for name in options}
+        if any(names != set(options) for options in self._options):
+            raise ValueError("either all environments are given the same reset options, or none")
+        return {name: np.array([o[name] for o in self._options]) for name in names} or None
+
+    def _split(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return an info for each environment."""
+        reported = {k: v for k, v in infos.items() if k.lstrip("_") not in ("final_obs", "final_info")}
+        return [_row(reported, i) if reported else {} for i in range(self.num_envs)]
+
+    def _share(self, value: Any, indices: Any) -> list[Any]:
+        each = isinstance(value, np.ndarray | list | tuple) and len(value) == self.num_envs
+        return [value[i] if each else value for i in self._get_indices(indices)]
+
+    def _all(self, indices: Any, verb: str) -> None:
+        chosen: Iterable[int] = self._get_indices(indices)
+        if sorted(chosen) != list(range(self.num_envs)):
+            raise NotImplementedError(
+                f"a batch can only {verb} for all of its environments, got indices {indices!r}"
+            )
+
+
+def _row(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return what a vector environment's infos say about environment i: where the mask "_name" is set."""
+    return {k: v[i] for k, v in infos.items() if not k.startswith("_") and infos[f"_{k}"][i]}
+
+
+class ScaledReward(VecEnvWrapper):
+    """Multiply the reward that a learner sees.
+
+    Parameters
+    ----------
+    venv : VecEnv
+        The environments.
+    factor : float
+        What the rewards are multiplied by.
+    """
+
+    def __init__(self, venv: VecEnv, factor: float) -> None:
+        super().__init__(venv)
+        self.factor = np.float32(factor)
+
+    def reset(self) -> Any:
+        """Begin an episode in every environment."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Step all environments."""
+        observations, rewards, done, infos = self.venv.step_wait()
+        return observations, rewards * self.factor, done, infos

@@ -1,0 +1,378 @@
+"""Pictures: to scale, complete, the same for everyone, and without a display."""
+
+import math
+import subprocess
+import sys
+import time
+from functools import partial
+from itertools import pairwise
+from typing import get_args
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lag_envs
+from lag_envs.envs import rendering
+from lag_envs.scenes.shapes import Arrow, Circle, Moment, Polygon, Role, round_length, ticks
+from lag_envs.tasks import load_task
+
+pygame = pytest.importorskip("pygame")
+
+IDS = list(lag_envs.TASKS)
+
+
+def kind(env_id):
+    place, fixed = lag_envs.TASKS[env_id]
+    return partial(load_task(place), **fixed)
+
+
+TASKS = {env_id: kind(env_id)() for env_id in IDS} | {"quasi-static": kind("InclineTilt-v0")(control="tilt")}
+UNLIMITED = ("PivotedBarFree-v0", "InclineBrake-v0", "CylinderInCylinderDamping-v0")
+BLUE = [(0x56, 0xB4, 0xE9), (0x00, 0x72, 0xB2)]
+
+
+def picture(env_id, state=None, action=0.5, **options):
+    env = gym.make(env_id, render_mode="rgb_array", **options)
+    env.reset(seed=1, options=None if state is None else {"state": state})
+    env.step(np.array([action], dtype=np.float32))
+    frame = env.render()
+    env.close()
+    return frame
+
+
+def moment(task, share=0.5, **changes):
+    state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+    return Moment(state, share * task.limit_control, share, task.target_range and 0.1)._replace(**changes)
+
+
+def blue(frame):
+    """Return height and width of what has the colours of a body."""
+    rows, columns = np.nonzero(np.any([np.all(frame == colour, axis=-1) for colour in BLUE], axis=0))
+    return np.ptp(rows) + 1, np.ptp(columns) + 1
+
+
+def length(points):
+    return sum(math.dist(a, b) for a, b in pairwise(points))
+
+
+# --- pictures -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_frames_are_pictures_that_follow_the_state(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=1)
+    first = env.render()
+    assert first.shape == (432, 640, 3) and first.dtype == np.uint8
+    kept = first.copy()
+    assert np.array_equal(env.render(), first)
+    env.step(env.action_space.sample())
+    second = env.render()
+    assert not np.array_equal(second, first)
+    assert np.array_equal(first, kept) and not np.shares_memory(first, second)
+    assert len(np.unique(second.reshape(-1, 3), axis=0)) > 50
+    assert not pygame.display.get_init()
+    env.close()
+    env.reset(seed=1)
+    assert np.array_equal(env.render(), kept)
+    env.close()
+
+
+def test_cylinders_are_drawn_to_scale():
+    # 1.08 reaches to either side, a reach is the bar's 0.6 m; half a thickness sticks out above the pivot.
+    for frame, radius, scale in [
+        (picture("CylinderInCylinderTilt-v0"), 0.1, 384 / 1.28),
+        (picture("CylinderInCylinderDamping-v0", action=-1.0, radius=0.2), 0.2, 384 / 1.28),
+        (picture("InclineTilt-v0"), 0.05, 640 / 1.25),
+    ]:
+        assert blue(frame) == pytest.approx((2 * radius * scale,) * 2, abs=4)
+
+
+def test_bar_is_drawn_to_scale():
+    # 1.08 reaches to either side, a reach is the bar's 0.6 m; the bar ends half of its thickness above the pivot.
+    height, width = blue(picture("PivotedBarFree-v0", [0.0, 0.0], 0.0))
+    assert height == pytest.approx(0.6 * 1.035 * 384 / (2 * 1.08 * 0.6), abs=4)
+    assert width == pytest.approx(0.07 * 384 / (2 * 1.08), abs=4)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_arrow_is_in_proportion_to_the_control(name):
+    task = TASKS[name]
+    arrows = {}
+    for share in (0.0, 0.25, 0.5, 1.0):
+        (arrows[share],) = (s for s in task.shapes(moment(task, share)) if isinstance(s, Arrow))
+    full = length(arrows[1.0].points)
+    assert full > 0.0
+    for share, arrow in arrows.items():
+        assert length(arrow.points) == pytest.approx(share * full, rel=1e-2, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_shows_its_target_or_limits(name):
+    task = TASKS[name]
+    roles = {getattr(shape, "role", None) for shape in task.shapes(moment(task))}
+    assert {"body", "action", "target"} <= roles
+    assert ("limit" in roles) == (name not in UNLIMITED)
+
+
+def test_target_is_where_it_was_set():
+    task = TASKS["CylinderInCylinderTilt-v0"]
+    (mark,) = (s for s in task.shapes(moment(task, target=0.3)) if s.role == "target")
+    assert mark.centre == pytest.approx((0.4 * math.sin(0.3), -0.4 * math.cos(0.3)))
+    assert mark.radius == 0.1
+    task = TASKS["InclineTilt-v0"]
+    (mark,) = (s for s in task.shapes(moment(task, target=0.3, state=[0.0, 0.0, 0.0])) if s.role == "target")
+    assert mark == Circle((0.3, 0.05), 0.05, "target")
+
+
+def turn(shapes):
+    """Return place and angle of a rolling cylinder."""
+    centre = next(s.centre for s in shapes if isinstance(s, Circle) and s.role == "body")
+    x, y = next(s.points[1] for s in shapes if isinstance(s, Polygon) and s.role == "mark")
+    return centre, math.atan2(y - centre[1], x - centre[0])
+
+
+def turned(task, before, after):
+    angles = [turn(task.shapes(now))[1] for now in (before, after)]
+    return math.remainder(angles[1] - angles[0], 2.0 * math.pi)
+
+
+def test_cylinders_roll_without_slipping():
+    # On the incline at x'/R + phi' clockwise; in the shell at (R psi' - a theta')/r counter-clockwise.
+    task = TASKS["InclineTilt-v0"]
+    before, after = Moment([0.1, 0.0, 0.01]), Moment([0.12, 0.0, 0.03])
+    assert turned(task, before, after) == pytest.approx(-(0.02 / 0.05 + 0.02))
+    task = TASKS["CylinderInCylinderPump-v0"]
+    before, after = Moment([0.1, 0.0, 0.0], turned=0.3), Moment([0.2, 0.0, 0.0], turned=0.4)
+    assert turned(task, before, after) == pytest.approx((0.5 * 0.1 - 0.4 * 0.1) / 0.1)
+    task = TASKS["InclineBrake-v0"]
+    (x0, y0), _ = turn(task.shapes(Moment([-1.0, 0.0])))
+    (x1, y1), _ = turn(task.shapes(Moment([-0.9, 0.0])))
+    assert (x1 - x0, y1 - y0) == pytest.approx((0.1 * math.cos(math.pi / 12), -0.1 * math.sin(math.pi / 12)))
+
+
+def test_shell_turns_by_the_integral_of_its_rate():
+    env = gym.make("CylinderInCylinderTilt-v0", render_mode="rgb_array", damping=0.0).unwrapped
+    env.reset(seed=1)
+    env.render()
+    for _ in range(5):
+        env.step(np.array([0.1], dtype=np.float32))
+        env.render()
+        env.render()
+    # psi'' = 1.5 rad/s² for 0.25 s.
+    assert env._viewer._turned == pytest.approx(0.5 * 1.5 * 0.25**2)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        ("PivotedBar-v0", {"track": math.inf}),
+        ("PivotedBar-v0", {"inertia": 0.0}),
+        ("PivotedBar-v0", {"com_distance": 1e-8}),
+        ("PivotedBar-v0", {"com_distance": 1e3}),
+        ("InclineTilt-v0", {"control": "tilt"}),
+        ("InclineTilt-v0", {"inertia": 0.0025}),
+        ("InclineTilt-v0", {"radius": 1e-9}),
+        ("InclineBrake-v0", {"tilt": 0.0}),
+        ("InclineBrake-v0", {"tilt": 1.5}),
+        ("InclineBrake-v0", {"radius": 1e6}),
+        ("InclineBrake-v0", {"radius": 1e-9}),
+        ("CylinderInCylinderTilt-v0", {"radius": 0.4999}),
+        ("CylinderInCylinderTilt-v0", {"shell_radius": 1e6, "radius": 1e-6}),
+    ],
+)
+def test_unusual_parameters_are_drawn_too(env_id, options):
+    task = kind(env_id)(**options)
+    start = time.process_time()
+    frame = pygame.surfarray.array3d(rendering.paint(task, moment(task)))
+    assert time.process_time() - start < 0.5
+    assert frame.std() > 0.0
+
+
+def test_far_away_start_stays_in_the_picture():
+    assert min(blue(picture("InclineBrake-v0", [-500.0, 1.0]))) > 10
+
+
+def test_tubes_are_drawn_hollow():
+    solid = picture("CylinderInCylinderTilt-v0")
+    tube = picture("CylinderInCylinderTilt-v0", inertia=0.009)
+    assert np.all(solid == BLUE[1], axis=-1).sum() > 2 * np.all(tube == BLUE[1], axis=-1).sum()
+
+
+def test_vector_environment_draws_each_of_its_environments():
+    envs = gym.make_vec(
+        "CylinderInCylinderTilt-v0", num_envs=3, render_mode="rgb_array", radius=[0.05, 0.1, 0.2]
+    )
+    envs.reset(seed=1)
+    envs.step(envs.action_space.sample())
+    frames = envs.render()
+    assert len(frames) == 3
+    assert [blue(frame)[1] for frame in frames] == pytest.approx([30, 60, 120], abs=4)
+    envs.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_record_video_without_a_warning(env_id, tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(
+        gym.make(env_id, render_mode="rgb_array"), str(tmp_path), disable_logger=True
+    )
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    assert video.stat().st_size > 1000
+
+
+def test_pictures_for_the_readme_are_small(tmp_path):
+    files = rendering.write_pictures(tmp_path)
+    assert [file.stem for file in files] == IDS
+    assert max(file.stat().st_size for file in files) <= 40_000
+
+
+# --- windows ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def window(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield
+    pygame.display.quit()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_window_opens_closes_and_opens_again(window, env_id):
+    env = gym.make(env_id, render_mode="human")
+    for _ in range(2):
+        env.reset(seed=1)
+        env.step(env.action_space.sample())
+        assert env.render() is None
+        assert pygame.display.get_surface().get_size() == (640, 432)
+        env.close()
+        assert not pygame.display.get_init()
+
+
+def test_window_shows_what_rgb_array_returns(window):
+    env = gym.make("InclineTilt-v0", render_mode="human")
+    env.reset(seed=1)
+    env.step(np.array([0.5], dtype=np.float32))
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    assert np.array_equal(shown, picture("InclineTilt-v0"))
+    env.close()
+
+
+def test_window_keeps_the_pace_of_the_control_interval(window):
+    env = gym.make("CylinderInCylinderTilt-v0", render_mode="human")
+    env.reset(seed=1)
+    start = time.perf_counter()
+    for _ in range(6):
+        env.step(env.action_space.sample())
+    assert time.perf_counter() - start > 0.9 * 6 * 0.05
+    env.close()
+
+
+def test_environments_share_the_window(window):
+    envs = [gym.make(env_id, render_mode="human") for env_id in IDS[:3]]
+    for env in envs:
+        env.reset(seed=1)
+    for env in envs:
+        env.step(env.action_space.sample())
+    assert pygame.display.get_surface().get_size() == (2 * 640, 2 * 432)
+    envs[1].close()
+    envs[0].render()
+    assert pygame.display.get_surface().get_size() == (2 * 640, 432)
+    envs[0].close()
+    envs[2].close()
+    assert not pygame.display.get_init()
+
+
+def test_environment_goes_on_when_its_window_is_closed(window):
+    env = gym.make("PivotedBar-v0", render_mode="human")
+    env.reset(seed=1)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    assert not pygame.display.get_init()
+    env.close()
+    env.reset(seed=1)
+    assert pygame.display.get_surface() is not None
+    env.close()
+
+
+def test_keys_are_left_to_the_program(window):
+    env = gym.make("PivotedBar-v0", render_mode="human")
+    env.reset(seed=1)
+    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
+    env.step(env.action_space.sample())
+    assert [event.key for event in pygame.event.get(pygame.KEYDOWN)] == [pygame.K_LEFT]
+    env.close()
+
+
+def test_pygame_may_be_quit_by_others(window):
+    env, shown = (gym.make("PivotedBar-v0", render_mode=mode) for mode in ("rgb_array", "human"))
+    env.reset(seed=1)
+    shown.reset(seed=1)
+    before = env.render()
+    pygame.quit()
+    assert np.array_equal(env.render(), before)
+    shown.render()
+    assert pygame.display.get_surface() is not None
+    env.close()
+    shown.close()
+
+
+def test_missing_display_is_named(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+    env = gym.make("PivotedBar-v0", render_mode="human")
+    with pytest.raises(gym.error.Error, match="rgb_array"):
+        env.reset(seed=1)
+    env.close()
+
+
+# --- the rest -----------------------------------------------------------------------------------------------
+
+
+def test_missing_pygame_is_named_with_its_remedy(monkeypatch):
+    env = gym.make("PivotedBar-v0", render_mode="rgb_array")
+    env.reset(seed=1)
+    rendering._pygame.cache_clear()
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "lag-envs\[render\]"'):
+        env.render()
+
+
+def test_pygame_is_imported_only_when_something_is_drawn():
+    code = """
+import sys, gymnasium as gym, lag_envs.envs.rendering
+env = gym.make("PivotedBar-v0")
+env.reset(seed=1)
+env.step(env.action_space.sample())
+env.close()
+assert "pygame" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_role_has_a_style():
+    assert set(rendering.STYLES) == set(get_args(Role))
+
+
+def test_round_lengths_and_ticks():
+    assert [round_length(x) for x in (0.03, 0.1, 0.99, 5.0, 40.0)] == pytest.approx(
+        [0.02, 0.1, 0.5, 5.0, 20.0]
+    )
+    assert ticks(-0.25, 0.2, 0.1) == pytest.approx([-0.2, -0.1, 0.0, 0.1, 0.2])
+
+
+def test_dashes_cover_the_line():
+    dashes = list(rendering._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0))
+    assert sum(length(dash) for dash in dashes) == pytest.approx(3.0 * 4)
+    assert dashes[0] == [(0.0, 0.0), (3.0, 0.0)]
+    assert dashes[1] == [(5.0, 0.0), (7.0, 0.0), (7.0, 1.0)]
+
+
+def test_numbers_keep_their_width():
+    assert rendering._number(-1.5) == "−1.500"
+    assert rendering._number(123456.0) == "1.23e+05"

@@ -1,0 +1,630 @@
+"""Numerics: the recurrences, the bound, and one step of everything against 30 digits and more."""
+
+import math
+import os
+import subprocess
+import sys
+import time
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+from reference import EPS, VARIANTS, Pendulum, conditioning, elliptic, flow, linear, moving_plane, random_cases, scales
+from reference import pendulum as pendulum_reference
+from scipy.integrate import solve_ivp
+
+import lag_envs
+from lag_envs import scenes
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
+from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.pendulum import Drive
+from lag_envs.stepping.slope import Pull, Turn
+from lag_envs.tasks import TASKS, load_task
+
+KINDS = "task", "damped", "stiff", "extreme"
+
+
+@pytest.fixture(autouse=True)
+def precise():
+    with mp.workdps(60):
+        yield
+
+
+# --- the series ------------------------------------------------------------------------------------------------
+
+
+def random_drive(rng, ramp=True):
+    """Return W_0, cos, sin and scaled coefficients as mpmath numbers, from calm to violent."""
+    angle = mpf(rng.uniform(-4, 4))
+    size = 10.0 ** rng.uniform(-3, 0, 5) * rng.choice([0.0, 1.0], 5, p=[0.2, 0.8])
+    a, b, gamma, d, r = (mpf(v) for v in size * rng.uniform(-1, 1, 5) * [0.3, 0.3, 1, 0.3, 1])
+    w = mpf(rng.uniform(-1, 1) * 10.0 ** rng.uniform(-3, 0))
+    return w, mp.cos(angle), mp.sin(angle), Drive(a, b, gamma, d, r if ramp else 0.0)
+
+
+def test_coefficients_are_derivatives():
+    """W_k k! is the k-th derivative of W, by repeated differentiation of polynomials in W, cos, sin, t."""
+    import sympy
+
+    w, c, s, tau = symbols = sympy.symbols("w c s tau")
+    a, b, gamma, d, r = numbers = [sympy.Rational(n, 7) for n in (3, -2, 4, 5, 6)]
+    point = {w: sympy.Rational(2, 3), c: sympy.Rational(3, 5), s: sympy.Rational(-4, 5), tau: 0}
+    rates = (-(a * s + b * c) - gamma * w + d + r * tau, -s * w, c * w, 1)
+    derivative, expected = w, []
+    for k in range(11):
+        expected.append(float(derivative.subs(point)) / math.factorial(k))
+        derivative = sympy.expand(sum(derivative.diff(z) * rate for z, rate in zip(symbols, rates, strict=True)))
+    floats = (float(point[z]) for z in (w, c, s))
+    W, _ = pendulum.taylor_coefficients(*floats, Drive(*map(float, numbers)), 10)
+    assert pytest.approx(expected, rel=1e-13) == W
+
+
+def test_energy_identity():
+    """H = W²/2 holds for every coefficient, and 2/h sum H_k/(k+1) is the integral of theta'²."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        w, c, s, drive = random_drive(rng, ramp=False)
+        W, H = pendulum.taylor_coefficients(w, c, s, drive, 40)
+        for k, h in enumerate(H):
+            product = mp.fsum(W[j] * W[k - j] for j in range(k + 1)) / 2
+            assert abs(h - product) < 1e-15 * max(abs(x) for x in W) ** 2
+        a, b, gamma, d, _ = drive
+        angle = mp.fsum(x / (k + 1) for k, x in enumerate(W))
+        c1, s1 = c * mp.cos(angle) - s * mp.sin(angle), s * mp.cos(angle) + c * mp.sin(angle)
+        gained = mp.fsum(W) ** 2 / 2 - w**2 / 2 + a * (c - c1) + b * (s1 - s)
+        work = d * angle - gamma * 2 * mp.fsum(h / (k + 1) for k, h in enumerate(H))
+        assert abs(gained - work) < 1e-15
+
+
+@pytest.mark.parametrize("order", [3, 6, 10, 16, 20])
+def test_order(order):
+    """The error of one step of theta' falls as h^(N+1), that of theta as h^(N+2)."""
+    drive = Drive(mpf(20), mpf(-7), mpf(3), mpf(5), mpf(40))
+    start = mpf(0.3), mpf(2.5), mp.cos(0.3), mp.sin(0.3)
+
+    def errors(h):
+        rough, fine = (pendulum.step(*start, drive, h, n) for n in (order, order + 30))
+        return [abs(a - b) for a, b in zip(rough, fine, strict=True)][:2]
+
+    big, small = errors(mpf(2) ** -8), errors(mpf(2) ** -9)
+    slopes = [float(mp.log(a / b, 2)) for a, b in zip(big, small, strict=True)]
+    assert slopes == pytest.approx([order + 2, order + 1], abs=0.2)
+
+
+def least_x(w, drive):
+    """Return the least x for which the bound is proved."""
+    low, high = 0.0, 64.0
+    for _ in range(60):
+        x = 0.5 * (low + high)
+        good = pendulum.certified(float(w), Drive(*map(float, drive)), 1.0, x, np)
+        low, high = (low, x) if good else (x, high)
+    return high
+
+
+@pytest.mark.parametrize("order", [8, 16, 20])
+def test_bound_is_never_broken(order):
+    """Truncation against a longer series: below the bound in 300 random cases, by a factor of 2 at the closest."""
+    rng = np.random.default_rng(order)
+    closest = [0.0, 0.0]
+    tested = 0
+    while tested < 300:
+        w, c, s, drive = random_drive(rng)
+        x = mpf(least_x(w, drive))
+        if not 0 < x < 1:
+            continue
+        tested += 1
+        W, _ = pendulum.taylor_coefficients(w, c, s, drive, order + 24)
+        kappa = x / 2
+        for k, coefficient in enumerate(W):
+            assert abs(coefficient) <= x * kappa**k * (1 + mpf(1e-12))
+        tail = x * kappa ** (order + 1) / (1 - kappa)
+        left_out = abs(mp.fsum(W[order + 1 :])), abs(mp.fsum(v / (k + 1) for k, v in enumerate(W) if k > order))
+        for i, bound in enumerate((tail, tail / (order + 2))):
+            closest[i] = max(closest[i], float(left_out[i] / bound))
+    assert 1e-6 < min(closest) and max(closest) <= 1.0
+    assert max(closest) < 0.5
+
+
+def test_bound_of_a_pendulum_over_the_top():
+    """The bound is not loose by nature: here the coefficients come within a factor of 3 per power."""
+    # From the top of the orbit E = 2 G, theta'' ~ the singularity closest to the real axis.
+    w, drive = mpf(0.0), Drive(mpf(0.02), 0.0, 0.0, mpf(0.02), 0.0)
+    W, _ = pendulum.taylor_coefficients(w, mpf(0), mpf(-1), drive, 25)
+    x = least_x(w, drive)
+    assert (abs(W[25]) / x) ** (1 / 25) > x / 2 / 3
+
+
+def test_every_task_is_one_certified_step():
+    """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'."""
+    largest = {}
+    for name, (place, fixed) in TASKS.items():
+        task = load_task(place)(**fixed)
+        for case in corners(name):
+            bound = task.scene.truncation_bound(*case, task.dt)
+            if bound is None:
+                continue
+            assert bound.substeps == 1, (name, case)
+            assert bound.theta_dot <= 1e-12 and bound.theta <= 1e-12
+            largest[name] = max(largest.get(name, 0.0), bound.theta_dot)
+    assert len(largest) == 6
+
+
+def corners(name):
+    """Return the fastest states and strongest controls of a task."""
+    signs = [(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
+    if name.startswith("PivotedBar"):
+        speed, most = (7.0, 3.0) if "Balance" in name else (15.0, 5.0)
+        track = [] if "Free" in name else [0.5, 0.0]
+        return [([*track, theta, a * speed], b * most) for a, b, _ in signs for theta in (0.0, 1.5, math.pi)]
+    if name == "CylinderInCylinderDamping-v0":
+        return [([a * 1.3, b * 8.0], c) for a, b, _ in signs for c in (0.0, 2.4)]
+    if name.startswith("CylinderInCylinder"):
+        most, spin, place = (15.0, 6.0, 1.05) if "Tilt" in name else (4.0, 3.0, 1.3)
+        return [([place, a * 6.0, b * spin], c * most) for a, b, c in signs]
+    return [([0.0] * (3 if "Tilt" in name else 2), 0.0)]
+
+
+# --- one step against the reference -----------------------------------------------------------------------------
+
+
+@cache
+def body(kind, **parameters):
+    return getattr(scenes, kind)(**parameters)
+
+
+def one_step(case):
+    """Return the step's error as a share of 1e-12 scale, and of eps cond + 1e-12 scale; None where refused."""
+    arguments = [case[k] for k in ("scene", "params", "state", "control", "dt")]
+    scene = body(case["scene"], **case["params"])
+    try:
+        end = scene.simulate(case["state"], [case["control"]], case["dt"])[1]
+    except StepRefused as error:
+        assert np.array_equal(error.trajectory, [case["state"]])
+        return None
+    errors = [abs(mpf(float(a)) - b) for a, b in zip(end, flow(*arguments, dps=30), strict=True)]
+    sizes = scales(*arguments)
+    plain = max(float(e) / (1e-12 * s) for e, s in zip(errors, sizes, strict=True))
+    if plain < 0.1:
+        return plain, plain
+    amplified = conditioning(*arguments)
+    shares = zip(errors, sizes, amplified, strict=True)
+    return plain, max(float(e) / (EPS * a + 1e-12 * s) for e, s, a in shares)
+
+
+@pytest.mark.parametrize(
+    ("kind", "n", "seed", "allowed"), [("task", 60, 21, 1e-3), ("damped", 48, 22, 1e-2), ("stiff", 36, 23, 1e-2)]
+)
+def test_one_step(kind, n, seed, allowed):
+    """Errors as a share of 1e-12 max(1, ...): 2e-16 on the tasks, below 1e-15 with drag up to gamma dt = 1e6."""
+    for case in random_cases(kind, n, seed):
+        assert one_step(case)[0] < allowed, case
+
+
+def test_one_step_of_extremes():
+    """Full accuracy or a refusal; measured with what the system itself makes of the state's rounding."""
+    refused = 0
+    for case in random_cases("extreme", 42, 24):
+        error = one_step(case)
+        refused += error is None
+        assert error is None or error[1] < 50.0, case
+    assert refused <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_step_of_many(kind, capsys):
+    """The same for 1,200 cases of each kind, and the largest error of each scene."""
+    worst = {}
+    for case in random_cases(kind, 1200, 31):
+        error = one_step(case)
+        key = case["scene"], case["control_kind"]
+        entry = worst.setdefault(key, [0.0, 0.0, 0])
+        if error is None:
+            entry[2] += 1
+        else:
+            entry[:2] = map(max, entry[:2], error)
+    with capsys.disabled():
+        print(f"\n{kind}: largest error / (1e-12 scale), / (eps cond + 1e-12 scale), refused")
+        for key, (plain, share, refused) in worst.items():
+            print("   ", *key, f"{plain:.1e} {share:.1e} {refused}")
+    assert set(worst) == set(VARIANTS)
+    assert max(e[0 if kind != "extreme" else 1] for e in worst.values()) < {"task": 1e-3, "extreme": 100}.get(kind, 0.1)
+
+
+@cache
+def any_pendulum():
+    return pendulum.compile_flow((True,) * 5)
+
+
+def pendulum_errors(theta, omega, drive, dt):
+    """Return errors of theta and theta' as shares of what is asked for, and the substeps."""
+    c, s = math.cos(theta), math.sin(theta)
+    x = pendulum.largest_x(dt)
+    *end, substeps = any_pendulum()(theta, omega, c, s, *map(float, drive), dt, x)
+    exact = pendulum_reference(Pendulum(*map(mpf, drive)), mpf(theta), mpf(omega), mpf(dt), 40)
+    field = math.hypot(drive.alpha, drive.beta)
+    size = max(1.0, abs(theta), abs(omega) * dt, abs(end[0])), max(1.0, abs(omega), math.sqrt(field), abs(end[1]))
+    assert end[2:4] == pytest.approx([math.cos(end[0]), math.sin(end[0])], abs=1e-15 * (size[0] + math.sqrt(abs(substeps))))
+    return *(float(abs(a - b)) / (1e-12 * s) for a, b, s in zip(end[:2], exact, size, strict=True)), substeps
+
+
+@pytest.mark.parametrize("decay", [79.0, 83.0, 100.0, 110.0, 1000.0])
+@pytest.mark.parametrize("share", [0.999e-3, 1.001e-3, 3e-4, 1e-6])
+def test_heavy_damping_at_its_thresholds(decay, share):
+    """field = share gamma², gamma dt = decay: on both sides of where the jump along the slow manifold begins."""
+    dt = 0.02
+    gamma = decay / dt
+    field = share * gamma * gamma
+    for omega in (0.0, -1e6):
+        for theta, parts in (
+            (2.0, (1.0, 0.0, 0.0, 0.0)),
+            (-1.0, (0.0, -1.0, 0.0, 0.0)),
+            (3.1, (0.3, 0.3, 0.4, 0.0)),
+            (1.0, (0.2, -0.3, 0.0, 0.5)),
+            (0.5, (0.0, 0.0, -1.0, 0.0)),
+        ):
+            a, b, d, r = (field * part for part in parts)
+            *errors, _ = pendulum_errors(theta, omega, Drive(a, b, gamma, d, r / dt), dt)
+            assert max(errors) < 0.1, (omega, parts)
+
+
+@pytest.mark.parametrize("decay", [1e4, 1e6])
+def test_very_heavy_damping(decay):
+    dt = 0.05
+    gamma = decay / dt
+    for omega, field in ((1e4, 25.0), (-3.0, 5e3), (0.0, 1e-4 * gamma * decay)):
+        *errors, substeps = pendulum_errors(2.5, omega, Drive(field, -0.5 * field, gamma, 0.3 * field, field / dt), dt)
+        assert max(errors) < 1e-2
+        assert 0 < substeps < 1000
+
+
+@pytest.mark.parametrize("decay", [0.0, 1e-300, 1e-12, 1e-6, 0.2499, 0.2501, 1.0, 1.499, 1.501, 30.0, 1e3, 1e6])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_fixed_slope(decay, sign):
+    """drag dt on both sides of each change of formula; a negative drag pushes."""
+    if sign * decay < -700.0:
+        return
+    step = slope.compile_slide((True, True))
+    for dt in (1e-6, 0.02, 1.0):
+        for x, v, pull in ((0.3, -2.0, 5.0), (0.0, 0.0, 9.81), (1e3, 1e4, -0.1), (-1.0, 1.0, 0.0)):
+            drag = sign * decay / dt
+            *end, status = step(x, v, pull, drag, dt, 0.0)
+            exact = linear(mpf(drag), mpf(pull), mpf(0), mpf(x), mpf(v), mpf(dt))
+            growth = math.exp(max(0.0, -drag * dt)) * (1.0 + abs(drag * dt) * (sign < 0))
+            size = (abs(x) + (abs(v) + abs(pull) * dt) * dt * growth, (abs(v) + abs(pull) * dt) * growth)
+            assert status == 1
+            for value, truth, scale in zip(end, exact, size, strict=True):
+                assert abs(value - truth) <= 4e-16 * scale
+
+
+@pytest.mark.parametrize("decay", [0.0, 1e-3, 0.124, 0.126, 3.0, 1e3, 1e6])
+@pytest.mark.parametrize("rate", [0.0, 1e-300, -1e-12, 1e-3, 1.0, -40.0])
+def test_turning_slope(decay, rate):
+    """From a still plane to one that turns by 40 rad/s, on both sides of where short steps begin."""
+    step = slope.compile_turn((True,) * 4)
+    k, gravity = 2.0 / 3.0, 9.81
+    for dt in (0.02, 0.5):
+        drag = decay / dt
+        for x, v, phi in ((0.4, -1.0, 0.3), (-1.0, 0.0, -1.2)):
+            *end, status = step(x, v, math.cos(phi), math.sin(phi), k, gravity, drag, rate, dt, 0.0)
+            place, speed, tilt = moving_plane(*map(mpf, (k, drag, gravity, 0, rate)), map(mpf, (x, v, phi)), mpf(dt))
+            assert status == 1
+            for value, truth in zip(end, (place, speed, mp.cos(tilt), mp.sin(tilt)), strict=True):
+                assert abs(value - truth) <= 1e-14 * max(1, abs(truth))
+
+
+def test_still_plane_is_the_fixed_one():
+    plane = Incline(control="tilt_rate", damping=0.3).simulate([0.1, 0.2, 0.3], [0.0], 0.5)[1]
+    fixed = Incline(control="tilt", damping=0.3).simulate([0.1, 0.2], [0.3], 0.5)[1]
+    assert plane[:2] == pytest.approx(fixed, rel=1e-15)
+
+
+@pytest.mark.parametrize("control", [-0.05, -3.0])
+def test_negative_drag(control):
+    """A drag that is the control may be negative; then it pushes, and the bound takes its size."""
+    shell = CylinderInCylinder(control="damping")
+    k = shell.constants()
+    rows = shell.simulate([0.5, 0.2], [control] * 20, 0.02)
+
+    def rhs(t, y):
+        return [y[1], -k["weight"] * math.sin(y[0]) - k["brake"] * control * y[1]]
+
+    exact = solve_ivp(rhs, (0.0, 0.4), [0.5, 0.2], "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    assert rows[-1] == pytest.approx(exact, rel=1e-10)
+    with pytest.raises(StepRefused):
+        shell.simulate([0.5, 0.2], [-1e8], 0.02)
+
+
+# --- hard cases, and refusals ------------------------------------------------------------------------------------
+
+BAR = {"mass": 1.0, "com_distance": 0.5, "inertia": 0.0, "track": None}
+SHELL = {"mass": 1.0, "shell_radius": 0.5, "damping": 0.02}
+HARD = {
+    "drive of 1e6 for a second": ("PivotedBar", {**BAR, "damping": 1.0}, (1.0, 0.0), 1e6, 0.05),
+    "drive of 1e6 undamped": ("PivotedBar", BAR, (1.0, 0.0), 1e6, 1.0),
+    "1e4 rad/s for a second": ("PivotedBar", BAR, (1.0, 1e4), 3.0, 1.0),
+    "1e4 rad/s backwards": ("PivotedBar", BAR, (-math.pi, -1e4), 1e6, 0.1),
+    "no gravity": ("PivotedBar", {**BAR, "gravity": 0.0}, (1.0, 2.0), 0.0, 1.0),
+    "strong gravity": ("PivotedBar", {**BAR, "gravity": 1e3}, (math.pi, 0.0), 0.0, 0.5),
+    "upright": ("PivotedBar", BAR, (math.pi, 0.0), 0.0, 1.0),
+    "upright, tiny step": ("PivotedBar", BAR, (math.pi, 1.0), 1e6, 1e-6),
+    "short bar": ("PivotedBar", {**BAR, "com_distance": 1e-8}, (1.0, 3.0), 1.0, 0.01),
+    "separatrix above": ("PivotedBar", BAR, (0.0, 2 * math.sqrt(9.81 / 0.5) * (1 + 1e-15)), 0.0, 1.0),
+    "separatrix below": ("PivotedBar", BAR, (0.0, 2 * math.sqrt(9.81 / 0.5) * (1 - 1e-15)), 0.0, 1.0),
+    "far angle": ("PivotedBar", BAR, (1e9, 3.0), 1.0, 0.02),
+    "r near R": ("CylinderInCylinder", {**SHELL, "radius": 0.5 - 1e-9}, (1.0, 0.0, 2.0), 3.0, 1e-3),
+    "r near 0": ("CylinderInCylinder", {**SHELL, "radius": 1e-9}, (1.0, 0.0, 2.0), 3.0, 0.5),
+    "hoop, strong drive": (
+        "CylinderInCylinder",
+        {**SHELL, "radius": 0.1, "inertia": 0.01},
+        (1.0, 0.0, 2.0),
+        1e6,
+        0.01,
+    ),
+    "point mass": ("CylinderInCylinder", {**SHELL, "radius": 0.1, "inertia": 0.0}, (1.0, -4.0, 6.0), 15.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_case(name):
+    """Accurate within what rounding of the state and of the parameters does; and quick."""
+    kind, params, state, control, dt = HARD[name]
+    scene = body(kind, **params)
+    scene.simulate(state, [0.0], 1e-6)  # compile
+    began = time.perf_counter()
+    end = scene.simulate(state, [control], dt)[1]
+    assert time.perf_counter() - began < 0.2
+    arguments = kind, params, state, control, dt
+    exact, sizes = flow(*arguments, dps=30), scales(*arguments)
+    amplified = conditioning(*arguments, include_params=True)
+    for value, truth, size, gain in zip(end, exact, sizes, amplified, strict=True):
+        assert abs(value - truth) < 20 * EPS * gain + 1e-12 * size
+
+
+@pytest.mark.parametrize(
+    ("scene", "state", "control", "dt"),
+    [
+        (PivotedBar(track=None), (1.0, 1e7), 0.0, 1.0),
+        (PivotedBar(track=None), (1.0, 1e300), 0.0, 1.0),
+        (PivotedBar(track=None), (1.0, 0.0), 1e300, 0.02),
+        (PivotedBar(track=None), (1.0, 0.0), 0.0, 1e300),
+        (PivotedBar(), (1e308, 1e308, 0.0, 0.0), 0.0, 10.0),
+        (CylinderInCylinder(control="damping"), (1.0, 0.0), 1e300, 0.02),
+        (Incline(control="tilt_rate"), (1.0, 0.0, 0.0), 1e6, 1.0),
+        (Incline(control="tilt_rate"), (1.0, 0.0, 0.0), 1e300, 1.0),
+        (Incline(), (1e308, 1e308), 0.0, 10.0),
+    ],
+)
+def test_refusal(scene, state, control, dt):
+    """A step that cannot be taken says so at once, keeps what was computed, and leaves the scene usable."""
+    scene.simulate(state, [0.0], 1e-9)
+    for before in (0, 2):
+        small = [0.0] * before
+        began = time.perf_counter()
+        with pytest.raises(StepRefused, match="refused: from .* with control .* and dt=") as error:
+            scene.simulate(state, [*small, control], dt) if not before else scene.simulate(state, [control] * 3, dt)
+        assert time.perf_counter() - began < 0.2
+        assert np.array_equal(error.value.trajectory[0], state)
+    assert np.isfinite(scene.simulate([0.1] * len(state), [0.0], 0.02)).all()
+
+
+def test_refused_step_keeps_the_rows_before():
+    bar = PivotedBar(track=None)
+    controls = [1.0, 2.0, 1e300, 1.0]
+    with pytest.raises(StepRefused, match="step 2 of 4") as error:
+        bar.simulate([1.0, 0.0], controls, 0.02)
+    assert np.array_equal(error.value.trajectory, bar.simulate([1.0, 0.0], controls[:2], 0.02))
+
+
+@pytest.mark.parametrize(
+    ("state", "controls", "dt", "message"),
+    [
+        ([0.0, 0.0], [1.0, math.nan], 0.02, r"control must be finite, got nan at \[1\]"),
+        ([0.0, 0.0], [math.inf], 0.02, "control must be finite, got inf"),
+        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got \(\)"),
+        ([0.0, 0.0], [[1.0]], 0.02, r"shape \(T,\), got \(1, 1\)"),
+        ([0.0, 0.0], ["one"], 0.02, "control must be a number"),
+        ([0.0, 0.0, 0.0], [1.0], 0.02, r"state must be \(theta, theta_dot\), got .* \(3,\)"),
+        ([0.0, math.nan], [1.0], 0.02, "state must be finite, got .*theta_dot"),
+        ("ab", [1.0], 0.02, "state must be 2 numbers"),
+        ([0.0, 0.0], [1.0], 0.0, "dt must be above 0 s, got 0 s"),
+        ([0.0, 0.0], [1.0], -0.02, "dt must be above 0 s, got -0.02 s"),
+        ([0.0, 0.0], [1.0], 1e-320, "dt must be above 0 s"),
+        ([0.0, 0.0], [1.0], math.nan, "dt must be finite"),
+        ([0.0, 0.0], [1.0], math.inf, "dt must be finite"),
+        ([0.0, 0.0], [1.0], True, "dt must be a real number"),
+    ],
+)
+def test_bad_arguments(state, controls, dt, message):
+    with pytest.raises(ValueError, match=message):
+        PivotedBar(track=None).simulate(state, controls, dt)
+
+
+def test_no_controls():
+    assert PivotedBar(track=None).simulate([1.0, 2.0], [], 0.02).tolist() == [[1.0, 2.0]]
+
+
+# --- long runs -----------------------------------------------------------------------------------------------------
+
+
+def test_long_run():
+    """1,000 s undamped from 2 rad: energy, cos² + sin², and the angle by elliptic functions."""
+    bar = PivotedBar(track=None)
+    (weight,) = (v for v in bar.constants().values() if v not in (0.0, bar.constants()["pull"]))
+    dt, steps = 0.02, 50_000
+    rows = bar.simulate([2.0, 0.0], np.zeros(steps), dt)
+    energy = bar.energy(rows)["total"]
+    assert np.ptp(energy) / bar.mass / bar.gravity / bar.com_distance < 2e-12
+    p = Pendulum(mpf(weight), mpf(0), mpf(0), mpf(0), mpf(0))
+    for row, allowed in ((500, 1e-13), (steps, 2e-9)):
+        exact = elliptic(p, mpf(2.0), mpf(0), row * mpf(dt))
+        assert rows[row] == pytest.approx([float(v) for v in exact], abs=allowed)
+
+    advance, x = bar.stepper().compile(), pendulum.largest_x(dt)
+    numbers = [v for v in bar.constants().values() if v]
+    y = (2.0, 0.0, math.cos(2.0), math.sin(2.0))
+    for _ in range(steps):
+        *y, _ = advance(*y, 0.0, dt, x, *numbers)
+    assert y[0] == rows[-1, 0]
+    assert y[2] * y[2] + y[3] * y[3] == pytest.approx(1.0, abs=5e-16)
+    assert y[2:] == pytest.approx([math.cos(y[0]), math.sin(y[0])], abs=1e-11)
+
+
+@pytest.mark.slow
+def test_energy_after_ten_million_steps():
+    bar = PivotedBar(track=None)
+    state, start = np.array([2.0, 0.0]), bar.energy([2.0, 0.0])["total"]
+    worst = 0.0
+    for _ in range(10):
+        rows = bar.simulate(state, np.zeros(1_000_000), 0.02)
+        state = rows[-1]
+        worst = max(worst, np.abs(bar.energy(rows)["total"] - start).max())
+    assert worst / bar.mass / bar.gravity / bar.com_distance < 1e-11
+
+
+@pytest.mark.parametrize("kind", ["bar", "shell", "shell damping"])
+def test_against_dop853(kind):
+    """10 s with drag and a new control in each step, against SciPy at 1e-13."""
+    rng = np.random.default_rng(3)
+    if kind == "bar":
+        scene, state, dt = PivotedBar(damping=0.001, track=None), [1.0, 2.0], 0.02
+        controls = rng.uniform(-5, 5, 500)
+    elif kind == "shell":
+        scene, state, dt = CylinderInCylinder(damping=0.24), [0.3, 0.5, 1.0], 0.05
+        controls = rng.uniform(-15, 15, 200)
+    else:
+        scene, state, dt = CylinderInCylinder(control="damping"), [0.8, 3.0], 0.02
+        controls = rng.uniform(0, 2.4, 500) * (rng.random(500) < 0.1)
+    rows = scene.simulate(state, controls, dt)
+    k = scene.constants()
+
+    def rhs(t, y):
+        if kind == "bar":
+            return [y[1], -k["weight"] * math.sin(y[0]) - k["pull"] * u * math.cos(y[0]) - k["drag"] * y[1]]
+        if kind == "shell":
+            return [y[1], -k["weight"] * math.sin(y[0]) + k["push"] * u - k["drag"] * (y[1] - y[2]), u]
+        return [y[1], -k["weight"] * math.sin(y[0]) - k["brake"] * u * y[1]]
+
+    y = np.array(state)
+    for u in controls:
+        y = solve_ivp(rhs, (0.0, dt), y, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    assert np.abs(rows[-1] - y).max() < 2e-11
+
+
+# --- one source, several backends ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_simulate_is_the_environments_step(name):
+    """From a given state, with the control that was applied: the same bits (but for the speed where it is kicked)."""
+    env = gym.make(name).unwrapped
+    rng = np.random.default_rng(4)
+    env.reset(seed=5)
+    kicks = 0
+    for _ in range(60):
+        env.reset()
+        start = env.state
+        env.reset(options={"state": start})
+        env.step(rng.uniform(-1, 1, 1))
+        end, expected = env.state, env.scene.simulate(start, [env.control], env.task.dt)[1]
+        kicks += not np.array_equal(end, expected)
+        if kicks and not np.array_equal(end, expected):
+            assert np.flatnonzero(end != expected).tolist() == [env.scene.state_names.index("theta_dot")]
+    assert kicks <= (5 if env.task.draws else 0)
+    if not env.task.draws:
+        env.reset(options={"state": start})
+        controls, states = [], [start]
+        for _ in range(100):
+            _, _, terminated, _, _ = env.step(rng.uniform(-0.2, 0.2, 1))
+            controls.append(env.control)
+            states.append(env.state)
+            if terminated:
+                break
+        assert np.array_equal(states, env.scene.simulate(start, controls, env.task.dt))
+
+
+def batch(n, sizes, seed):
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-size, size, n) for size in sizes]
+
+
+def formulas():
+    """Yield functions of columns, and the columns, for each of the three flows."""
+    h = 0.02
+
+    def swing(theta, omega, c, s, *drive):
+        return pendulum.step(theta, omega, c, s, Drive(*drive), h)
+
+    theta, omega, *drive = batch(200, [3, 10, 30, 10, 5, 5, 20], 7)
+    yield swing, [theta, omega, np.cos(theta), np.sin(theta), *drive]
+    yield lambda x, v, pull, drag: slope.slide(x, v, Pull(pull, drag), h), batch(200, [1, 3, 9, 5], 8)
+    x, v, phi, *turn = batch(200, [1, 3, 1, 1, 9, 1, 1], 9)
+    yield (
+        lambda x, v, c, s, *rest: slope.turn_series(x, v, c, s, Turn(*rest), h),
+        [x, v, np.cos(phi), np.sin(phi), *turn],
+    )
+
+
+@pytest.mark.parametrize("which", range(3))
+def test_floats_arrays_and_tensors(which):
+    """The same formula: equal bits on floats and arrays, a few units in the last place on torch tensors."""
+    torch = pytest.importorskip("torch")
+    formula, columns = list(formulas())[which]
+    arrays = np.array(formula(*columns))
+    floats = np.array([formula(*row) for row in np.transpose(columns).tolist()]).T
+    assert np.array_equal(arrays, floats)
+    tensors = np.array([v.numpy() for v in formula(*map(torch.from_numpy, columns))])
+    assert np.abs(tensors - arrays).max() <= 4 * EPS * np.abs(arrays).max()
+
+
+def test_compiled_is_the_formula():
+    """Fused operations change the last places only."""
+    formula, columns = next(iter(formulas()))
+    plain = np.array(formula(*columns))
+    x = pendulum.largest_x(0.02)
+    for i, row in enumerate(np.transpose(columns).tolist()):
+        *compiled, substeps = any_pendulum()(*row, 0.02, x)
+        assert substeps == 1
+        assert compiled == pytest.approx(plain[:, i], rel=1e-15, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("scene", "parameter", "state"),
+    [
+        (PivotedBar, "damping", (0.1, 0.2, 2.0, 3.0)),
+        (PivotedBar, "gravity", (0.1, 0.2, 2.0, 3.0)),
+        (CylinderInCylinder, "damping", (1.0, 2.0, 3.0)),
+        (Incline, "damping", (0.4, -1.0)),
+    ],
+)
+def test_what_is_zero_costs_nothing(scene, parameter, state):
+    """A constant that is zero leaves fewer operations, and the numbers are those of a very small one."""
+    keywords = {"control": "tilt"} if scene is Incline else {}
+    without, with_it = (scene(**keywords, **{parameter: value}) for value in (0.0, 1e-50))
+    assert len(without.stepper().fast) < len(with_it.stepper().fast)
+    ends = [body.simulate(state, [1.3], 0.02)[1] for body in (without, with_it)]
+    assert ends[0] == pytest.approx(ends[1], rel=1e-15)
+
+
+def test_track_costs_only_itself():
+    with_track, without = (len(PivotedBar(track=track).stepper().fast) for track in (0.5, None))
+    assert without < with_track <= without + 6
+
+
+def test_same_bits_in_every_process():
+    """Neither hash seeds nor the order of compilation show."""
+    code = (
+        "from lag_envs.scenes import *; import numpy as np;"
+        "a = PivotedBar(track=None).simulate([1, 2], np.linspace(-5, 5, 300), 0.02);"
+        "b = Incline(control='tilt_rate').simulate([.1, .2, .3], np.linspace(-3, 3, 50), 0.05);"
+        "print(a.tobytes().hex()[-64:], b.tobytes().hex()[-64:])"
+    )
+    outputs = set()
+    for seed in "1", "2":
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        outputs.add(run.stdout)
+    assert len(outputs) == 1 and len(outputs.pop()) > 128
+    assert lag_envs.__version__

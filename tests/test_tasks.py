@@ -1,0 +1,517 @@
+"""Each task restated in plain numbers, held against what the environments do."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+from rollouts import IDS, actions, make
+
+each_id = pytest.mark.parametrize("env_id", IDS)
+PI = math.pi
+
+
+# --- the table ------------------------------------------------------------------------------------------------
+
+
+class Row:
+    """One row of the table: dt, steps, boxes of the start, and the task's formulas in the order of a step."""
+
+    dt, steps = 0.02, 500
+    largest = 1.0  # control
+    target = 0.0  # half width
+    kicks: tuple = ()
+
+    def control(self, a, y):
+        return self.largest * a
+
+    def ended(self, y):
+        return False
+
+
+class PivotedBar(Row):
+    start = [(0, 0.05), (0, 0.02), (0, 0.1), (0, 0.1)]
+    largest, track = 5.0, 0.5
+
+    def control(self, a, y, dt=0.02):
+        return nearest_safe(y[0], y[1], self.largest * a, self.largest, self.track, dt)
+
+    def reward(self, y, u, target):
+        return ((1 - math.cos(y[2])) / 2) ** 2 - 0.02 * (u / 5) ** 2
+
+    def observe(self, y, target):
+        return [y[0] / 0.5, y[1] / 2, math.cos(y[2]), math.sin(y[2]), y[3] / 8]
+
+
+class PivotedBarFree(Row):
+    start = [(0, 0.1), (0, 0.1)]
+    largest = 5.0
+
+    def reward(self, y, u, target):
+        return ((1 - math.cos(y[0])) / 2) ** 2 - 0.02 * (u / 5) ** 2
+
+    def observe(self, y, target):
+        return [math.cos(y[0]), math.sin(y[0]), y[1] / 8]
+
+
+class PivotedBarBalance(Row):
+    start = [(0, 0.2), (0, 0.2), (PI, 0.15), (0, 0.3)]
+    largest = 3.0
+
+    def reward(self, y, u, target):
+        return 1 - 0.5 * ((y[2] - PI) / 0.35) ** 2 - 0.5 * (y[0] / 0.5) ** 2
+
+    def ended(self, y):
+        return abs(y[2] - PI) > 0.35 or abs(y[0]) > 0.5
+
+    def observe(self, y, target):
+        return [y[0], y[1], y[2] - PI, y[3]]
+
+    def kicked(self, size):
+        return abs(size) <= 1.0
+
+
+class InclineTilt(Row):
+    dt, steps = 0.05, 200
+    start = [(0, 0.4), (0, 0.3), (0, 0.05)]
+    largest, target = 0.3, 0.3
+
+    def control(self, a, y, dt=0.05):
+        return min(max(0.3 * a, (-0.1 - y[2]) / dt), (0.1 - y[2]) / dt)
+
+    def reward(self, y, u, target):
+        return math.exp(-(((y[0] - target) / 0.1) ** 2)) - 0.02 * (u / 0.3) ** 2
+
+    def ended(self, y):
+        return abs(y[0]) > 0.5
+
+    def observe(self, y, target):
+        return [*y, target]
+
+
+class InclineBrake(Row):
+    start = [(-2, 1.0), (0.5, 0.5)]
+
+    def control(self, a, y):
+        return 3.0 * (1 + a)
+
+    def reward(self, y, u, target):
+        return -0.02  # the last step has a test of its own
+
+    def ended(self, y):
+        return y[0] >= 0.0
+
+    def observe(self, y, target):
+        return [-y[0], y[1]]
+
+
+class CylinderInCylinderTilt(Row):
+    dt, steps = 0.05, 200
+    start = [(0, 0.1), (0, 0.2), (0, 0.0)]
+    largest, target, fastest, highest = 15.0, 0.3, 6.0, 1.05
+
+    def control(self, a, y, dt=0.05):
+        return min(max(self.largest * a, (-self.fastest - y[2]) / dt), (self.fastest - y[2]) / dt)
+
+    def reward(self, y, u, target):
+        return math.exp(-(((y[0] - target) / 0.1) ** 2)) - 0.02 * (u / 15) ** 2
+
+    def ended(self, y):
+        return abs(y[0]) > self.highest
+
+    def observe(self, y, target):
+        return [*y, target]
+
+
+class CylinderInCylinderPump(CylinderInCylinderTilt):
+    largest, target, fastest, highest = 4.0, 0.0, 3.0, 1.3
+
+    def reward(self, y, u, target):
+        square, wanted = 2 / 3 * 9.81 / 0.4, 2 / 3 * 9.81 / 0.4 * (1 - math.cos(0.9))
+        assert wanted == pytest.approx(6.187, abs=5e-4)
+        energy = y[1] ** 2 / 2 + square * (1 - math.cos(y[0]))
+        return math.exp(-abs(energy - wanted) / (0.3 * wanted)) - 0.02 * (u / 4) ** 2
+
+    def observe(self, y, target):
+        return list(y)
+
+
+class CylinderInCylinderDamping(Row):
+    start = [(0, 0.8), (0, 1.0)]
+
+    def control(self, a, y):
+        return 1.2 * (1 + a)
+
+    def reward(self, y, u, target):
+        square = 2 / 3 * 9.81 / 0.4
+        assert math.sqrt(square) == pytest.approx(4.0435, abs=5e-5)
+        return math.exp(-math.sqrt(y[0] ** 2 + y[1] ** 2 / square) / 0.1)
+
+    def ended(self, y):
+        return 0.4 * y[1] ** 2 + 9.81 * math.cos(y[0]) < 0
+
+    def observe(self, y, target):
+        return list(y)
+
+    def kicked(self, size):
+        return min(abs(abs(size) - 1.5), abs(abs(size) - 3.0)) < 1e-12
+
+
+ROWS = {cls.__name__ + "-v0": cls() for cls in (
+    PivotedBar, PivotedBarFree, PivotedBarBalance, InclineTilt, InclineBrake,
+    CylinderInCylinderTilt, CylinderInCylinderPump, CylinderInCylinderDamping,
+)}  # fmt: skip
+
+
+def nearest_safe(s, s_dot, wanted, top, track, dt):
+    """Return the control nearest to the wanted one after which braking at `top` stops on the track."""
+
+    def overshoot(u, side):
+        v = s_dot + u * dt
+        return v * v / (2 * top) + side * (s + s_dot * dt + u * dt * dt / 2) - track
+
+    candidates = [wanted, -top, top]
+    for side in (1, -1):
+        a, b = dt * dt / (2 * top), s_dot * dt / top + side * dt * dt / 2
+        c = s_dot * s_dot / (2 * top) + side * (s + s_dot * dt) - track
+        candidates += [root.real for root in np.roots([a, b, c]) if abs(root.imag) < 1e-6 * abs(root)]
+    safe = [u for u in candidates if abs(u) <= top + 1e-9 and max(overshoot(u, 1), overshoot(u, -1)) <= 1e-12]
+    return min(safe, key=lambda u: abs(u - wanted)) if safe else -math.copysign(top, s_dot)
+
+
+def bold(env_id, env, i, rng):
+    """Return actions that reach limits and ends: noise, then long pushes."""
+    if i % 2:
+        return rng.uniform(-1.2, 1.2, 1)
+    return np.sign(env.state[-1:] if (i // 100) % 4 == 0 else rng.normal(size=1))
+
+
+# --- the step -------------------------------------------------------------------------------------------------
+
+
+@each_id
+def test_parameters_and_time(env_id):
+    env, row = make(env_id), ROWS[env_id]
+    assert (env.task.dt, env.task.limit) == (row.dt, row.steps)
+    scene = env.scene
+    if env_id.startswith("PivotedBar"):
+        assert (scene.mass, scene.com_distance, scene.damping) == (0.2, 0.3, 0.001 if "Balance" not in env_id else scene.damping)
+        assert scene.inertia == pytest.approx(0.006, rel=1e-15)
+        assert scene.track == (None if "Free" in env_id else 0.5)
+    elif env_id.startswith("Incline"):
+        assert (scene.mass, scene.radius, scene.inertia) == (1.0, 0.05, pytest.approx(0.5 * 0.05**2))
+        assert scene.damping == (0.03 if "Tilt" in env_id else 0.0)
+        assert "Tilt" in env_id or scene.tilt == pytest.approx(PI / 12)
+    else:
+        assert (scene.mass, scene.shell_radius, scene.radius, scene.inertia) == (1.0, 0.5, 0.1, pytest.approx(0.005))
+        assert scene.damping == {"Tilt-v0": 0.24, "Pump-v0": 0.024, "Damping-v0": 0.0}[env_id.removeprefix("CylinderInCylinder")]
+    assert scene.gravity == 9.81
+
+
+@each_id
+def test_every_step_is_as_the_table_says(env_id):
+    env, row = make(env_id), ROWS[env_id]
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    n, ends, cuts, kicks = 0, 0, 0, 0
+    for i in range(2500):
+        before, target = env.state, env.target
+        a = bold(env_id, env, i // 10, rng) if i % 10 == 0 or i // 10 % 2 else a
+        observation, reward, terminated, truncated, _ = env.step(a)
+        n += 1
+        u = env.control
+        assert u == pytest.approx(row.control(float(np.clip(a[0], -1, 1)), before), abs=1e-7)
+        after = env.scene.simulate(before, [u], row.dt)[1]
+        jump = env.state - after
+        if hasattr(row, "kicked"):
+            kicks += abs(jump[-1]) > 1e-9
+            assert abs(jump[-1]) < 1e-12 or row.kicked(jump[-1])
+            jump[-1] = 0.0
+        np.testing.assert_allclose(jump, 0.0, atol=1e-14)
+        # Reward and ending look at the state before the kick, the observation at the one after it.
+        if not (terminated and env_id == "InclineBrake-v0"):
+            assert reward == pytest.approx(row.reward(after, u, target), rel=1e-12, abs=1e-14)
+        assert terminated == row.ended(after)
+        np.testing.assert_allclose(observation, np.float32(row.observe(env.state, target)), rtol=3e-7, atol=1e-7)
+        assert truncated == (n == row.steps)
+        ends, cuts = ends + terminated, cuts + truncated
+        if terminated or truncated:
+            env.reset()
+            n = 0
+    assert (ends > 0) == (env_id not in ("PivotedBar-v0", "PivotedBarFree-v0")) or "Damping" in env_id
+    assert (kicks > 0) == hasattr(row, "kicked")
+
+
+@each_id
+def test_starts(env_id):
+    row = ROWS[env_id]
+    envs = gym.make_vec(env_id, num_envs=20_000)
+    envs.reset(seed=0)
+    columns = list(envs.state.T)
+    boxes = list(row.start)
+    assert (envs.target is None) == (row.target == 0.0)
+    if row.target:
+        columns.append(envs.target)
+        boxes.append((0, row.target))
+    drawn = []
+    for values, (centre, half) in zip(columns, boxes, strict=True):
+        if half == 0:
+            assert (values == centre).all()
+            continue
+        share = (np.sort(values) - centre + half) / (2 * half)
+        assert 0.0 <= share[0] and share[-1] < 1.0 + 1e-12
+        assert_uniform(share)
+        drawn.append(values)
+    correlations = np.corrcoef(drawn) - np.eye(len(drawn))
+    assert np.abs(correlations).max() < 5.0 / math.sqrt(20_000)
+    # The second episodes are drawn afresh.
+    envs.reset()
+    assert abs(np.corrcoef(drawn[0], envs.state[:, 0])[0, 1]) < 5.0 / math.sqrt(20_000)
+
+
+def assert_uniform(share):
+    """Hold sorted numbers against the uniform distribution: Kolmogorov-Smirnov at a chance of 1e-5."""
+    n = len(share)
+    assert np.abs(share - (np.arange(n) + 0.5) / n).max() < 2.5 / math.sqrt(n)
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.2, 0.005])
+@pytest.mark.parametrize("env_id", ["PivotedBarBalance-v0", "CylinderInCylinderDamping-v0"])
+def test_kicks(env_id, dt):
+    n, steps = 3000, 20
+    envs = gym.make_vec(env_id, num_envs=n, dt=dt)
+    envs.reset(seed=1)
+    sizes = []
+    for _ in range(steps):
+        before, control = envs.state, np.zeros((n, 1))
+        *_, terminated, truncated, _ = envs.step(control)
+        after = np.array([envs.scene.simulate(y, [u], dt)[1] for y, u in zip(before, envs.control, strict=True)])
+        sizes.append((envs.state - after)[:, -1])
+        np.testing.assert_allclose((envs.state - after)[:, :-1], 0.0, atol=1e-13)
+        if (terminated | truncated).any():
+            envs.reset()
+    sizes = np.concatenate(sizes)
+    kicks = sizes[np.abs(sizes) > 1e-10]
+    chance = 1 - 0.99 ** (dt / 0.02)
+    assert abs(len(kicks) - chance * len(sizes)) < 5 * math.sqrt(chance * len(sizes))
+    if env_id == "PivotedBarBalance-v0":
+        assert_uniform((np.sort(kicks) + 1) / 2)
+    else:
+        counts = [np.sum(np.abs(kicks - size) < 1e-9) for size in (-3.0, -1.5, 1.5, 3.0)]
+        assert sum(counts) == len(kicks)
+        assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
+
+
+@pytest.mark.parametrize("env_id", [i for i in IDS if i != "InclineBrake-v0"])
+def test_running_rewards_with_another_interval(env_id):
+    env, row = make(env_id, dt=0.03), ROWS[env_id]
+    env.reset(seed=3)
+    for a in actions(50, 1):
+        before, target = env.state, env.target
+        _, reward, terminated, _, _ = env.step(a)
+        after = env.scene.simulate(before, [env.control], 0.03)[1]
+        assert reward == pytest.approx(0.03 / row.dt * row.reward(after, env.control, target), rel=1e-12, abs=1e-14)
+        if terminated:
+            env.reset()
+
+
+# --- limits ---------------------------------------------------------------------------------------------------
+
+
+def pushes(rng):
+    """Return policies that try to leave the track."""
+    return [
+        lambda y: 1.0,
+        lambda y: -1.0,
+        lambda y: np.sign(y[1]) or 1.0,
+        lambda y: -np.sign(y[1]) or 1.0,
+        lambda y: rng.choice([-1.0, 1.0]),
+        lambda y: rng.uniform(-1.0, 1.0),
+        lambda y: math.cos(40 * y[0]),
+    ]
+
+
+@pytest.mark.parametrize(("track", "dt"), [(0.5, 0.02), (0.5, 0.1), (0.05, 0.02), (3.0, 0.005), (0.5, 1e-4)])
+def test_the_track_is_never_left(track, dt):
+    env = make("PivotedBar-v0", track=track, dt=dt)
+    rng = np.random.default_rng(0)
+    worst = 0.0
+    for policy in pushes(rng):
+        for edge in (0.0, 0.3, 0.999999, 1.0):
+            s = rng.uniform(-track, track) if edge < 1.0 else rng.choice([-track, track])
+            s_dot = rng.choice([-1.0, 1.0]) * math.sqrt(2 * 5.0 * edge * (track - abs(s)))
+            env.reset(seed=1, options={"state": [s, s_dot, 0.0, 0.0]})
+            for _ in range(150):
+                y = env.state
+                a = policy(y)
+                env.step(np.array([a]))
+                s, s_dot = env.state[:2]
+                worst = max(worst, abs(s) - track, abs(s) + s_dot**2 / 10 - track)
+                # Where the root is nearly double, rounding moves it by the square root of rounding.
+                assert env.control == pytest.approx(nearest_safe(y[0], y[1], 5.0 * a, 5.0, track, dt), abs=1e-8 / dt)
+    assert worst < 1e-14 * (1 + track)
+
+
+def test_the_guard_leaves_alone_what_is_safe():
+    env = make("PivotedBar-v0")
+    env.reset(seed=1, options={"state": [0.1, 0.2, 0.0, 0.0]})
+    for a in (0.123456789, -1.0, 1.0):
+        env.step(np.array([a]))
+        assert env.control == 5.0 * a
+
+
+def test_an_endless_track_has_no_guard():
+    env = make("PivotedBar-v0", track=math.inf)
+    env.reset(seed=1)
+    for _ in range(300):
+        env.step(np.ones(1))
+        assert env.control == 5.0
+    assert env.state[0] > 50.0
+
+
+@pytest.mark.parametrize(
+    ("env_id", "entry", "limit"),
+    [("InclineTilt-v0", 2, 0.1), ("CylinderInCylinderTilt-v0", 2, 6.0), ("CylinderInCylinderPump-v0", 2, 3.0)],
+)
+@pytest.mark.parametrize("dt", [None, 0.013, 0.7])
+def test_limits_are_met_at_the_end_of_a_step(env_id, entry, limit, dt):
+    env = make(env_id, dt=dt)
+    rng = np.random.default_rng(0)
+    env.reset(seed=1)
+    met = 0
+    for i in range(2000):
+        side = 1.0 if i // 40 % 2 else -1.0
+        *_, terminated, truncated, _ = env.step(np.array([side * rng.choice([1.0, 1.0, 0.7])]))
+        value = abs(env.state[entry])
+        assert value <= limit * (1 + 4e-16)
+        met += value == pytest.approx(limit, rel=1e-12)
+        if terminated or truncated:
+            env.reset()
+    assert met > 5
+
+
+def test_quasi_static_tilt():
+    env = make("InclineTilt-v0", control="tilt")
+    assert env.scene.state_names == ("x", "x_dot")
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (3,)
+    env.step(np.array([0.5]))
+    assert env.control == 0.05
+
+
+# --- braking to the line --------------------------------------------------------------------------------------
+
+
+def crossing(x, v, pull, drag):
+    """Return time and speed at the line of x'' = pull - drag x' from (x, v), in 60 digits."""
+    x, v, pull, drag = map(mpf, (x, v, pull, drag))
+
+    def at(t):
+        phi1 = -mp.expm1(-drag * t) / drag if drag else t
+        phi2 = (t - phi1) / drag if drag else t * t / 2
+        return x + v * phi1 + pull * phi2, v * mp.exp(-drag * t) + pull * phi1
+
+    high = mpf(1)
+    low = mpf(0)
+    for _ in range(220):
+        middle = (low + high) / 2
+        low, high = (low, middle) if at(middle)[0] >= 0 else (middle, high)
+    return low, at(low)[1]
+
+
+CROSSINGS = [
+    # distance, speed, action, options
+    (1e-3, 1.0, -1.0, {}), (0.015, 1.0, 0.3, {}), (0.0199, 1.0, -1.0, {}), (1e-9, 0.0, 1.0, {}), (1e-15, 1.0, 1.0, {}),
+    (1e-4, 0.5, 1.0, {}), (0.01, 0.6, 1.0, {"damping": 5.0}), (0.5, 50.0, 0.5, {}), (1.5, 100.0, 1.0, {}),
+    (0.3, 0.0, -1.0, {"dt": 1.0}), (0.8, 1.0, 1.0, {"dt": 1.0}), (0.5, 1.0, 1.0, {"dt": 1.0, "damping": 10.0}),
+    # flat: the cylinder coasts, and may come to the line with hardly any speed
+    (0.01, 1.0, -1.0, {"tilt": 0.0}), (0.01, 1.0, 1.0, {"tilt": 0.0}), (0.1, 1.0, 1.0, {"tilt": 0.0, "damping": 5.0, "dt": 1.0}),
+    (0.015 * (1 - 1e-9), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 1.0}),
+    (0.015 * (1 - 1e-6), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 0.5}),
+    # stiff: the speed is gone at once, or just before the line
+    (1e-6, 1.0, 0.0, {"damping": 1e3}), (1e-6, 1.0, 0.0, {"damping": 1e5}), (1.4e-3, 1.0, 0.0, {"damping": 1e3}),
+    (1.5e-3, 1.0, 0.0, {"damping": 1e3}), (1.51e-3, 1.0, 0.0, {"damping": 1e3}), (1.6e-3, 1.0, 0.0, {"damping": 1e3, "dt": 0.5}),
+    (1.5e-6, 1.0, 0.0, {"damping": 1e6}), (1.5e-6 + 1e-12, 1.0, 0.0, {"damping": 1e6, "dt": 1.0}),
+    (1e-8, 0.0, 0.0, {"damping": 1e6}), (1.5e-4, 100.0, 0.0, {"damping": 1e6, "dt": 1.0}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("distance", "speed", "action", "options"), CROSSINGS)
+def test_crossing_time(distance, speed, action, options):
+    env = make("InclineBrake-v0", duration=10.0, **options)
+    env.reset(seed=1, options={"state": [-distance, speed]})
+    _, reward, terminated, _, _ = env.step(np.array([action]))
+    assert terminated
+    scene = env.scene
+    c = 3.0 * (1.0 + action)
+    assert env.control == pytest.approx(c)
+    with mp.workdps(60):
+        share = 1 / (1 + mpf(scene.inertia) / (mpf(scene.mass) * mpf(scene.radius) ** 2))
+        pull = share * mpf(scene.gravity) * mp.sin(mpf(scene.tilt))
+        time, end = crossing(-distance, speed, pull, share * (mpf(scene.damping) + mpf(env.control)) / mpf(scene.mass))
+        assert 0 <= time <= env.task.dt * (1 + mpf(10) ** -14)
+        wanted = -time - 5 * max(end - mpf(0.5), 0)
+        assert abs(reward - wanted) < 1e-12 * (1 + speed)
+
+
+def test_the_way_to_the_line_is_paid_by_the_second():
+    for dt in (0.01, 0.02, 0.05):
+        env = make("InclineBrake-v0", dt=dt)
+        env.reset(seed=1, options={"state": [-1.0, 0.0]})
+        rewards = []
+        terminated = False
+        while not terminated:
+            _, reward, terminated, _, _ = env.step(np.array([-1.0]))
+            rewards.append(reward)
+        assert rewards[:-1] == [-dt] * (len(rewards) - 1)
+        pull = 2 / 3 * 9.81 * math.sin(PI / 12)
+        assert sum(rewards) == pytest.approx(-math.sqrt(2 / pull) - 5 * (math.sqrt(2 * pull) - 0.5), rel=1e-12)
+
+
+# --- known returns --------------------------------------------------------------------------------------------
+
+
+def mean_return(env_id, policy, n=400, **options):
+    """Return the mean return of the first episodes, and its standard error."""
+    envs = gym.make_vec(env_id, num_envs=n, **options)
+    envs.reset(seed=0)
+    rng = np.random.default_rng(1)
+    total, on = np.zeros(n), np.ones(n, dtype=bool)
+    while on.any():
+        given = rng.uniform(-1.0, 1.0, (n, 1)) if policy is None else np.full((n, 1), policy)
+        _, rewards, terminated, truncated, _ = envs.step(given)
+        total += on * rewards
+        on &= ~(terminated | truncated)
+    return total.mean(), total.std() / math.sqrt(n)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "policy", "options", "known", "within"),
+    [
+        ("PivotedBarFree-v0", None, {}, -2.9, 0.3),
+        ("PivotedBarFree-v0", 0.0, {}, 0.0, 0.1),
+        ("PivotedBar-v0", None, {}, 0.6, 1.5),
+        ("PivotedBar-v0", 0.0, {}, 0.0, 0.1),
+        ("PivotedBarBalance-v0", None, {}, 21.0, 2.0),
+        ("PivotedBarBalance-v0", 0.0, {}, 21.0, 2.0),
+        ("InclineTilt-v0", None, {"target": 0.0}, 9.0, 2.0),
+        ("InclineTilt-v0", None, {"target": 0.3}, 6.0, 2.0),
+        ("InclineTilt-v0", 0.0, {"target": 0.0}, 14.0, 2.0),
+        ("InclineTilt-v0", 0.0, {"target": 0.3}, 9.0, 2.0),
+        ("InclineBrake-v0", None, {}, -4.27, 0.2),
+        ("InclineBrake-v0", -1.0, {}, -12.0, 0.4),
+        ("InclineBrake-v0", 1.0, {}, -4.66, 0.2),
+        ("CylinderInCylinderTilt-v0", None, {"target": 0.3}, 32.0, 3.0),
+        ("CylinderInCylinderTilt-v0", 0.0, {"target": 0.3}, 0.0, 0.5),
+        ("CylinderInCylinderDamping-v0", None, {}, 283.0, 8.0),
+        ("CylinderInCylinderDamping-v0", -1.0, {}, 9.0, 2.0),
+        ("CylinderInCylinderDamping-v0", 1.0, {}, 295.0, 8.0),
+    ],
+)
+def test_known_returns(env_id, policy, options, known, within):
+    mean, error = mean_return(env_id, policy, **options)
+    assert error < within / 3 + 0.1
+    assert mean == pytest.approx(known, abs=within)
