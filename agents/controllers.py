@@ -65,9 +65,9 @@ class Random:
 class EnergyShapingLQR:
     """Pump a bar up to the energy of the upright rest, then hold it by a linear-quadratic regulator.
 
-    Far from upright the support is accelerated in the direction in which it does work on the bar, as in [1]_,
-    and softly back to the middle of the track. Near upright the LQR takes over, and hands back only when it is
-    well out of its depth: nearness is the LQR's own cost to go, and the two thresholds differ.
+    Far from upright the support is accelerated in the direction in which it does work on the bar [1]_, and
+    softly back to the middle of the track. Near upright the LQR takes over, and hands back only when out of
+    its depth: nearness is the LQR's own cost to go, and the two thresholds differ.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class EnergyShapingLQR:
 
 
 def linearised(scene: PivotedBar) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return A and B of x' = A x + B s'' for x = (s, s', e, θ') near upright, e = θ - π, from the Lagrangian."""
+    """Return A and B of x' = A x + B s'' near upright, for x = (s, s', θ - π, θ'), from the Lagrangian."""
     import sympy
 
     from lag_envs.lagrange import acceleration, coordinates, t
@@ -154,10 +154,11 @@ def linearised(scene: PivotedBar) -> tuple[NDArray[np.float64], NDArray[np.float
 
 
 def lqr(task: SwingUp) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the gain K of u = -K x and the cost to go P of x'Px, for x = (s, s', e, θ') near upright.
+    """Return the gain K of u = -K x and P of the cost to go x'Px, near upright.
 
-    The cost of a step is what the reward h² - 0.02 (u/U)² loses there to second order, e²/2 + 0.02 (u/U)², and
-    on the track, for which the reward does not care, 0.02 (s/S)²: else nothing would call the support back.
+    There x = (s, s', e, θ') with e = θ - π. A step costs what the reward h² - 0.02 (u/U)² loses there to
+    second order, e²/2 + 0.02 (u/U)², and for the track, which the reward does not mind, 0.02 (s/S)²: else
+    nothing would call the support back.
     """
     a, b = linearised(task.scene)
     # The control is held over a step: the exact discretisation is a matrix exponential.

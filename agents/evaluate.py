@@ -44,6 +44,36 @@ def evaluate(env: gym.Env, agent: Any, seeds: Iterable[int]) -> NDArray[np.float
     return np.array(returns)
 
 
+def evaluate_batch(env_id: str, agent: Any, seed: int, episodes: int, **options: Any) -> NDArray[np.float64]:
+    """Return an agent's returns in episodes that are stepped together, which is a good deal quicker.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment.
+    agent : object
+        As for `evaluate`, taking batches.
+    seed : int
+        Seed of the first episode; the others' follow it.
+    episodes : int
+        Number of episodes.
+    **options
+        Parameters of the environment.
+    """
+    envs = gym.make_vec(env_id, episodes, autoreset_mode="SameStep", **options)
+    observation, _ = envs.reset(seed=seed)
+    state, returns, running = None, np.zeros(episodes), np.ones(episodes, np.bool_)
+    start = running.copy()
+    while running.any():
+        action, state = agent.predict(observation, state, start, deterministic=True)
+        observation, reward, terminated, truncated, _ = envs.step(action)
+        returns += np.where(running, reward, 0.0)
+        start = terminated | truncated
+        running &= ~start
+    envs.close()
+    return returns
+
+
 def score(env_id: str, mean_return: float) -> float | None:
     """Return how far a mean return lies on the way from the random policy (0) to the best known one (1)."""
     if env_id not in KNOWN_RETURNS:

@@ -50,8 +50,8 @@ class SB3VecEnv(VecEnv):
         A vector environment that resets in the same step.
     spread : int, default 0
         Steps over which the beginnings of the first episodes are spread; the length of an episode is a good
-        choice. A reset then takes so many steps with random actions and meanwhile restarts the environments one
-        after the other. Else, where episodes are equally long, a learner's roll-out shows one phase of them.
+        choice. A reset then takes so many steps with random actions and restarts the environments one after
+        the other. Else, where episodes are equally long, a learner's roll-out shows one phase of them.
 
     Raises
     ------
@@ -155,7 +155,9 @@ class SB3VecEnv(VecEnv):
     def _split(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
         """Return an info for each environment."""
         reported = {k: v for k, v in infos.items() if k.lstrip("_") not in ("final_obs", "final_info")}
-        return [_row(reported, i) if reported else {} for i in range(self.num_envs)]
+        if not reported:
+            return [{} for _ in range(self.num_envs)]
+        return [_row(reported, i) for i in range(self.num_envs)]
 
     def _share(self, value: Any, indices: Any) -> list[Any]:
         each = isinstance(value, np.ndarray | list | tuple) and len(value) == self.num_envs

@@ -28,7 +28,7 @@ def actions(steps, *shape, seed=0):
 
 
 def trace(env, given):
-    """Return what the steps return, as bytes where arrays; an episode that is over is followed by the next."""
+    """Return what the steps return, as bytes where arrays; after an episode comes the next."""
     out = []
     for action in given:
         observation, reward, terminated, truncated, _ = env.step(action)

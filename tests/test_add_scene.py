@@ -1,4 +1,4 @@
-"""The recipe of CONTRIBUTING.md: a scene and a task that stand outside the package are as good as those inside."""
+"""The recipe of CONTRIBUTING.md: a scene and a task outside the package are as good as those inside."""
 
 import gymnasium as gym
 import numpy as np

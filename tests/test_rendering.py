@@ -80,7 +80,7 @@ def test_frames_are_pictures_that_follow_the_state(env_id):
 
 
 def test_cylinders_are_drawn_to_scale():
-    # 1.08 reaches to either side, a reach is the bar's 0.6 m; half a thickness sticks out above the pivot.
+    # The window on the shell is 2.56 R = 1.28 m high, in 384 pixels; that on the plank 1.25 m wide, in 640.
     for frame, radius, scale in [
         (picture("CylinderInCylinderTilt-v0"), 0.1, 384 / 1.28),
         (picture("CylinderInCylinderDamping-v0", action=-1.0, radius=0.2), 0.2, 384 / 1.28),
@@ -90,7 +90,7 @@ def test_cylinders_are_drawn_to_scale():
 
 
 def test_bar_is_drawn_to_scale():
-    # 1.08 reaches to either side, a reach is the bar's 0.6 m; the bar ends half of its thickness above the pivot.
+    # 1.08 reaches to either side, a reach is the bar's 0.6 m; half a thickness sticks out above the pivot.
     height, width = blue(picture("PivotedBarFree-v0", [0.0, 0.0], 0.0))
     assert height == pytest.approx(0.6 * 1.035 * 384 / (2 * 1.08 * 0.6), abs=4)
     assert width == pytest.approx(0.07 * 384 / (2 * 1.08), abs=4)
@@ -216,13 +216,13 @@ def test_vector_environment_draws_each_of_its_environments():
 def test_record_video_without_a_warning(env_id, tmp_path):
     pytest.importorskip("moviepy")
     env = gym.wrappers.RecordVideo(
-        gym.make(env_id, render_mode="rgb_array"), str(tmp_path), disable_logger=True
+        gym.make(env_id, render_mode="rgb_array"), str(tmp_path / "videos"), disable_logger=True
     )
     env.reset(seed=1)
     for _ in range(5):
         env.step(env.action_space.sample())
     env.close()
-    (video,) = tmp_path.glob("*.mp4")
+    (video,) = tmp_path.glob("videos/*.mp4")
     assert video.stat().st_size > 1000
 
 

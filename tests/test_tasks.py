@@ -14,7 +14,7 @@ each_id = pytest.mark.parametrize("env_id", IDS)
 PI = math.pi
 
 
-# --- the table ------------------------------------------------------------------------------------------------
+# --- the table ---
 
 
 class Row:
@@ -33,7 +33,7 @@ class Row:
 
 
 class PivotedBar(Row):
-    start = [(0, 0.05), (0, 0.02), (0, 0.1), (0, 0.1)]
+    start = ((0, 0.05), (0, 0.02), (0, 0.1), (0, 0.1))
     largest, track = 5.0, 0.5
 
     def control(self, a, y, dt=0.02):
@@ -47,7 +47,7 @@ class PivotedBar(Row):
 
 
 class PivotedBarFree(Row):
-    start = [(0, 0.1), (0, 0.1)]
+    start = ((0, 0.1), (0, 0.1))
     largest = 5.0
 
     def reward(self, y, u, target):
@@ -58,7 +58,7 @@ class PivotedBarFree(Row):
 
 
 class PivotedBarBalance(Row):
-    start = [(0, 0.2), (0, 0.2), (PI, 0.15), (0, 0.3)]
+    start = ((0, 0.2), (0, 0.2), (PI, 0.15), (0, 0.3))
     largest = 3.0
 
     def reward(self, y, u, target):
@@ -76,7 +76,7 @@ class PivotedBarBalance(Row):
 
 class InclineTilt(Row):
     dt, steps = 0.05, 200
-    start = [(0, 0.4), (0, 0.3), (0, 0.05)]
+    start = ((0, 0.4), (0, 0.3), (0, 0.05))
     largest, target = 0.3, 0.3
 
     def control(self, a, y, dt=0.05):
@@ -93,7 +93,7 @@ class InclineTilt(Row):
 
 
 class InclineBrake(Row):
-    start = [(-2, 1.0), (0.5, 0.5)]
+    start = ((-2, 1.0), (0.5, 0.5))
 
     def control(self, a, y):
         return 3.0 * (1 + a)
@@ -110,7 +110,7 @@ class InclineBrake(Row):
 
 class CylinderInCylinderTilt(Row):
     dt, steps = 0.05, 200
-    start = [(0, 0.1), (0, 0.2), (0, 0.0)]
+    start = ((0, 0.1), (0, 0.2), (0, 0.0))
     largest, target, fastest, highest = 15.0, 0.3, 6.0, 1.05
 
     def control(self, a, y, dt=0.05):
@@ -140,7 +140,7 @@ class CylinderInCylinderPump(CylinderInCylinderTilt):
 
 
 class CylinderInCylinderDamping(Row):
-    start = [(0, 0.8), (0, 1.0)]
+    start = ((0, 0.8), (0, 1.0))
 
     def control(self, a, y):
         return 1.2 * (1 + a)
@@ -160,10 +160,19 @@ class CylinderInCylinderDamping(Row):
         return min(abs(abs(size) - 1.5), abs(abs(size) - 3.0)) < 1e-12
 
 
-ROWS = {cls.__name__ + "-v0": cls() for cls in (
-    PivotedBar, PivotedBarFree, PivotedBarBalance, InclineTilt, InclineBrake,
-    CylinderInCylinderTilt, CylinderInCylinderPump, CylinderInCylinderDamping,
-)}  # fmt: skip
+ROWS = {
+    cls.__name__ + "-v0": cls()
+    for cls in (
+        PivotedBar,
+        PivotedBarFree,
+        PivotedBarBalance,
+        InclineTilt,
+        InclineBrake,
+        CylinderInCylinderTilt,
+        CylinderInCylinderPump,
+        CylinderInCylinderDamping,
+    )
+}
 
 
 def nearest_safe(s, s_dot, wanted, top, track, dt):
@@ -177,19 +186,19 @@ def nearest_safe(s, s_dot, wanted, top, track, dt):
     for side in (1, -1):
         a, b = dt * dt / (2 * top), s_dot * dt / top + side * dt * dt / 2
         c = s_dot * s_dot / (2 * top) + side * (s + s_dot * dt) - track
-        candidates += [root.real for root in np.roots([a, b, c]) if abs(root.imag) < 1e-6 * abs(root)]
+        candidates += [root.real for root in np.roots([a, b, c]) if abs(root.imag) <= 1e-6 * abs(root)]
     safe = [u for u in candidates if abs(u) <= top + 1e-9 and max(overshoot(u, 1), overshoot(u, -1)) <= 1e-12]
     return min(safe, key=lambda u: abs(u - wanted)) if safe else -math.copysign(top, s_dot)
 
 
-def bold(env_id, env, i, rng):
+def bold(env, i, rng):
     """Return actions that reach limits and ends: noise, then long pushes."""
     if i % 2:
         return rng.uniform(-1.2, 1.2, 1)
     return np.sign(env.state[-1:] if (i // 100) % 4 == 0 else rng.normal(size=1))
 
 
-# --- the step -------------------------------------------------------------------------------------------------
+# --- the step ---
 
 
 @each_id
@@ -198,7 +207,11 @@ def test_parameters_and_time(env_id):
     assert (env.task.dt, env.task.limit) == (row.dt, row.steps)
     scene = env.scene
     if env_id.startswith("PivotedBar"):
-        assert (scene.mass, scene.com_distance, scene.damping) == (0.2, 0.3, 0.001 if "Balance" not in env_id else scene.damping)
+        assert (scene.mass, scene.com_distance, scene.damping) == (
+            0.2,
+            0.3,
+            0.001 if "Balance" not in env_id else scene.damping,
+        )
         assert scene.inertia == pytest.approx(0.006, rel=1e-15)
         assert scene.track == (None if "Free" in env_id else 0.5)
     elif env_id.startswith("Incline"):
@@ -206,8 +219,18 @@ def test_parameters_and_time(env_id):
         assert scene.damping == (0.03 if "Tilt" in env_id else 0.0)
         assert "Tilt" in env_id or scene.tilt == pytest.approx(PI / 12)
     else:
-        assert (scene.mass, scene.shell_radius, scene.radius, scene.inertia) == (1.0, 0.5, 0.1, pytest.approx(0.005))
-        assert scene.damping == {"Tilt-v0": 0.24, "Pump-v0": 0.024, "Damping-v0": 0.0}[env_id.removeprefix("CylinderInCylinder")]
+        assert (scene.mass, scene.shell_radius, scene.radius, scene.inertia) == (
+            1.0,
+            0.5,
+            0.1,
+            pytest.approx(0.005),
+        )
+        assert (
+            scene.damping
+            == {"Tilt-v0": 0.24, "Pump-v0": 0.024, "Damping-v0": 0.0}[
+                env_id.removeprefix("CylinderInCylinder")
+            ]
+        )
     assert scene.gravity == 9.81
 
 
@@ -217,9 +240,10 @@ def test_every_step_is_as_the_table_says(env_id):
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     n, ends, cuts, kicks = 0, 0, 0, 0
-    for i in range(2500):
+    a = np.zeros(1)
+    for i in range(1200):
         before, target = env.state, env.target
-        a = bold(env_id, env, i // 10, rng) if i % 10 == 0 or i // 10 % 2 else a
+        a = bold(env, i // 10, rng) if i % 10 == 0 or i // 10 % 2 else a
         observation, reward, terminated, truncated, _ = env.step(a)
         n += 1
         u = env.control
@@ -230,18 +254,23 @@ def test_every_step_is_as_the_table_says(env_id):
             kicks += abs(jump[-1]) > 1e-9
             assert abs(jump[-1]) < 1e-12 or row.kicked(jump[-1])
             jump[-1] = 0.0
-        np.testing.assert_allclose(jump, 0.0, atol=1e-14)
+        np.testing.assert_allclose(jump, 0.0, atol=1e-13)
         # Reward and ending look at the state before the kick, the observation at the one after it.
         if not (terminated and env_id == "InclineBrake-v0"):
             assert reward == pytest.approx(row.reward(after, u, target), rel=1e-12, abs=1e-14)
         assert terminated == row.ended(after)
-        np.testing.assert_allclose(observation, np.float32(row.observe(env.state, target)), rtol=3e-7, atol=1e-7)
+        np.testing.assert_allclose(
+            observation, np.float32(row.observe(env.state, target)), rtol=3e-7, atol=1e-7
+        )
         assert truncated == (n == row.steps)
         ends, cuts = ends + terminated, cuts + truncated
         if terminated or truncated:
             env.reset()
             n = 0
-    assert (ends > 0) == (env_id not in ("PivotedBar-v0", "PivotedBarFree-v0")) or "Damping" in env_id
+    if env_id in ("PivotedBar-v0", "PivotedBarFree-v0"):
+        assert ends == 0 and cuts > 0
+    elif "Pump" not in env_id and "Damping" not in env_id:
+        assert ends > 0
     assert (kicks > 0) == hasattr(row, "kicked")
 
 
@@ -278,29 +307,49 @@ def assert_uniform(share):
     assert np.abs(share - (np.arange(n) + 0.5) / n).max() < 2.5 / math.sqrt(n)
 
 
+def rolled(env_id, y, u, dt):
+    """Return the angle's rate after a step, by classical Runge-Kutta steps for all environments at once."""
+
+    def rate(y):
+        if env_id == "PivotedBarBalance-v0":
+            about_pivot = 0.006 + 0.2 * 0.3**2
+            return np.array(
+                [y[1], -(0.06 * (u * np.cos(y[0]) + 9.81 * np.sin(y[0])) + 0.001 * y[1]) / about_pivot]
+            )
+        return np.array([y[1], -2 / 3 * 9.81 / 0.4 * np.sin(y[0]) - 2 / 3 * u / 0.16 * y[1]])
+
+    h = dt / 100
+    for _ in range(100):
+        a = rate(y)
+        b = rate(y + h / 2 * a)
+        c = rate(y + h / 2 * b)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c))
+    return y
+
+
 @pytest.mark.parametrize("dt", [0.02, 0.2, 0.005])
 @pytest.mark.parametrize("env_id", ["PivotedBarBalance-v0", "CylinderInCylinderDamping-v0"])
 def test_kicks(env_id, dt):
-    n, steps = 3000, 20
-    envs = gym.make_vec(env_id, num_envs=n, dt=dt)
+    n, steps = 4000, 20
+    envs = gym.make_vec(env_id, num_envs=n, dt=dt, autoreset_mode="Disabled")
     envs.reset(seed=1)
     sizes = []
-    for _ in range(steps):
-        before, control = envs.state, np.zeros((n, 1))
-        *_, terminated, truncated, _ = envs.step(control)
-        after = np.array([envs.scene.simulate(y, [u], dt)[1] for y, u in zip(before, envs.control, strict=True)])
-        sizes.append((envs.state - after)[:, -1])
-        np.testing.assert_allclose((envs.state - after)[:, :-1], 0.0, atol=1e-13)
-        if (terminated | truncated).any():
-            envs.reset()
+    for action in actions(steps, n, 1):
+        before = envs.state.T[-2:]
+        *_, terminated, truncated, _ = envs.step(action)
+        jump = envs.state.T[-2:] - rolled(env_id, before, envs.control, dt)
+        np.testing.assert_allclose(jump[0], 0.0, atol=1e-9)
+        sizes.append(jump[1])
+        if (over := terminated | truncated).any():
+            envs.reset(options={"reset_mask": over})
     sizes = np.concatenate(sizes)
-    kicks = sizes[np.abs(sizes) > 1e-10]
+    kicks = sizes[np.abs(sizes) > 1e-7]
     chance = 1 - 0.99 ** (dt / 0.02)
     assert abs(len(kicks) - chance * len(sizes)) < 5 * math.sqrt(chance * len(sizes))
     if env_id == "PivotedBarBalance-v0":
         assert_uniform((np.sort(kicks) + 1) / 2)
     else:
-        counts = [np.sum(np.abs(kicks - size) < 1e-9) for size in (-3.0, -1.5, 1.5, 3.0)]
+        counts = [np.sum(np.abs(kicks - size) < 1e-7) for size in (-3.0, -1.5, 1.5, 3.0)]
         assert sum(counts) == len(kicks)
         assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
 
@@ -313,12 +362,14 @@ def test_running_rewards_with_another_interval(env_id):
         before, target = env.state, env.target
         _, reward, terminated, _, _ = env.step(a)
         after = env.scene.simulate(before, [env.control], 0.03)[1]
-        assert reward == pytest.approx(0.03 / row.dt * row.reward(after, env.control, target), rel=1e-12, abs=1e-14)
+        assert reward == pytest.approx(
+            0.03 / row.dt * row.reward(after, env.control, target), rel=1e-12, abs=1e-14
+        )
         if terminated:
             env.reset()
 
 
-# --- limits ---------------------------------------------------------------------------------------------------
+# --- limits ---
 
 
 def pushes(rng):
@@ -351,7 +402,9 @@ def test_the_track_is_never_left(track, dt):
                 s, s_dot = env.state[:2]
                 worst = max(worst, abs(s) - track, abs(s) + s_dot**2 / 10 - track)
                 # Where the root is nearly double, rounding moves it by the square root of rounding.
-                assert env.control == pytest.approx(nearest_safe(y[0], y[1], 5.0 * a, 5.0, track, dt), abs=1e-8 / dt)
+                assert env.control == pytest.approx(
+                    nearest_safe(y[0], y[1], 5.0 * a, 5.0, track, dt), abs=1e-8 / dt
+                )
     assert worst < 1e-14 * (1 + track)
 
 
@@ -374,7 +427,11 @@ def test_an_endless_track_has_no_guard():
 
 @pytest.mark.parametrize(
     ("env_id", "entry", "limit"),
-    [("InclineTilt-v0", 2, 0.1), ("CylinderInCylinderTilt-v0", 2, 6.0), ("CylinderInCylinderPump-v0", 2, 3.0)],
+    [
+        ("InclineTilt-v0", 2, 0.1),
+        ("CylinderInCylinderTilt-v0", 2, 6.0),
+        ("CylinderInCylinderPump-v0", 2, 3.0),
+    ],
 )
 @pytest.mark.parametrize("dt", [None, 0.013, 0.7])
 def test_limits_are_met_at_the_end_of_a_step(env_id, entry, limit, dt):
@@ -383,7 +440,7 @@ def test_limits_are_met_at_the_end_of_a_step(env_id, entry, limit, dt):
     env.reset(seed=1)
     met = 0
     for i in range(2000):
-        side = 1.0 if i // 40 % 2 else -1.0
+        side = 1.0 if i // 120 % 2 else -1.0
         *_, terminated, truncated, _ = env.step(np.array([side * rng.choice([1.0, 1.0, 0.7])]))
         value = abs(env.state[entry])
         assert value <= limit * (1 + 4e-16)
@@ -402,7 +459,7 @@ def test_quasi_static_tilt():
     assert env.control == 0.05
 
 
-# --- braking to the line --------------------------------------------------------------------------------------
+# --- braking to the line ---
 
 
 def crossing(x, v, pull, drag):
@@ -424,19 +481,36 @@ def crossing(x, v, pull, drag):
 
 CROSSINGS = [
     # distance, speed, action, options
-    (1e-3, 1.0, -1.0, {}), (0.015, 1.0, 0.3, {}), (0.0199, 1.0, -1.0, {}), (1e-9, 0.0, 1.0, {}), (1e-15, 1.0, 1.0, {}),
-    (1e-4, 0.5, 1.0, {}), (0.01, 0.6, 1.0, {"damping": 5.0}), (0.5, 50.0, 0.5, {}), (1.5, 100.0, 1.0, {}),
-    (0.3, 0.0, -1.0, {"dt": 1.0}), (0.8, 1.0, 1.0, {"dt": 1.0}), (0.5, 1.0, 1.0, {"dt": 1.0, "damping": 10.0}),
+    (1e-3, 1.0, -1.0, {}),
+    (0.015, 1.0, 0.3, {}),
+    (0.0199, 1.0, -1.0, {}),
+    (1e-9, 0.0, 1.0, {}),
+    (1e-15, 1.0, 1.0, {}),
+    (1e-4, 0.5, 1.0, {}),
+    (0.01, 0.6, 1.0, {"damping": 5.0}),
+    (0.5, 50.0, 0.5, {}),
+    (1.5, 100.0, 1.0, {}),
+    (0.3, 0.0, -1.0, {"dt": 1.0}),
+    (0.5, 1.0, 1.0, {"dt": 1.0}),
+    (0.2, 1.0, 1.0, {"dt": 1.0, "damping": 10.0}),
     # flat: the cylinder coasts, and may come to the line with hardly any speed
-    (0.01, 1.0, -1.0, {"tilt": 0.0}), (0.01, 1.0, 1.0, {"tilt": 0.0}), (0.1, 1.0, 1.0, {"tilt": 0.0, "damping": 5.0, "dt": 1.0}),
+    (0.01, 1.0, -1.0, {"tilt": 0.0}),
+    (0.01, 1.0, 1.0, {"tilt": 0.0}),
+    (0.1, 1.0, 1.0, {"tilt": 0.0, "damping": 5.0, "dt": 1.0}),
     (0.015 * (1 - 1e-9), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 1.0}),
     (0.015 * (1 - 1e-6), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 0.5}),
     # stiff: the speed is gone at once, or just before the line
-    (1e-6, 1.0, 0.0, {"damping": 1e3}), (1e-6, 1.0, 0.0, {"damping": 1e5}), (1.4e-3, 1.0, 0.0, {"damping": 1e3}),
-    (1.5e-3, 1.0, 0.0, {"damping": 1e3}), (1.51e-3, 1.0, 0.0, {"damping": 1e3}), (1.6e-3, 1.0, 0.0, {"damping": 1e3, "dt": 0.5}),
-    (1.5e-6, 1.0, 0.0, {"damping": 1e6}), (1.5e-6 + 1e-12, 1.0, 0.0, {"damping": 1e6, "dt": 1.0}),
-    (1e-8, 0.0, 0.0, {"damping": 1e6}), (1.5e-4, 100.0, 0.0, {"damping": 1e6, "dt": 1.0}),
-]  # fmt: skip
+    (1e-6, 1.0, 0.0, {"damping": 1e3}),
+    (1e-6, 1.0, 0.0, {"damping": 1e5}),
+    (1.4e-3, 1.0, 0.0, {"damping": 1e3}),
+    (1.5e-3, 1.0, 0.0, {"damping": 1e3}),
+    (1.51e-3, 1.0, 0.0, {"damping": 1e3}),
+    (1.6e-3, 1.0, 0.0, {"damping": 1e3, "dt": 0.5}),
+    (1.5e-6, 1.0, 0.0, {"damping": 1e6}),
+    (1.5e-6 + 1e-12, 1.0, 0.0, {"damping": 1e6, "dt": 1.0}),
+    (1e-8, 0.0, 0.0, {"damping": 1e6}),
+    (1.5e-4, 100.0, 0.0, {"damping": 1e6, "dt": 1.0}),
+]
 
 
 @pytest.mark.parametrize(("distance", "speed", "action", "options"), CROSSINGS)
@@ -451,10 +525,13 @@ def test_crossing_time(distance, speed, action, options):
     with mp.workdps(60):
         share = 1 / (1 + mpf(scene.inertia) / (mpf(scene.mass) * mpf(scene.radius) ** 2))
         pull = share * mpf(scene.gravity) * mp.sin(mpf(scene.tilt))
-        time, end = crossing(-distance, speed, pull, share * (mpf(scene.damping) + mpf(env.control)) / mpf(scene.mass))
+        time, end = crossing(
+            -distance, speed, pull, share * (mpf(scene.damping) + mpf(env.control)) / mpf(scene.mass)
+        )
         assert 0 <= time <= env.task.dt * (1 + mpf(10) ** -14)
         wanted = -time - 5 * max(end - mpf(0.5), 0)
-        assert abs(reward - wanted) < 1e-12 * (1 + speed)
+        # Rounding the place shows in the time as rounding over speed.
+        assert abs(reward - wanted) < 1e-12 * (1 + speed) + (4 * 2**-53 * distance / end if end else 0)
 
 
 def test_the_way_to_the_line_is_paid_by_the_second():
@@ -468,14 +545,16 @@ def test_the_way_to_the_line_is_paid_by_the_second():
             rewards.append(reward)
         assert rewards[:-1] == [-dt] * (len(rewards) - 1)
         pull = 2 / 3 * 9.81 * math.sin(PI / 12)
-        assert sum(rewards) == pytest.approx(-math.sqrt(2 / pull) - 5 * (math.sqrt(2 * pull) - 0.5), rel=1e-12)
+        assert sum(rewards) == pytest.approx(
+            -math.sqrt(2 / pull) - 5 * (math.sqrt(2 * pull) - 0.5), rel=1e-12
+        )
 
 
-# --- known returns --------------------------------------------------------------------------------------------
+# --- known returns ---
 
 
-def mean_return(env_id, policy, n=400, **options):
-    """Return the mean return of the first episodes, and its standard error."""
+def returns(env_id, policy, n=500, **options):
+    """Return the returns of the first episodes."""
     envs = gym.make_vec(env_id, num_envs=n, **options)
     envs.reset(seed=0)
     rng = np.random.default_rng(1)
@@ -485,33 +564,33 @@ def mean_return(env_id, policy, n=400, **options):
         _, rewards, terminated, truncated, _ = envs.step(given)
         total += on * rewards
         on &= ~(terminated | truncated)
-    return total.mean(), total.std() / math.sqrt(n)
+    return total
 
 
 @pytest.mark.parametrize(
-    ("env_id", "policy", "options", "known", "within"),
+    ("env_id", "policy", "options", "known"),
     [
-        ("PivotedBarFree-v0", None, {}, -2.9, 0.3),
-        ("PivotedBarFree-v0", 0.0, {}, 0.0, 0.1),
-        ("PivotedBar-v0", None, {}, 0.6, 1.5),
-        ("PivotedBar-v0", 0.0, {}, 0.0, 0.1),
-        ("PivotedBarBalance-v0", None, {}, 21.0, 2.0),
-        ("PivotedBarBalance-v0", 0.0, {}, 21.0, 2.0),
-        ("InclineTilt-v0", None, {"target": 0.0}, 9.0, 2.0),
-        ("InclineTilt-v0", None, {"target": 0.3}, 6.0, 2.0),
-        ("InclineTilt-v0", 0.0, {"target": 0.0}, 14.0, 2.0),
-        ("InclineTilt-v0", 0.0, {"target": 0.3}, 9.0, 2.0),
-        ("InclineBrake-v0", None, {}, -4.27, 0.2),
-        ("InclineBrake-v0", -1.0, {}, -12.0, 0.4),
-        ("InclineBrake-v0", 1.0, {}, -4.66, 0.2),
-        ("CylinderInCylinderTilt-v0", None, {"target": 0.3}, 32.0, 3.0),
-        ("CylinderInCylinderTilt-v0", 0.0, {"target": 0.3}, 0.0, 0.5),
-        ("CylinderInCylinderDamping-v0", None, {}, 283.0, 8.0),
-        ("CylinderInCylinderDamping-v0", -1.0, {}, 9.0, 2.0),
-        ("CylinderInCylinderDamping-v0", 1.0, {}, 295.0, 8.0),
+        ("PivotedBarFree-v0", None, {}, -2.9),
+        ("PivotedBarFree-v0", 0.0, {}, 0.0),
+        ("PivotedBar-v0", None, {}, 0.6),
+        ("PivotedBar-v0", 0.0, {}, 0.0),
+        ("PivotedBarBalance-v0", None, {}, 21.0),
+        ("PivotedBarBalance-v0", 0.0, {}, 21.0),
+        ("InclineTilt-v0", None, {"target": 0.0}, 9.0),
+        ("InclineTilt-v0", None, {"target": 0.3}, 6.0),
+        ("InclineTilt-v0", 0.0, {"target": 0.0}, 14.0),
+        ("InclineTilt-v0", 0.0, {"target": 0.3}, 9.0),
+        ("InclineBrake-v0", None, {}, -4.27),
+        ("InclineBrake-v0", -1.0, {}, -12.0),
+        ("InclineBrake-v0", 1.0, {}, -4.66),
+        ("CylinderInCylinderTilt-v0", None, {"target": 0.3}, 32.0),
+        ("CylinderInCylinderTilt-v0", 0.0, {"target": 0.3}, 0.0),
+        ("CylinderInCylinderDamping-v0", None, {}, 283.0),
+        ("CylinderInCylinderDamping-v0", -1.0, {}, 9.0),
+        ("CylinderInCylinderDamping-v0", 1.0, {}, 295.0),
     ],
 )
-def test_known_returns(env_id, policy, options, known, within):
-    mean, error = mean_return(env_id, policy, **options)
-    assert error < within / 3 + 0.1
-    assert mean == pytest.approx(known, abs=within)
+def test_known_returns(env_id, policy, options, known):
+    drawn = returns(env_id, policy, **options)
+    # The known figures are means of 20 episodes.
+    assert abs(drawn.mean() - known) < 3 * drawn.std() / math.sqrt(20) + 0.05 + 0.01 * abs(known)

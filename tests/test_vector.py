@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
@@ -23,15 +24,39 @@ each_mode = pytest.mark.parametrize("mode", MODES)
 
 #: Parameters, one per environment, that need one substep, many, and the treatment of stiff damping.
 MIXED = {
-    "PivotedBar-v0": {"damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02], "gravity": [9.81, 0.0, 1e3, 9.81, 9.81, 50.0, 1.6]},
-    "PivotedBarFree-v0": {"com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0], "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0]},
-    "PivotedBarBalance-v0": {"damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02], "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5]},
-    "InclineTilt-v0": {"damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1], "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3]},
-    "InclineBrake-v0": {"tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5], "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1]},
-    "CylinderInCylinderTilt-v0": {"radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2], "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1]},
-    "CylinderInCylinderPump-v0": {"gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81], "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1]},
-    "CylinderInCylinderDamping-v0": {"gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81], "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1]},
-}  # fmt: skip
+    "PivotedBar-v0": {
+        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
+        "gravity": [9.81, 0.0, 1e3, 9.81, 9.81, 50.0, 1.6],
+    },
+    "PivotedBarFree-v0": {
+        "com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0],
+        "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0],
+    },
+    "PivotedBarBalance-v0": {
+        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
+        "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5],
+    },
+    "InclineTilt-v0": {
+        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
+        "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3],
+    },
+    "InclineBrake-v0": {
+        "tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5],
+        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
+    },
+    "CylinderInCylinderTilt-v0": {
+        "radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2],
+        "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1],
+    },
+    "CylinderInCylinderPump-v0": {
+        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
+        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
+    },
+    "CylinderInCylinderDamping-v0": {
+        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
+        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
+    },
+}
 
 
 def pair(env_id, n, mode="NextStep", **options):
@@ -50,7 +75,9 @@ def mixed_pair(env_id, mode="NextStep", **options):
         own = {name: values[i] for name, values in MIXED[env_id].items()}
         return lambda: gym.make(env_id, disable_env_checker=True, **own, **options)
 
-    sync = SyncVectorEnv([one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different")
+    sync = SyncVectorEnv(
+        [one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different"
+    )
     return gym.make_vec(env_id, num_envs=7, autoreset_mode=mode, **MIXED[env_id], **options), sync
 
 
@@ -75,7 +102,7 @@ def assert_same(a, b):
 
 
 def assert_alike(native, sync, steps, seed=0):
-    """Step both with the same actions; with autoreset disabled, reset what is over, and sometimes something else."""
+    """Step both alike; with autoreset disabled, reset what is over, and sometimes something else."""
     n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     rng = np.random.default_rng(seed)
     given = actions(steps, n, 1, seed=seed)
@@ -94,7 +121,7 @@ def assert_alike(native, sync, steps, seed=0):
     return resets
 
 
-# --- the same bits --------------------------------------------------------------------------------------------
+# --- the same bits ---
 
 
 @each_id
@@ -138,7 +165,9 @@ def test_same_bits_where_parameters_differ(env_id, mode):
         assert native.control[i] == env.unwrapped.control
         assert native.target is None or native.target[i] == env.unwrapped.target
         space = native.single_observation_space
-        assert (space.high >= env.observation_space.high).all() and (space.low <= env.observation_space.low).all()
+        assert (space.high >= env.observation_space.high).all() and (
+            space.low <= env.observation_space.low
+        ).all()
 
 
 @each_id
@@ -199,13 +228,17 @@ def test_states_and_targets_by_hand(env_id):
         assert single.step(given[i])[0].tobytes() == stepped[i].tobytes()
 
 
-# --- autoreset ------------------------------------------------------------------------------------------------
+# --- autoreset ---
 
 
-@pytest.mark.parametrize("mode", [*MODES, *AutoresetMode, "NEXT_STEP", "next_step", "same_step", "DISABLED"], ids=str)
+@pytest.mark.parametrize(
+    "mode", [*MODES, *AutoresetMode, "NEXT_STEP", "next_step", "same_step", "DISABLED"], ids=str
+)
 def test_mode_as_string_or_enum(mode):
     envs = gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode)
-    wanted = AutoresetMode[mode.upper()] if isinstance(mode, str) and mode not in MODES else AutoresetMode(mode)
+    wanted = (
+        AutoresetMode[mode.upper()] if isinstance(mode, str) and mode not in MODES else AutoresetMode(mode)
+    )
     assert envs.metadata["autoreset_mode"] is wanted
     assert "autoreset_mode" not in gym.make_vec("PivotedBar-v0", num_envs=2).__class__.metadata
 
@@ -217,7 +250,9 @@ def test_unknown_mode(mode):
 
 
 def test_metadata_belongs_to_the_instance():
-    a, b = (gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode) for mode in ("NextStep", "Disabled"))
+    a, b = (
+        gym.make_vec("PivotedBar-v0", num_envs=2, autoreset_mode=mode) for mode in ("NextStep", "Disabled")
+    )
     assert a.metadata is not b.metadata
     assert a.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert a.metadata["render_fps"] == 50
@@ -269,7 +304,7 @@ def test_masked_rows_are_not_looked_at():
     assert envs.target[1] != -0.25
 
 
-# --- seeds ----------------------------------------------------------------------------------------------------
+# --- seeds ---
 
 
 @each_id
@@ -285,8 +320,13 @@ def test_seeds(env_id):
 
 @each_id
 def test_unseeded_environments_differ(env_id):
-    runs = [gym.make_vec(env_id, num_envs=4).reset(seed=seed)[0] for seed in (None, None, [1, None, None, 2], [1, None, None, 2])]
-    assert len({row.tobytes() for row in np.concatenate([runs[0], runs[1], runs[2][1:3], runs[3][1:3]])}) == 12
+    runs = [
+        gym.make_vec(env_id, num_envs=4).reset(seed=seed)[0]
+        for seed in (None, None, [1, None, None, 2], [1, None, None, 2])
+    ]
+    assert (
+        len({row.tobytes() for row in np.concatenate([runs[0], runs[1], runs[2][1:3], runs[3][1:3]])}) == 12
+    )
     assert (runs[2][[0, 3]] == runs[3][[0, 3]]).all()
 
 
@@ -299,7 +339,7 @@ def test_bad_seeds(seed):
     assert_same(envs.reset(), twin.reset())
 
 
-# --- what is returned -----------------------------------------------------------------------------------------
+# --- what is returned ---
 
 
 @each_id
@@ -312,7 +352,12 @@ def test_nothing_is_shared(env_id, mode):
         for action in actions(40, 3, 1):
             *out, info = envs.step(action)
             over = out[2] | out[3]
-            arrays += [*out, envs.state, envs.control, *(v for v in info.values() if isinstance(v, np.ndarray))]
+            arrays += [
+                *out,
+                envs.state,
+                envs.control,
+                *(v for v in info.values() if isinstance(v, np.ndarray)),
+            ]
             arrays += [row for row in info.get("final_obs", ()) if row is not None]
             if mode == "Disabled" and over.any():
                 arrays.append(envs.reset(options={"reset_mask": over})[0])
@@ -322,7 +367,7 @@ def test_nothing_is_shared(env_id, mode):
             assert_same(a, b)
     whole = [a for a in kept[0][0] if a.dtype != object]
     spans = sorted((a.__array_interface__["data"][0], a.nbytes) for a in whole)
-    assert all(start + size <= following for (start, size), (following, _) in zip(spans, spans[1:], strict=False))
+    assert all(start + size <= following for (start, size), (following, _) in pairwise(spans))
 
 
 @each_id
@@ -351,11 +396,13 @@ def test_observations_stay_in_the_space(env_id):
             assert last is None or last in envs.single_observation_space
 
 
-# --- copies and specs -----------------------------------------------------------------------------------------
+# --- copies and specs ---
 
 
 @each_id
-@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"])
+@pytest.mark.parametrize(
+    "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
+)
 def test_copies_go_on_alike(env_id, clone):
     envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **MIXED[env_id])
     envs.reset(seed=2)
@@ -385,7 +432,9 @@ def test_spec_survives_json(env_id):
 
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_record_episode_statistics(mode):
-    envs = RecordEpisodeStatistics(gym.make_vec("InclineBrake-v0", num_envs=4, autoreset_mode=mode, duration=1.0))
+    envs = RecordEpisodeStatistics(
+        gym.make_vec("InclineBrake-v0", num_envs=4, autoreset_mode=mode, duration=1.0)
+    )
     envs.reset(seed=1)
     returns, recorded = np.zeros(4), 0
     for action in actions(300, 4, 1):
@@ -402,7 +451,7 @@ def test_record_episode_statistics(mode):
     assert recorded > 10
 
 
-# --- what is refused ------------------------------------------------------------------------------------------
+# --- what is refused ---
 
 
 def running(n, env_id="PivotedBar-v0", **options):
@@ -428,12 +477,23 @@ def test_actions_that_are_not_finite_step_nothing(value, place, dtype):
 
 @pytest.mark.parametrize(
     "action",
-    [np.zeros(3), np.zeros((3, 2)), np.zeros((2, 1)), np.zeros((1, 3)), 0.5, None, "up", np.zeros((3, 1), dtype=complex),
-     np.array([["a"], ["b"], ["c"]]), [[0.1], [0.2], [None]], [[0.1], [0.2], [0.3, 0.4]]],
-)  # fmt: skip
+    [
+        np.zeros(3),
+        np.zeros((3, 2)),
+        np.zeros((2, 1)),
+        np.zeros((1, 3)),
+        0.5,
+        None,
+        "up",
+        np.zeros((3, 1), dtype=complex),
+        np.array([["a"], ["b"], ["c"]]),
+        [[0.1], [0.2], [None]],
+        [[0.1], [0.2], [0.3, 0.4]],
+    ],
+)
 def test_bad_actions(action):
     envs, twin = running(3), running(3)
-    with pytest.raises(ValueError, match="actions|inhomogeneous"):
+    with pytest.raises(ValueError, match=r"actions|inhomogeneous"):
         envs.step(action)
     assert_same(envs.step(np.zeros((3, 1))), twin.step(np.zeros((3, 1))))
 
@@ -442,9 +502,12 @@ def test_other_actions_mean_their_value():
     envs, twin = running(3), running(3)
     fine = np.array([[0.3], [-1.0], [1.0]])
     for action in (
-        [[0.3], [-5], [1e300]], np.array([[0.3], [-1.0], [1.0]], dtype=">f8"), np.array([[0.3], [-1.0], [1.0]], dtype=np.longdouble),
-        np.asfortranarray(fine), np.array([[0.3, 9.0], [-1.0, 9.0], [1.0, 9.0]])[:, :1],
-    ):  # fmt: skip
+        [[0.3], [-5], [1e300]],
+        np.array([[0.3], [-1.0], [1.0]], dtype=">f8"),
+        np.array([[0.3], [-1.0], [1.0]], dtype=np.longdouble),
+        np.asfortranarray(fine),
+        np.array([[0.3, 9.0], [-1.0, 9.0], [1.0, 9.0]])[:, :1],
+    ):
         assert_same(envs.step(action), twin.step(fine))
     assert_same(envs.step(np.array([[1], [0], [1]], dtype=bool)), twin.step(np.array([[1.0], [0.0], [1.0]])))
 
@@ -474,7 +537,7 @@ def test_step_before_reset():
         ({"target": np.zeros(3)}, ValueError, "no target"),
         ({"colour": 1}, ValueError, "unknown reset option 'colour'"),
     ],
-)  # fmt: skip
+)
 def test_bad_options_reset_nothing(options, error, match):
     envs, twin = running(3), running(3)
     with pytest.raises(error, match=match):
@@ -519,7 +582,13 @@ def test_unknown_keyword():
 
 @each_mode
 def test_a_refused_environment_does_not_stop_the_others(mode):
-    extreme = {"com_distance": [0.3, 1e-9, 0.4], "inertia": [None, 1e-30, None], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
+    extreme = {
+        "com_distance": [0.3, 1e-9, 0.4],
+        "inertia": [None, 1e-30, None],
+        "gravity": 1e3,
+        "dt": 1.0,
+        "damping": 0.0,
+    }
     mild = {"com_distance": [0.3, 0.4], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
     envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme)
     twin = gym.make_vec("PivotedBarFree-v0", num_envs=2, autoreset_mode=mode, **mild)

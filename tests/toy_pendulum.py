@@ -113,4 +113,5 @@ class Swing(Task):
 
     def bounds(self):
         k = self.scene.constants()
-        return [1.0, 1.0, finite(FASTEST_START + (k["weight"] + k["push"] * self.limit_control) * self.duration)]
+        fastest = FASTEST_START + (k["weight"] + k["push"] * self.limit_control) * self.duration
+        return [1.0, 1.0, finite(fastest)]

@@ -15,5 +15,6 @@ for _id, (_task, _fixed) in TASKS.items():
         _id,
         entry_point="lag_envs.envs.single:LagrangianEnv",
         vector_entry_point="lag_envs.envs.vector:LagrangianVectorEnv",
+        order_enforce=False,  # the environment itself refuses a step before its reset
         kwargs={"task": _task, **_fixed},
     )

@@ -187,7 +187,7 @@ class Program:
 
     @cached_property
     def step_all(self) -> Callable:
-        """``step_all(f, ids, par, action, obs, reward, ended, target_given, count)`` to (status, over).
+        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, target_given, count)`` to (status, over).
 
         Steps every environment; one whose episode was over is restarted instead. The status is 0; or i + 1 where
         environment i was refused and kept its state; or -(i + 1), before anything was stepped, where action i
@@ -202,8 +202,8 @@ class Program:
         special = " and not over > 0.0" if self.last else ""
         main = [
             *inputs, f"a = {_at('a')}", *self.control, *self.fast,
-            "again = n < 0.0", "restarts += again", *self.judge,
-            f"plain = within{special}", "slow += not plain", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
+            "again = n < 0.0", *self.judge,
+            f"plain = within{special}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
@@ -239,8 +239,8 @@ class Program:
         ]  # fmt: skip
         output = [
             f"reward[first + i] = {_at('r')}", f"over = {_at('over')}",
-            "ended[first + i] = (over == 1.0) | (over == 3.0)", "ended[second + first + i] = over >= 2.0",
-            "overs += over > 0.0", *_observations(self.o),
+            "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
+            "overs += over > 0.0",
         ]  # fmt: skip
         body = [
             "wide_vectors()",
@@ -261,14 +261,18 @@ class Program:
                 "slow, restarts = 0, 0",
                 *_block("for i in range(width):", ["f[work + i] = f[base + i]"]),
                 *_block(lane, [f"{_at('a')} = action[first + i]"]),
-                *_block(lane, main), "if slow > 0:", *_indent(_block(lane, redo)),
+                *_block(lane, main),
+                *_block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
+                "if slow > 0:", *_indent(_block(lane, redo)),
                 "if restarts > 0:", *_indent(_block(lane, restart)),
                 *_block(lane, output),
+                # One loop per entry: a loop that writes to many arrays would have to check them all for overlap.
+                *(line for entry in _observations(self.o) for line in _block(lane, [entry])),
                 *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
             ]),
             "return np.int64(refused), overs",
         ]  # fmt: skip
-        return _function("step_all", "f, ids, par, action, obs, reward, ended, target_given, count", body, self.advance)
+        return _function("step_all", "f, ids, par, action, obs, reward, terminated, truncated, target_given, count", body, self.advance)
 
     @cached_property
     def start_all(self) -> Callable:
@@ -315,9 +319,8 @@ def _at(row: str) -> str:
 
 
 def _observations(names: Sequence[str], value: str = _at("{}")) -> list[str]:
-    """Put the observation's numbers into the batch's array."""
-    place = f"(first + i) * np.uint64({len(names)})"
-    return [f"obs[{place} + np.uint64({j})] = {value.format(o)}" for j, o in enumerate(names)]
+    """Put the observation's numbers into the batch's array, one row per entry."""
+    return [f"obs[{j}, first + i] = {value.format(o)}" for j, o in enumerate(names)]
 
 
 def _next_episode(key: str, episode: str, episode_key: str) -> list[str]:

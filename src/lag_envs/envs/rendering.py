@@ -459,7 +459,7 @@ def _draw_scale(picture: pygame.Surface, scale: float) -> None:
 # --- pictures of all environments ---------------------------------------------------------------------------
 
 
-def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 3) -> list[Path]:
+def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -> list[Path]:
     """Write a picture of every environment as PNG.
 
     Parameters
@@ -468,7 +468,7 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 3) -
         Where to; made if it does not exist.
     seconds : float, default 0.4
         How long the control swings to and fro before [s]; an episode that ends earlier is shown as it ended.
-    seed : int, default 3
+    seed : int, default 9
         Seed of the start.
 
     Returns
@@ -487,7 +487,7 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 3) -
         env.reset(seed=seed)
         task: Task = env.unwrapped.task  # type: ignore[attr-defined]
         for i in range(round(seconds / task.dt)):
-            if any(env.step(np.array([0.8 * math.cos(5.0 * i * task.dt)]))[2:4]):
+            if any(env.step(np.array([0.8 * math.cos(7.0 * i * task.dt)]))[2:4]):
                 break
         picture: Any = env.render()
         files.append(Path(directory) / f"{env_id}.png")

@@ -17,6 +17,7 @@ from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
 RENDER_MODES = ["human", "rgb_array"]
+FLOAT32 = np.dtype(np.float32)
 
 
 class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -156,7 +157,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ResetNeeded(
                 "call reset() before step(): " + ("the episode has terminated" if self._started else "no episode has begun")
             )
-        observation = np.empty(self._size, np.float32)
+        observation = np.empty(self._size, FLOAT32)
         reward, over = self._step(self._rows, observation, a, self._ids)
         if over:
             if over == SLOW:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.program import BLOCK, Program, constants_of
 from lag_envs.envs.single import (
+    FLOAT32,
     RENDER_MODES,
     absent,
     action_space,
@@ -26,6 +27,9 @@ from lag_envs.envs.single import (
 )
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
+
+
+BOOL = np.dtype(np.bool_)
 
 
 class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
@@ -75,6 +79,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         diagnostics: bool = False,
         **options: Any,
     ) -> None:
+        if render_mode == "human":
+            raise ValueError("render_mode must be 'rgb_array' or None for a vector environment, got 'human'")
         check_render_mode(render_mode)
         if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
             raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
@@ -178,7 +184,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._write("g", lanes, target)
         elif self._targets_given:
             self._write("g", lanes, np.array([self._tasks[i].target for i in lanes]))
-        observations = np.empty((self.num_envs, len(self._program.o)), dtype=np.float32)
+        observations = np.empty((len(self._program.o), self.num_envs), dtype=FLOAT32).T
         self._start(observations, mask, True, state is not None, target is not None or self._targets_given)
         self._started = True
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
@@ -216,19 +222,27 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             done = np.flatnonzero(self._read("n") < 0.0)
             raise ResetNeeded(f"the episodes of environments {done.tolist()} are over: reset them with options['reset_mask']")
         n, program = self.num_envs, self._program
-        observations = np.empty(n * len(program.o), dtype=np.float32)
-        rewards = np.empty(n)
-        ended = np.empty(2 * n, dtype=np.bool_)
+        # One row per entry is quicker to fill; the transpose is what the caller sees.
+        observations = np.empty((len(program.o), n), dtype=FLOAT32)
+        rewards, terminations, truncations = np.empty(n), np.empty(n, dtype=BOOL), np.empty(n, dtype=BOOL)
         status, over = program.step_all(
-            self._memory, self._ids, self._par, actions, observations, rewards, ended, self._targets_given, n
+            self._memory,
+            self._ids,
+            self._par,
+            actions,
+            observations,
+            rewards,
+            terminations,
+            truncations,
+            self._targets_given,
+            n,
         )
         if status < 0:
             raise ValueError(f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}")
         self._over = over
         if status > 0:
             self._refuse(status - 1)
-        observations = observations.reshape(n, -1)
-        terminations, truncations = ended[:n], ended[n:]
+        observations = observations.T
         infos = self._infos(None) if self.diagnostics else {}
         if self._over and self._mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
@@ -288,7 +302,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _start(self, observations: NDArray[np.float32], mask: NDArray[np.bool_], *given: bool) -> None:
         """Begin episodes where the mask is set; ``given``: whether to write all observations, states, targets."""
         self._program.start_all(
-            self._memory, self._ids, self._par, observations.reshape(-1), mask, *given, self.num_envs
+            self._memory, self._ids, self._par, observations.T, mask, *given, self.num_envs
         )
 
     def _restart(

@@ -383,3 +383,10 @@ def check_step(dt: Any) -> float:
     if not dt >= sys.float_info.min:  # what lies between has no inverse
         raise ValueError(f"dt must be above 0 s, got {dt:g} s")
     return dt
+
+
+def friction_ratio(friction: Any, normal: Any) -> Any:
+    """Return |F|/N; infinite where the contact carries nothing or pulls."""
+    friction, normal = np.broadcast_arrays(np.abs(friction), normal)
+    out = np.full(normal.shape, np.inf)
+    return np.divide(friction, normal, out=out, where=normal > 0.0)[()]

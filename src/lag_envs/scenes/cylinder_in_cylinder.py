@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, parameter
-from lag_envs.scenes.incline import _ratio
+from lag_envs.scenes.base import Motion, Scene, parameter, friction_ratio
 from lag_envs.scenes.shapes import (
     Arrow,
     Circle,
@@ -77,7 +76,7 @@ class CylinderInCylinder(Scene):
     Examples
     --------
     >>> shell = CylinderInCylinder()
-    >>> shell.forces([0.0, 0.0], 0.0)["normal"].round(2).item()
+    >>> shell.forces([0.0, 0.0, 0.0])["normal"].round(2).item()
     9.81
     """
 
@@ -196,7 +195,7 @@ class CylinderInCylinder(Scene):
         """Return normal force (contact is lost below 0), friction, needed μ and the torque that turns the shell."""
         normal = self.mass * (self.arm * m.v.theta * m.v.theta + self.gravity * np.cos(m.q.theta))
         friction = self.inertia * (self.shell_radius * m.a.psi - self.arm * m.a.theta) / (self.radius * self.radius)
-        forces = {"normal": normal, "friction": friction, "needed_friction": _ratio(friction, normal)}
+        forces = {"normal": normal, "friction": friction, "needed_friction": friction_ratio(friction, normal)}
         if self.control == "tilt":
             forces["drive_torque"] = friction * self.shell_radius + self.damping * (m.v.psi - m.v.theta)
         return forces

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, parameter
+from lag_envs.scenes.base import Motion, Scene, parameter, friction_ratio
 from lag_envs.scenes import shapes
 from lag_envs.scenes.shapes import Arrow, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import slope
@@ -188,7 +188,7 @@ class Incline(Scene):
             self.gravity * np.cos(m.q.phi) - 2.0 * m.v.x * m.v.phi - self.radius * turn - m.q.x * m.a.phi
         )
         friction = self.inertia * rolling / (self.radius * self.radius)
-        forces = {"normal": normal, "friction": friction, "needed_friction": _ratio(friction, normal)}
+        forces = {"normal": normal, "friction": friction, "needed_friction": friction_ratio(friction, normal)}
         if self.control == "tilt_rate":
             forces["drive_torque"] = (
                 (self.mass * self.radius + self.inertia / self.radius) * rolling
@@ -260,13 +260,6 @@ class Incline(Scene):
         x, y = self.place(now.state[0], self.radius, self.tilted(now))
         size = 12.0 * self.radius
         return Window(x - size, y - size, x + size, y + size)
-
-
-def _ratio(friction: Any, normal: Any) -> Any:
-    """Return |F|/N; infinite where the contact carries nothing or pulls."""
-    friction, normal = np.broadcast_arrays(np.abs(friction), normal)
-    out = np.full(normal.shape, np.inf)
-    return np.divide(friction, normal, out=out, where=normal > 0.0)[()]
 
 
 def _symbolic_sine(tilt: Any) -> Any:

@@ -61,7 +61,7 @@ def scaled(drive: Drive, h: Any) -> Drive:
 
 
 def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tuple[list, list]:
-    """Return the Taylor coefficients W_0 ... W_order of hθ' and H_0 ... H_order of (hθ')²/2.
+    """Return the Taylor coefficients W_0 ... W_order of hθ', and H_0 ... of (hθ')²/2 up to order - 1.
 
     Parameters
     ----------
@@ -73,25 +73,21 @@ def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tup
         The highest coefficient of W.
     """
     a, b, gamma, d, r = drive
-    W, P, Q, H = [w], [a * s + b * c], [a * c - b * s], [0.5 * (w * w)]
-    for k in range(order):
-        force = P[k] + gamma * W[k]
-        if k == 0:
-            force = force - d
-        if k == 1:
-            force = force - r
-        W.append(force * (-1.0 / (k + 1)))
-        if k + 1 == order:
-            break
-        early = sorted(range(k + 1), key=lambda j: (max(j, k - j), j))  # noqa: B023
-        P.append(balanced_sum((Q[j], W[k - j]) for j in early) * (1.0 / (k + 1)))
+    W, Q, H = [w], [a * c - b * s], [0.5 * (w * w)]
+    W.append(d - (a * s + b * c) - gamma * w)
+    for k in range(1, order):
         # The convolution of W with itself is symmetric, so half of its products are enough.
-        pairs = [(W[j], W[k + 1 - j]) for j in reversed(range((k + 2) // 2))]
-        H.append(balanced_sum([(0.5 * W[(k + 1) // 2], W[(k + 1) // 2]), *pairs] if k % 2 else pairs))
-        work = 2.0 * (gamma * H[k]) - d * W[k]
-        if k:
-            work = work - r * W[k - 1]
-        Q.append(H[k + 1] + work * (1.0 / (k + 1)))
+        pairs = [(W[j], W[k - j]) for j in reversed(range((k + 1) // 2))]
+        H.append(balanced_sum(pairs if k % 2 else [(0.5 * W[k // 2], W[k // 2]), *pairs]))
+        work = H[k - 1] * (gamma * (2.0 / k)) - d * W[k - 1] * (1.0 / k)
+        if k > 1:
+            work = work - r * W[k - 2] * (1.0 / k)
+        Q.append(H[k] + work)
+        # P_k itself is not needed: it goes straight into W.
+        early = sorted(range(k), key=lambda j: (max(j, k - 1 - j), j))
+        torque = balanced_sum((Q[j], W[k - 1 - j]) for j in early)
+        change = torque * (-1.0 / (k * (k + 1))) - W[k] * (gamma * (1.0 / (k + 1)))
+        W.append(change + 0.5 * r if k == 1 else change)
     return W, H
 
 
@@ -168,11 +164,14 @@ def truncation_bound(omega: float, drive: Drive, dt: float, order: int = ORDER) 
     earlier substeps left out. Where `flow` jumps along the slow manifold (heavy damping) the count is that
     of plain substeps, which the jump replaces.
     """
-    n = 1 if certified(omega, drive, dt, largest_x(dt, order), np) else _substeps(omega, *drive, dt, order)
-    n = min(n, 1e15)
+    largest = largest_x(dt, order)
+    one = certified(omega, drive, dt, largest, np)
+    n = 1 if one else min(_substeps(omega, *drive, dt, order), 1e15)
     h = dt / n
     # One step needs the bound at its start only, several need it all the way.
     x = _rate(omega, *drive, dt if n > 1 else 0.0) * h
+    if one:
+        x = min(x, largest)
     tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
     return Bound(int(n), order, n * tail / (order + 2), n * tail / h)
 

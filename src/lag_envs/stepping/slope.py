@@ -100,8 +100,10 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
     """
     drag, pull = force
     faster = drag * v <= pull
-    line = -(drag * drag * x + (drag * v - pull)) / (drag * pull)
-    time = xp.where(faster, dt, xp.where(pull > 0.0, xp.maximum(line, 0.0), 0.0))
+    line = 0.0  # without pull there is no such line
+    if not (isinstance(pull, float) and pull == 0.0):
+        line = xp.maximum(-(drag * drag * x + (drag * v - pull)) / (drag * pull), 0.0)
+    time = xp.where(faster, dt, line)
     for _ in range(8):
         z = drag * time
         small = z <= SMALL_DECAY

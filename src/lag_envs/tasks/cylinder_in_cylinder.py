@@ -72,7 +72,110 @@ class _Shell(Task):
 
 
 class Tilt(_Shell):
-    """Hold a cylinder at an angle inside a shell by turning the shell."""
+    """Hold a cylinder at an angle inside a shell by turning the shell.
+
+    ## Description
+
+    A solid cylinder rolls without slipping inside a larger hollow one, the shell, filled with a medium that
+    turns with the shell and drags. By turning the shell the small cylinder is to be brought to an angle and
+    kept there.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | angular acceleration ψ'' of the shell, 15 times the action | rad/s² | -15 | 15 |
+
+    It is cut back so that |ψ'| is at most 6 rad/s at the step's end.
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | theta | angle of the small cylinder's axis | rad | -20.35 | 20.35 |
+    | 1 | theta_dot | its rate | rad/s | -386 | 386 |
+    | 2 | psi_dot | rate of the shell | rad/s | -6.000 | 6.000 |
+    | 3 | target | the angle θ* to hold | rad | -1.05 | 1.05 |
+
+    ## Rewards
+
+    exp(-((θ - θ*)/0.1)²) - 0.02 (u/15)² for each step, at its end; u is the control applied. For another
+    `dt` it is scaled by dt/0.05.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [theta, theta_dot, psi_dot], "target": theta*})`, inside the
+    limits.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | theta | rad | 0 | 0.1 |
+    | theta_dot | rad/s | 0 | 0.2 |
+    | psi_dot | rad/s | 0 | 0 |
+    | target | rad | 0 | 0.3 |
+
+    ## Episode End
+
+    Termination: |θ| > 1.05 rad at a step's end. Truncation: after 200 steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 1 | kg | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | inner radius R of the shell |
+    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0.24 | N m s | coefficient c of the drag -c(θ' - ψ') |
+    | gravity | 9.81 | m/s² | field g, downward |
+    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | target | None | rad | an angle for every episode, within ±1.05; None: random |
+
+    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
+    drive torque in `info`.
+
+    ## Equations
+
+    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²):
+
+        θ'' = -(k g/a) sinθ + k (I/(mr²)) (R/a) ψ'' - β (θ' - ψ')
+            = -16.35 sinθ + 0.41667 ψ'' - 1.0 (θ' - ψ')     (default parameters)
+
+    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate
+    drags.
+
+    Held at θ*, the shell turns at ψ' = (k g/(a β)) sinθ*: 4.83 rad/s for 0.3 rad.
+
+    ## Signs and Units
+
+    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped; so are ψ and its rate. The state
+    is float64: `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
+    most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
+    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+
+    ## Optimal Value
+
+    Not known; at most 200 (194.8 for θ* = 0.3, by finite-horizon value iteration on a grid: an estimate).
+    Over 4,096 episodes (mean ± standard error), the last column being the feedback action = 30.3 (θ* - θ) -
+    3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
+
+    | Id | Random actions | Zero control | Feedback |
+    | -- | -------------- | ------------ | -------- |
+    | CylinderInCylinderTilt-v0 | 42.3 ± 0.4 | 61.3 ± 1.1 | 197.6 ± 0.0 |
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
     observation = ("theta", "theta_dot", "psi_dot", "target")
@@ -107,7 +210,104 @@ class Tilt(_Shell):
 
 
 class Pump(_Shell):
-    """Pump the swing of a cylinder inside a shell to an energy by turning the shell, and keep it there."""
+    """Pump the swing of a cylinder inside a shell to an energy by turning the shell, and keep it there.
+
+    ## Description
+
+    The scene of `Tilt` with a tenth of its drag and a weaker drive. The small cylinder's swing is to be
+    pumped to the energy of an amplitude of 0.9 rad, and kept at it. One push is not enough: the drive has
+    to follow the swing.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | angular acceleration ψ'' of the shell, 4 times the action | rad/s² | -4 | 4 |
+
+    It is cut back so that |ψ'| is at most 3 rad/s at the step's end.
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | theta | angle of the small cylinder's axis | rad | -15.46 | 15.46 |
+    | 1 | theta_dot | its rate | rad/s | -283.2 | 283.2 |
+    | 2 | psi_dot | rate of the shell | rad/s | -3.000 | 3.000 |
+
+    ## Rewards
+
+    exp(-|E - E*|/(0.3 E*)) - 0.02 (u/4)² for each step, at its end; u is the control applied. E = θ'²/2 +
+    ω₀² (1 - cosθ) with ω₀² = k g/a is the energy per inertia, E* = 6.187/s² that of the amplitude. For
+    another `dt` it is scaled by dt/0.05.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [theta, theta_dot, psi_dot]})`, inside the limits.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | theta | rad | 0 | 0.1 |
+    | theta_dot | rad/s | 0 | 0.2 |
+    | psi_dot | rad/s | 0 | 0 |
+
+    ## Episode End
+
+    Termination: |θ| > 1.3 rad at a step's end. Truncation: after 200 steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 1 | kg | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | inner radius R of the shell |
+    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0.024 | N m s | coefficient c of the drag -c(θ' - ψ') |
+    | gravity | 9.81 | m/s² | field g, downward, above 0 |
+    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+
+    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
+    drive torque in `info`.
+
+    ## Equations
+
+    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²):
+
+        θ'' = -(k g/a) sinθ + k (I/(mr²)) (R/a) ψ'' - β (θ' - ψ')
+            = -16.35 sinθ + 0.41667 ψ'' - 0.1 (θ' - ψ')     (default parameters)
+
+    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate
+    drags.
+
+    ## Signs and Units
+
+    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped; so are ψ and its rate. The state
+    is float64: `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
+    most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
+    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+
+    ## Optimal Value
+
+    Not known; at most 200. Over 4,096 episodes (mean ± standard error), the last column being the energy
+    pump action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1:
+
+    | Id | Random actions | Zero control | Energy pump |
+    | -- | -------------- | ------------ | ----------- |
+    | CylinderInCylinderPump-v0 | 6.25 ± 0.01 | 7.22 ± 0.00 | 142.1 ± 0.0 |
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.024, "control": "tilt"}
     observation = ("theta", "theta_dot", "psi_dot")
@@ -151,7 +351,104 @@ class Pump(_Shell):
 
 
 class Damping(Task):
-    """Calm a kicked cylinder inside a fixed shell by braking it."""
+    """Calm a kicked cylinder inside a fixed shell by braking it.
+
+    ## Description
+
+    A solid cylinder rolls without slipping inside a fixed hollow one. A brake, a drag whose coefficient is
+    the control, takes energy out; kicks put it back. The cylinder is to rest at the bottom. Braking as hard
+    as possible is not the best: it makes the cylinder creep.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | drag coefficient c, 1.2 (1 + action) | N m s | 0 | 2.4 |
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted, at worst a kick in every step.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | theta | angle of the small cylinder's axis | rad | -18635 | 18635 |
+    | 1 | theta_dot | its rate | rad/s | -1763.5 | 1763.5 |
+
+    ## Rewards
+
+    exp(-√(θ² + θ'²/ω₀²)/0.1) for each step, at its end and before a kick, with ω₀ = √(k g/a) = 4.0435/s.
+    For another `dt` it is scaled by dt/0.02.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [theta, theta_dot]})`, where there is contact and |θ| is at most
+    1,000 rad.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | theta | rad | 0 | 0.8 |
+    | theta_dot | rad/s | 0 | 1 |
+
+    After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by -3,
+    -1.5, 1.5 or 3 rad/s, each equally likely.
+
+    ## Episode End
+
+    Termination: contact is lost, N = m (a θ'² + g cosθ) < 0 at a step's end. Truncation: after 500 steps
+    (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 1 | kg | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | inner radius R of the shell |
+    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0 | N m s | constant drag; adds to the brake |
+    | gravity | 9.81 | m/s² | field g, downward, above 0 |
+    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+
+    Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
+    `info`.
+
+    ## Equations
+
+    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²), at most 10/s:
+
+        θ'' = -(k g/a) sinθ - β θ' = -16.35 sinθ - β θ'     (default parameters)
+
+    Overdamped from β = 2 ω₀ = 8.1/s.
+
+    ## Signs and Units
+
+    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped. The state is float64:
+    `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
+    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound.
+
+    ## Optimal Value
+
+    Not known; at most 500. Value iteration on a grid estimated 361, which the law below exceeds. Over 4,096
+    episodes (mean ± standard error), the last column being full brake away from the bottom, and action =
+    14.6 (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
+
+    | Id | Random actions | Zero control | Switching line |
+    | -- | -------------- | ------------ | -------------- |
+    | CylinderInCylinderDamping-v0 | 294.3 ± 1.0 | 13.2 ± 0.4 | 363.8 ± 0.7 |
+
+    Zero control is the action -1, no brake.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     scene_type = CylinderInCylinder
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}

@@ -17,7 +17,107 @@ from lag_envs.tasks.base import FASTEST_START, Task, finite
 
 
 class Tilt(Task):
-    """Roll a cylinder to a mark on a plane by tilting it, and stop there."""
+    """Roll a cylinder to a mark on a plane by tilting it, and stop there.
+
+    ## Description
+
+    A solid cylinder rolls without slipping on a plane that turns about its middle. It is to be brought to a
+    mark and kept there, the plane's rate of turning being the control. The plane carries the cylinder, so
+    turning it also pushes.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | rate φ' of the tilt, 0.3 times the action | rad/s | -0.3 | 0.3 |
+
+    The rate is cut back so that |φ| is at most 0.1 rad at the step's end. With `control="tilt"` the control
+    is the tilt itself, 0.1 rad times the action, and each step is one of a plane at rest at that tilt.
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted. With `control="tilt"` row 1 is
+    x_dot and row 2 is missing.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | x | place along the plane | m | -5.895 | 5.895 |
+    | 1 | w | x' + R φ', the speed that the momentum goes with | m/s | -107.9 | 107.9 |
+    | 2 | phi | tilt | rad | -0.1 | 0.1 |
+    | 3 | target | the mark x* | m | -0.5 | 0.5 |
+
+    ## Rewards
+
+    exp(-((x - x*)/0.1)²) - 0.02 (u/U)² for each step, at its end; u is the control applied and U its limit.
+    For another `dt` it is scaled by dt/0.05.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [x, w, phi], "target": x*})`, inside the limits.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | x | m | 0 | 0.4 |
+    | w | m/s | 0 | 0.3 |
+    | phi | rad | 0 | 0.05 |
+    | target | m | 0 | 0.3 |
+
+    ## Episode End
+
+    Termination: |x| > 0.5 m at a step's end. Truncation: after 200 steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 1 | kg | mass m |
+    | radius | 0.05 | m | rolling radius R |
+    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0.03 | N s/m | coefficient c of the drag -cx' at the axis |
+    | gravity | 9.81 | m/s² | field g, downward |
+    | control | tilt_rate | - | what the control is: "tilt_rate", or "tilt" |
+    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | target | None | m | a mark for every episode, within ±0.5; None: random |
+
+    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
+    drive torque in `info`.
+
+    ## Equations
+
+    With k = 1/(1 + I/(mR²)) = 2/3, and φ' held:
+
+        w' = k (g sinφ + x φ'²) - (c k/m) x',   x' = w - R φ'
+
+    No φ'' appears, and w stays continuous when the rate is switched, whereas x' jumps by -R times the
+    switch. With `control="tilt"`: x'' = k g sinφ - (c k/m) x'.
+
+    ## Signs and Units
+
+    SI units. x is positive down the slope and 0 at the point about which the plane turns; φ is positive
+    when the plane falls to the side of positive x. The state is float64: `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    The equation is linear while the rate is held, and is stepped by its own Taylor series, summed to
+    rounding (with `control="tilt"` by its closed form). Measured against 40 digits: below 2e-16, relative
+    to the size that docs/numerics.md defines.
+
+    ## Optimal Value
+
+    Not known; at most 200. Over 4,096 episodes (mean ± standard error), the last column being the cascade
+    φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1, action = 43.4 (φ_wanted - φ), clipped to ±1:
+
+    | Id | Random actions | Zero control | Cascade |
+    | -- | -------------- | ------------ | ------- |
+    | InclineTilt-v0 | 9.5 ± 0.2 | 11.3 ± 0.2 | 179.9 ± 0.3 |
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     scene_type = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
@@ -86,7 +186,7 @@ class Tilt(Task):
         push = gravity * math.sin(self.largest_tilt) + reach * rate * rate + k["drag"] * radius * rate
         speed = FASTEST_START + radius * rate + push * self.duration
         state = [self.edge + speed * self.dt, speed]
-        return [finite(b) for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), 1e3)]
+        return [finite(b) for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), self.edge)]
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Return a plank that ends at the edges, with the target and the largest tilt."""
@@ -117,7 +217,101 @@ class Tilt(Task):
 
 
 class Brake(Task):
-    """Let a cylinder roll down to a line by braking it: cross slowly, but soon."""
+    """Let a cylinder roll down to a line by braking it: cross slowly, but soon.
+
+    ## Description
+
+    A solid cylinder rolls without slipping down a slope of 15°. A brake, a drag whose coefficient is the
+    control, slows it. It is to cross a line soon, at 0.5 m/s or less: time and excess of speed both cost.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | drag coefficient c, 3 (1 + action) | N s/m | 0 | 6 |
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted (at most 1,000 m before the
+    line).
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | distance | distance to the line, -x | m | -2169 | 2169 |
+    | 1 | v | speed x' down the slope | m/s | -116.9 | 116.9 |
+
+    ## Rewards
+
+    Minus the seconds that the step takes: -0.02. In the step that crosses the line, minus the time to the
+    crossing, and minus 5 (v - 0.5) where the speed v there is above 0.5 m/s. Both are those of the exact
+    crossing, not of the step's end.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [x, x_dot]})`, before the line and not moving uphill. The line is
+    at x = 0.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | x | m | -2 | 1 |
+    | x_dot | m/s | 0.5 | 0.5 |
+
+    ## Episode End
+
+    Termination: the line is crossed. Truncation: after 500 steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 1 | kg | mass m |
+    | radius | 0.05 | m | rolling radius R |
+    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0 | N s/m | constant drag; adds to the brake |
+    | tilt | 0.261799 | rad | the slope φ, 0 or more and below π/2 |
+    | gravity | 9.81 | m/s² | field g, downward |
+    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+
+    Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
+    `info`.
+
+    ## Equations
+
+    With k = 1/(1 + I/(mR²)) = 2/3 and β = c k/m, at most 4/s:
+
+        x'' = k g sinφ - β x' = 1.6927 - β x'     (default parameters)
+
+    Fully braked, the speed settles at 0.423 m/s.
+
+    ## Signs and Units
+
+    SI units. x is positive down the slope, 0 at the line. The state is float64: `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Stepped in closed form, written so that nothing cancels for any drag. Measured against 40 digits: below
+    2e-16, relative to the size that docs/numerics.md defines. The crossing time is solved for by Newton's
+    method on the closed form, from a side on which it converges monotonically.
+
+    ## Optimal Value
+
+    About -1.72 (finite-horizon value iteration on a grid: an estimate). Over 4,096 episodes (mean ±
+    standard error), the last column being the switching line action = 14.6 (v - 0.149 - 2.33 distance),
+    clipped to ±1:
+
+    | Id | Random actions | Zero control | Switching line |
+    | -- | -------------- | ------------ | -------------- |
+    | InclineBrake-v0 | -4.32 ± 0.01 | -11.98 ± 0.03 | -1.740 ± 0.005 |
+
+    Zero control is the action -1, no brake.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     scene_type = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}

@@ -22,7 +22,115 @@ def _speed_bound(task: Task, limit: float) -> float:
 
 
 class SwingUp(Task):
-    """Swing a bar up by moving its support, and hold it upright."""
+    """Swing a bar up by moving its support, and hold it upright.
+
+    ## Description
+
+    A uniform bar hangs from a support. The support is accelerated to and fro; the bar is to be swung up and
+    kept upright. With a track (`PivotedBar-v0`) the support has half a metre to either side; without one
+    (`PivotedBarFree-v0`, the same class with `track=None`) its place and speed are no part of the task.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | acceleration u = s'' of the support, 5 times the action | m/s² | -5 | 5 |
+
+    With a track, the control applied is the one nearest to 5 times the action from which the support can
+    still stop inside the track by braking at 5 m/s²; read it as `env.unwrapped.control`.
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted. Without a track the first two
+    rows are missing.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | s/S | place of the support over S = 0.5 m | 1 | -1.000 | 1.000 |
+    | 1 | s_dot/2 | speed of the support, halved | m/s | -1.118 | 1.118 |
+    | 2 | cos(theta) | cosine of the bar's angle | 1 | -1 | 1 |
+    | 3 | sin(theta) | sine of it | 1 | -1 | 1 |
+    | 4 | theta_dot/8 | angular velocity, over 8 | rad/s | -58.78 | 58.78 |
+
+    ## Rewards
+
+    h² - 0.02 (u/5)² for each step, where h = (1 - cosθ)/2 is 0 hanging and 1 upright, taken at the step's
+    end, and u is the control applied. The square keeps a spinning bar from paying (3/8 of the optimum). For
+    another `dt` it is scaled by dt/0.02, so that a second is worth the same.
+
+    ## Starting State
+
+    Uniform, hanging nearly at rest; or `reset(options={"state": [s, s_dot, theta, theta_dot]})` (without a
+    track `[theta, theta_dot]`). A start from which the support cannot stop inside the track is refused.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | s | m | 0 | 0.05 |
+    | s_dot | m/s | 0 | 0.02 |
+    | theta | rad | 0 | 0.1 |
+    | theta_dot | rad/s | 0 | 0.1 |
+
+    The half width of s is a tenth of the track's.
+
+    ## Episode End
+
+    Termination: never; the track's ends are guarded, see above. Truncation: after 500 steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 0.2 | kg | mass m |
+    | com_distance | 0.3 | m | distance L from pivot to centre of mass, half of the bar's length |
+    | inertia | 0.006 | kg m² | moment of inertia I about the centre of mass; None: mL²/3 |
+    | damping | 0.001 | N m s | coefficient b of the pivot's torque -bθ' |
+    | gravity | 9.81 | m/s² | field g, downward |
+    | track | 0.5 | m | travel S to either side; `math.inf`: no limit (s/S is then s/0.5 m); None: no track |
+    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+
+    Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
+
+    ## Equations
+
+    With J = mL² + I:
+
+        θ'' = -(m L (u cosθ + g sinθ) + b θ')/J = -24.525 sinθ - 2.5 u cosθ - 0.041667 θ'
+        s'' = u
+
+    The numbers are those of the default parameters. The support is moved by a drive that is strong enough:
+    the bar does not act back on it.
+
+    ## Signs and Units
+
+    SI units. θ = 0 hangs straight down, θ = π stands; positive counter-clockwise, not wrapped. s is
+    positive to the right, 0 in the middle of the track. The state is float64: `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
+    most 15.0 rad/s, whatever the control; above that the step is divided, by the same bound. Measured
+    against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines. s and s' are exact
+    to rounding.
+
+    ## Optimal Value
+
+    418 to 421 with a track and 421 without (finite-horizon value iteration on a grid: estimates, not
+    proofs; upright after about 2 s). Over 4,096 episodes:
+
+    | Id | Random actions | Zero control |
+    | -- | -------------- | ------------ |
+    | PivotedBar-v0 | -0.78 ± 0.07 | 0.00 ± 0.00 |
+    | PivotedBarFree-v0 | -2.43 ± 0.02 | 0.00 ± 0.00 |
+
+    (mean ± standard error.) `make demo` trains an agent and shows what it and a classical controller reach.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     scene_type = PivotedBar
     defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
@@ -58,13 +166,19 @@ class SwingUp(Task):
         wanted = k.limit_control * a
         if not self.has_track or math.isinf(self.scene.track):
             return wanted
+        # With v the speed at the step's end, and braking from there at U, the support stops at
+        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, it passes S or -S where v² + |reach| > 2US.
         s, s_dot = y[:2]
+        top, per_step = k.limit_control, k.limit_control * dt
+        ends, start = 2.0 * (top * k.track), (2.0 * top) * s + per_step * s_dot
         v = s_dot + dt * wanted
-        right, left = _too_far(s, s_dot, v, k, dt), _too_far(-s, -s_dot, -v, k, dt)
-        # Both ends at once would leave nothing to choose from, which inside the safe set does not happen.
-        side = xp.where(right, 1.0, xp.where(left, -1.0, 0.0))
-        nearest = side * xp.minimum(side * wanted, _hardest(side * s, side * s_dot, k, dt, xp))
-        return xp.where(right | left, nearest, wanted)
+        reach = start + per_step * v
+        side = xp.where(reach < 0.0, -1.0, 1.0)
+        # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed that is not too much.
+        half = 0.5 * per_step
+        highest = xp.sqrt(xp.maximum(half * half + ends - side * start, 0.0)) - half
+        hardest = clip((highest - side * s_dot) * (1.0 / dt), -top, top, xp)
+        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * wanted, hardest), wanted)
 
     def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
         """Return h² - 0.02 (u/U)² with the height h = (1 - cosθ)/2."""
@@ -108,27 +222,108 @@ class SwingUp(Task):
                 )
 
 
-def _too_far(s: Any, s_dot: Any, v: Any, k: Any, dt: Any) -> Any:
-    """Tell whether braking at -U from speed v at the step's end would pass S.
-
-    The condition v²/(2U) + s + s' dt + u dt²/2 <= S with v = s' + u dt, multiplied by 2U. Below v = -U dt/2 its left
-    side, a parabola in v, falls with v: there a move away from S, at most as fast as U allows, meets equality, and
-    rounding must not call that too far.
-    """
-    top = k.limit_control
-    return (v > -0.5 * (top * dt)) & (v * v + (top * dt) * v > top * (2.0 * (k.track - s) - s_dot * dt))
-
-
-def _hardest(s: Any, s_dot: Any, k: Any, dt: Any, xp: Any) -> Any:
-    """Return the largest u in [-U, U] that is not too far: the condition's root, solved for v."""
-    top = k.limit_control
-    half = 0.5 * (top * dt)
-    v = xp.sqrt(xp.maximum(half * half + top * (2.0 * (k.track - s) - s_dot * dt), 0.0)) - half
-    return clip((v - s_dot) * (1.0 / dt), -top, top, xp)
-
-
 class Balance(SwingUp):
-    """Keep a bar upright against kicks by moving its support."""
+    """Keep a bar upright against kicks by moving its support.
+
+    ## Description
+
+    The bar of `SwingUp` starts nearly upright. It is to be kept there, near the middle of the track, while
+    random kicks knock it off balance. Without kicks the task would be trivial.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+
+    | Num | Control | Unit | At -1 | At 1 |
+    | --- | ------- | ---- | ----- | ---- |
+    | 0 | acceleration u = s'' of the support, 3 times the action | m/s² | -3 | 3 |
+
+    ## Observation Space
+
+    `Box` of float32. The bounds are proved for every start that is accepted, at worst a kick in every step.
+
+    | Num | Observation | Quantity | Unit | Min | Max |
+    | --- | ----------- | -------- | ---- | --- | --- |
+    | 0 | s | place of the support | m | -3.1 | 3.1 |
+    | 1 | s_dot | its speed | m/s | -130 | 130 |
+    | 2 | e | angle from upright, θ - π | rad | -18.76 | 18.76 |
+    | 3 | theta_dot | angular velocity | rad/s | -920.3 | 920.3 |
+
+    ## Rewards
+
+    1 - (e/0.35)²/2 - (s/S)²/2 for each step, at its end and before a kick, with S = 0.5 m: between 0 and 1
+    inside the limits. For another `dt` it is scaled by dt/0.02.
+
+    ## Starting State
+
+    Uniform; or `reset(options={"state": [s, s_dot, theta, theta_dot]})`, inside the limits below.
+
+    | State | Unit | Centre | To either side |
+    | ----- | ---- | ------ | -------------- |
+    | s | m | 0 | 0.2 |
+    | s_dot | m/s | 0 | 0.2 |
+    | theta | rad | 3.14159 | 0.15 |
+    | theta_dot | rad/s | 0 | 0.3 |
+
+    After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by a
+    uniform amount in ±1 rad/s.
+
+    ## Episode End
+
+    Termination: |e| > 0.35 rad or |s| > 0.5 m at a step's end; that step still pays. Truncation: after 500
+    steps (10 s).
+
+    ## Arguments
+
+    | Keyword | Default | Unit | Meaning |
+    | ------- | ------- | ---- | ------- |
+    | mass | 0.2 | kg | mass m |
+    | com_distance | 0.3 | m | distance L from pivot to centre of mass, half of the bar's length |
+    | inertia | 0.006 | kg m² | moment of inertia I about the centre of mass; None: mL²/3 |
+    | damping | 0.001 | N m s | coefficient b of the pivot's torque -bθ' |
+    | gravity | 9.81 | m/s² | field g, downward |
+    | track | 0.5 | m | travel S to either side; finite here |
+    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
+    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+
+    Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
+
+    ## Equations
+
+    With J = mL² + I:
+
+        θ'' = -(m L (u cosθ + g sinθ) + b θ')/J
+        s'' = u
+
+    Upright, without control, a deviation grows e-fold in √(J/(mgL)) = 0.2 s.
+
+    ## Signs and Units
+
+    SI units. θ = 0 hangs straight down, θ = π stands; positive counter-clockwise, not wrapped: θ = -π is
+    another angle and outside the limits. s is positive to the right. The state is float64:
+    `env.unwrapped.state`.
+
+    ## Numerical Accuracy
+
+    Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
+    most 15.0 rad/s, whatever the control; above that the step is divided, by the same bound. s and s' are
+    exact to rounding.
+
+    ## Optimal Value
+
+    Not known; at most 500. Over 4,096 episodes (mean ± standard error), the last column being the feedback
+    action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
+
+    | Id | Random actions | Zero control | Linear feedback |
+    | -- | -------------- | ------------ | --------------- |
+    | PivotedBarBalance-v0 | 21.3 ± 0.2 | 21.8 ± 0.2 | 445.7 ± 1.7 |
+
+    Kicks that no control survives keep the optimum below 500.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.1.0).
+    """
 
     limit_control = 3.0
     draws = 2

@@ -1,0 +1,325 @@
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from agents import demo
+from agents.controllers import Constant, EnergyShapingLQR, Random, do_nothing, linearised
+from agents.evaluate import KNOWN_RETURNS, evaluate, evaluate_batch, score
+from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
+from lag_envs.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+ENV = "PivotedBar-v0"
+
+
+@pytest.fixture(scope="module")
+def controller():
+    with gym.make(ENV) as env:
+        return EnergyShapingLQR(env.unwrapped.task)
+
+
+# --- controllers ---
+
+
+def test_controller_swings_up_and_holds(controller):
+    returns = evaluate_batch(ENV, controller, 1_000_000_000, 100)
+    assert returns[:20].mean() > 417.0  # what it is known to reach
+    assert returns.min() > 410.0  # none needs one swing more, or falls
+    assert score(ENV, returns.mean()) > 0.99
+
+
+def test_controller_acts_on_one_observation_as_on_a_batch(controller):
+    with gym.make(ENV) as env:
+        one = evaluate(env, controller, range(5, 8))
+    np.testing.assert_allclose(one, evaluate_batch(ENV, controller, 5, 3), rtol=1e-12)
+
+
+def test_controller_hands_over_with_hysteresis(controller):
+    def observation(e):
+        return np.array([0.0, 0.0, -np.cos(e), -np.sin(e), 0.0])
+
+    def holds(e, before):
+        return bool(controller.predict(observation(e), np.array(before))[1])
+
+    between = np.sqrt(0.5 * (controller.catch + controller.lose) / controller.cost[2, 2])
+    assert holds(0.1, False) and holds(0.1, True)
+    assert not holds(between, False) and holds(between, True)
+    assert not holds(np.pi, True)
+    # An episode's start wipes out what was before.
+    assert not controller.predict(observation(between), np.array(True), np.array([True]))[1]
+
+
+def test_controller_gets_a_bar_at_rest_going(controller):
+    action, _ = controller.predict(np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
+    assert abs(action.item()) == 1.0
+
+
+def test_controller_asks_for_a_track():
+    with gym.make("PivotedBarFree-v0") as env, pytest.raises(ValueError, match="track=None"):
+        EnergyShapingLQR(env.unwrapped.task)
+
+
+def test_linearisation_follows_the_motion(controller):
+    scene, dt = controller.scene, 1e-3
+    a, b = linearised(scene)
+    x, u = 1e-6 * np.array([1.0, -2.0, 3.0, -1.0]), 2e-6
+    state = x + np.array([0.0, 0.0, np.pi, 0.0])
+    forth, back = (scene.simulate(state, [u], h)[1] for h in (dt, 0.5 * dt))
+    slope = (4.0 * (back - state) - (forth - state)) / dt  # of second order, forward
+    np.testing.assert_allclose(slope, a @ x + b * u, rtol=1e-3, atol=1e-11)
+
+
+def test_doing_nothing_is_zero_control():
+    for id in TASKS:
+        with gym.make(id) as env:
+            env.reset(seed=1)
+            action, _ = do_nothing(env).predict(env.observation_space.sample())
+            assert action.shape == env.action_space.shape
+            env.step(action)
+            assert env.unwrapped.control == 0.0, id
+
+
+def test_agents_without_knowledge():
+    assert Constant(0.5).predict(np.zeros((3, 5)))[0].tolist() == [[0.5]] * 3
+    first, second = (Random(1).predict(np.zeros((3, 5)))[0] for _ in range(2))
+    assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
+    assert evaluate_batch(ENV, Constant(0.0), 0, 20).mean() == pytest.approx(0.0, abs=0.1)
+    assert evaluate_batch(ENV, Random(0), 0, 100).mean() == pytest.approx(KNOWN_RETURNS[ENV][0], abs=3.0)
+
+
+def test_score():
+    assert score(ENV, 421.0) == 1.0
+    assert score(ENV, 0.6) == 0.0
+    assert score("PivotedBarBalance-v0", 400.0) is None
+
+
+# --- the adapter ---
+
+
+def pair(env_id, n=3, seed=7, **options):
+    """Return the adapter and SB3's own vector environment over single ones, seeded alike."""
+    ours = make_sb3_vec_env(env_id, n, **options)
+    theirs = DummyVecEnv([lambda: gym.make(env_id, **options)] * n)
+    for envs in (ours, theirs):
+        envs.seed(seed)
+    return ours, theirs
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [(ENV, {"duration": 1.0}), ("PivotedBarBalance-v0", {}), ("InclineBrake-v0", {}), ("InclineTilt-v0", {})],
+)
+def test_adapter_equals_dummy_vec_env(env_id, options):
+    ours, theirs = pair(env_id, **options)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    rng = np.random.default_rng(0)
+    ends = {True: 0, False: 0}
+    for _ in range(450):
+        actions = rng.uniform(-1.0, 1.0, (3, 1)).astype(np.float32)
+        (o1, r1, d1, i1), (o2, r2, d2, i2) = ours.step(actions), theirs.step(actions)
+        assert (o1.tobytes(), r1.tobytes(), d1.tobytes()) == (o2.tobytes(), r2.tobytes(), d2.tobytes())
+        assert (o1.dtype, r1.dtype, d1.dtype) == (o2.dtype, r2.dtype, d2.dtype)
+        for a, b, done in zip(i1, i2, d1, strict=True):
+            if done:
+                assert a["terminal_observation"].tobytes() == b["terminal_observation"].tobytes()
+                assert a["TimeLimit.truncated"] is b["TimeLimit.truncated"]
+                ends[a["TimeLimit.truncated"]] += 1
+            else:
+                assert a == {}
+    assert sum(ends.values()) >= 6
+    # Without seeds a reset goes on with the next episodes.
+    assert ours.reset().tobytes() == theirs.reset().tobytes()
+
+
+def test_adapter_passes_options_and_infos_on():
+    ours, theirs = pair(ENV, diagnostics=True, duration=0.1)
+    for envs in (ours, theirs):
+        envs.set_options({"state": [0.1, 0.0, 3.0, 0.0]})
+    assert ours.reset().tobytes() == theirs.reset().tobytes()
+    np.testing.assert_array_equal(ours.get_attr("state"), [[0.1, 0.0, 3.0, 0.0]] * 3)
+    for _ in range(7):
+        _, _, _, i1 = ours.step(np.ones((3, 1), np.float32))
+        _, _, _, i2 = theirs.step(np.ones((3, 1), np.float32))
+        for a, b in zip(i1, i2, strict=True):
+            b.pop("TimeLimit.truncated")
+            a.pop("TimeLimit.truncated", None)
+            assert set(a) == set(b)
+            for name in a:
+                np.testing.assert_allclose(a[name], b[name], rtol=1e-12, atol=1e-12)
+    ours.set_options([{"state": [0.0, 0.0, 0.0, 0.0]}, {}, {}])
+    with pytest.raises(ValueError, match="all environments are given the same"):
+        ours.reset()
+
+
+def test_adapter_attributes():
+    envs = make_sb3_vec_env(ENV, 3, render_mode="rgb_array", mass=[0.1, 0.2, 0.3])
+    envs.seed(1)
+    observations = envs.reset()
+    assert [s.shape for s in envs.get_attr("state")] == [(4,)] * 3
+    assert envs.get_attr("state", [1])[0][0] == pytest.approx(0.5 * observations[1, 0])
+    assert envs.get_attr("action_space", 0) == [envs.action_space]
+    assert envs.has_attr("scene") and not envs.has_attr("nonsense")
+    assert envs.env_is_wrapped(gym.Wrapper) == [False] * 3
+    envs.set_attr("mark", 7)
+    assert envs.get_attr("mark", [0, 2]) == [7, 7]
+    with pytest.raises(NotImplementedError, match="all of its environments"):
+        envs.set_attr("mark", 8, [0])
+    assert len(envs.env_method("render")) == 3
+    assert envs.render().ndim == 3  # tiled into one picture
+    envs.close()
+
+
+def test_adapter_refuses_another_autoreset_mode():
+    with pytest.raises(ValueError, match="SameStep"):
+        SB3VecEnv(gym.make_vec(ENV, 2))
+
+
+def test_spread_starts():
+    """The environments then end their first episodes one after the other."""
+    envs = make_sb3_vec_env(ENV, 4, spread=20, duration=0.4)
+    envs.seed(1)
+    first = envs.reset()
+    ends = {t: np.flatnonzero(envs.step(np.zeros((4, 1), np.float32))[2]).tolist() for t in range(1, 41)}
+    assert {t: e for t, e in ends.items() if e} == {t: [t // 5 % 4] for t in range(5, 41, 5)}
+    envs.seed(1)
+    assert envs.reset().tobytes() == first.tobytes()
+
+
+def test_sb3_wrappers_and_learner_work_on_the_adapter():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        envs = VecMonitor(make_sb3_vec_env(ENV, 4, duration=0.5))
+        model = PPO("MlpPolicy", VecNormalize(ScaledReward(envs, 0.1)), n_steps=32, batch_size=64, n_epochs=1)
+        model.learn(256)
+    assert {e["l"] for e in model.ep_info_buffer} == {25}
+    assert len(model.ep_info_buffer) == 8
+
+
+# --- the demo ---
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Return a function that runs the demo here; it returns the status and what was printed."""
+    monkeypatch.setattr(demo, "EPISODES", 2)
+
+    def run(*arguments, folder):
+        status = demo.main([*arguments, "--output", str(folder)])
+        return status, "".join(capsys.readouterr())
+
+    return run
+
+
+def start(*arguments, folder):
+    """Start the demo as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "agents.demo", "--output", str(folder), *arguments],
+        cwd=ROOT,
+        env=os.environ
+        | {"PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+def test_demo_can_be_interrupted_resumed_and_evaluated(run, tmp_path):
+    folder = tmp_path / "run"
+    first = start("--steps", "100000", folder=folder)
+    for line in first.stdout:
+        if re.match(r" *8,192 steps", line):
+            break
+    first.send_signal(signal.SIGINT)
+    output = first.communicate(timeout=120)[0]
+    assert first.returncode == 128 + signal.SIGINT, output
+    assert "Stopped after" in output and f"--resume --output {folder}" in output
+    saved = json.loads((folder / "run.json").read_text())
+    assert 8192 <= saved["trained"] < 100_000
+    assert PPO.load(folder / "model.zip").num_timesteps == saved["trained"]
+
+    status, output = run(folder=folder)
+    assert status == 2 and "unfinished" in output and "--resume" in output and "--new" in output
+
+    goal = saved["trained"] + 1000
+    status, output = run("--resume", "--steps", str(goal), folder=folder)
+    assert status == 0, output
+    assert "energy shaping + LQR" in output
+    results = json.loads((folder / "results.json").read_text())
+    assert goal <= results["steps"] < 100_000
+    assert set(results["agents"]) == {"PPO", "random", "do nothing", "energy shaping + LQR"}
+    assert results["agents"]["energy shaping + LQR"]["mean_return"] > 417.0
+    assert len(results["agents"]["PPO"]["returns"]) == len(set(results["evaluation_seeds"])) == 2
+    assert results["versions"]["torch"]
+    assert (folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "episode.mp4").stat().st_size > 10_000
+    assert list((folder / "tensorboard").glob("*/events*"))
+    curve = json.loads((folder / "run.json").read_text())["curve"]
+    assert curve[: len(saved["curve"])] == saved["curve"] and curve[-1][0] == results["steps"]
+
+    status, output = run(folder=folder)
+    assert status == 2 and "evaluated" in output
+
+    (folder / "model.zip").write_bytes(b"not a model")
+    status, output = run("--resume", folder=folder)
+    assert status == 2 and "model.zip cannot be read" in output
+
+
+def test_demo_trains_other_environments_and_starts_anew(run, tmp_path):
+    for new in ([], ["--new"]):
+        status, output = run(*new, "--env", "InclineBrake-v0", "--steps", "1", "--no-video", folder=tmp_path)
+        assert status == 0, output
+    assert not (tmp_path / "episode.mp4").exists()
+    assert len(json.loads((tmp_path / "run.json").read_text())["curve"]) == 1
+    status, output = run("--resume", "--seed", "5", folder=tmp_path)
+    assert status == 2 and "has seed 0" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "PivotedBr-v0"], "did you mean PivotedBar-v0"),
+        (["--steps", "0"], "--steps must be at least 1"),
+        (["--seed", "-1"], "--seed must lie between"),
+        (["--resume"], "there is no run in"),
+    ],
+)
+def test_demo_says_what_is_wrong(arguments, message, run, tmp_path):
+    status, output = run(*arguments, folder=tmp_path / "run")
+    assert status == 2 and message in output and output.startswith("agents.demo: error:")
+
+
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"env": "PivotedBar-v0"}', '{"env": "x", "seed": 0, "steps": 5}']
+)
+def test_demo_with_a_damaged_run_file(content, run, tmp_path):
+    (tmp_path / "run.json").write_text(content)
+    status, output = run("--resume", folder=tmp_path)
+    assert status == 2 and "run.json cannot be read" in output
+
+
+def test_recipes_are_for_environments_that_exist():
+    assert set(demo.RECIPES) | set(KNOWN_RETURNS) <= set(TASKS)
+
+
+def test_demo_help_is_quick():
+    started = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "agents.demo", "--help"], cwd=ROOT, capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
+    )  # fmt: skip
+    assert done.returncode == 0 and "--resume" in done.stdout and "model.zip" in done.stdout
+    assert time.perf_counter() - started < 20.0

@@ -1,0 +1,322 @@
+"""What the documentation says is what the code does: headings, tables, figures, links."""
+
+import dataclasses
+import inspect
+import itertools
+import math
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from reference import flow, scales
+from rollouts import IDS, actions, make
+
+from lag_envs.tasks import TASKS, load_task
+
+ROOT = Path(__file__).parents[1]
+HEADINGS = [
+    "Description",
+    "Action Space",
+    "Observation Space",
+    "Rewards",
+    "Starting State",
+    "Episode End",
+    "Arguments",
+    "Equations",
+    "Signs and Units",
+    "Numerical Accuracy",
+    "Optimal Value",
+    "Version History",
+]
+
+each_id = pytest.mark.parametrize("env_id", IDS)
+
+
+def sections(text):
+    """Return a page's sections by heading, in order."""
+    parts = re.split(r"^## (.+)$", inspect.cleandoc(text), flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def table(text):
+    """Return the first table's rows as dicts by column."""
+    lines = (line.strip("| ") for line in text.splitlines() if line.startswith("|"))
+    rows = [[cell.strip() for cell in line.split(" | ")] for line in lines]
+    head, rule, *body = rows
+    assert set("".join(rule)) <= set("-| ")
+    return [dict(zip(head, row, strict=True)) for row in body]
+
+
+def page(env):
+    return sections(type(env.task).__doc__)
+
+
+def plain(text):
+    """Return a text without its line breaks."""
+    return " ".join(text.split())
+
+
+def agrees(stated, value):
+    """Tell whether a stated number is the value, rounded to what is printed."""
+    digits = len(stated.partition(".")[2])
+    return abs(float(stated) - value) <= 0.5001 * 10.0**-digits + 1e-6 * abs(value)
+
+
+# --- the tasks' pages ---
+
+
+@each_id
+def test_headings(env_id):
+    env = make(env_id)
+    assert list(page(env)) == HEADINGS
+    assert env.__doc__ == type(env.task).__doc__
+    assert all(text.strip() for text in page(env).values())
+
+
+@each_id
+def test_action_table(env_id):
+    env = make(env_id)
+    (row,) = table(page(env)["Action Space"])
+    for column, action in (("At -1", -1.0), ("At 1", 1.0)):
+        env.reset(seed=0, options={"state": env.task.centre})
+        env.step(np.array([action]))
+        assert env.control == float(row[column])
+    assert f"[{row['Unit']}]" in env.scene.control_unit
+
+
+@each_id
+def test_observation_table(env_id):
+    env = make(env_id)
+    rows = {row["Observation"]: row for row in table(page(env)["Observation Space"])}
+    assert [name for name in rows if name in env.task.observation] == list(env.task.observation)
+    space = env.observation_space
+    for name, low, high in zip(env.task.observation, space.low, space.high, strict=True):
+        assert agrees(rows[name]["Min"], low) and agrees(rows[name]["Max"], high), name
+
+
+@each_id
+def test_start_table(env_id):
+    env = make(env_id)
+    rows = {row["State"]: row for row in table(page(env)["Starting State"])}
+    names = zip(env.scene.state_names, env.scene.state_units, env.task.centre, env.task.start, strict=True)
+    for name, unit, centre, half in names:
+        row = rows[name]
+        assert row["Unit"] == unit and agrees(row["Centre"], centre), name
+        assert float(row["To either side"]) == pytest.approx(half), name
+    if env.task.target_range is not None:
+        assert float(rows["target"]["To either side"]) == env.task.target_range
+    kicks = page(env)["Starting State"].count("kick")
+    assert bool(kicks) == bool(env.task.draws)
+
+
+@each_id
+def test_episode_length(env_id):
+    task = make(env_id).task
+    assert f"after {task.steps} steps ({task.duration:g} s)" in plain(page(make(env_id))["Episode End"])
+
+
+@pytest.mark.parametrize("place", dict.fromkeys(place for place, _ in TASKS.values()))
+def test_argument_table(place):
+    """Every parameter that the task leaves free is there, with its default."""
+    task = load_task(place)()
+    rows = {row["Keyword"]: row for row in table(sections(type(task).__doc__)["Arguments"])}
+    fields = {field.name: field for field in dataclasses.fields(task.scene)}
+    own = {"dt": task.dt, "duration": task.duration}
+    if task.target_range is not None:
+        own["target"] = None
+    optional = {name for name in ("control", "tilt") if name in fields}
+    assert set(fields) - optional <= set(rows) - set(own) <= set(fields)
+    for name, row in rows.items():
+        value = own[name] if name in own else getattr(task.scene, name)
+        if isinstance(value, float):
+            assert float(row["Default"]) == pytest.approx(value, rel=1e-5), name
+        else:
+            assert row["Default"] == str(value), name
+        if name in fields and "unit" in fields[name].metadata:
+            assert row["Unit"] == fields[name].metadata["unit"], name
+
+
+# --- figures ---
+
+
+@each_id
+def test_certified_speed(env_id):
+    """One series suffices up to the stated |theta'|, whatever the control, and not much beyond."""
+    env = make(env_id)
+    scene, task, text = env.scene, env.task, plain(page(env)["Numerical Accuracy"])
+    stated = re.search(r"\|θ'\| is at most ([\d.]+) rad/s", text)
+    if scene.truncation_bound(task.centre, 0.0, task.dt) is None:
+        assert stated is None
+        return
+    assert f"order {scene.order}." in text
+    top = task.limit_control
+    controls = (0.0, top) if "Damping" in env_id else (-top, top)
+    rates = (-task.fastest_shell, task.fastest_shell) if hasattr(task, "fastest_shell") else (None,)
+
+    def substeps(speed):
+        worst = 0
+        for u, rate in itertools.product(controls, rates):
+            state = [0.0] * len(scene.state_names)
+            state[scene.angle + 1] = speed
+            if rate is not None:
+                state[2] = rate
+            worst = max(worst, scene.truncation_bound(state, u, task.dt).substeps)
+        return worst
+
+    assert substeps(float(stated[1])) == 1
+    assert substeps(1.02 * float(stated[1])) > 1
+
+
+@each_id
+def test_measured_error(env_id):
+    """One step errs by less than 2e-16 of the sizes that accuracy refers to: the pages and README say so."""
+    env = make(env_id)
+    scene, given = env.scene, actions(300, 1, seed=3)
+    fields = {field.name for field in dataclasses.fields(scene)} - {"track"}
+    params = {name: getattr(scene, name) for name in fields if getattr(scene, name) is not None}
+    env.reset(seed=3)
+    for i, action in enumerate(given):
+        before, kind = env.state, type(scene).__name__
+        *_, terminated, truncated, _ = env.step(action)
+        if i % 25 == 0:
+            after = scene.simulate(before, [env.control], env.task.dt)[1]  # without a kick
+            exact = flow(kind, params, before, env.control, env.task.dt, dps=40)
+            sizes = scales(kind, params, before, env.control, env.task.dt)
+            errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
+            assert max(errors) < 2e-16
+        if terminated or truncated:
+            env.reset()
+
+
+def balance(o):
+    return 1.83 * o[:, 0] + 1.43 * o[:, 1] - 12.4 * o[:, 2] - 1.84 * o[:, 3]
+
+
+def cascade(o):
+    x, w, phi, target = o.T
+    return 43.4 * (np.clip(-1.45 * (x - target) - 1.28 * w, -0.1, 0.1) - phi)
+
+
+def switching_line(o):
+    distance, v = o.T
+    return 14.6 * (v - 0.149 - 2.33 * distance)
+
+
+def hold(o):
+    theta, theta_dot, psi_dot, target = o.T
+    return 30.3 * (target - theta) - 3.77 * theta_dot + 0.355 * (16.35 * np.sin(target) - psi_dot)
+
+
+def energy_pump(o):
+    theta, theta_dot, psi_dot = o.T
+    energy = 0.5 * theta_dot**2 + 16.35 * (1.0 - np.cos(theta))
+    return 1.78 * (6.187 - energy) * theta_dot - 0.932 * psi_dot + 0.315 * theta
+
+
+def calm(o):
+    theta, theta_dot = o.T
+    return np.where(theta * theta_dot >= 0.0, 1.0, 14.6 * (np.abs(theta_dot) - 6.94 * np.abs(theta)))
+
+
+#: The feedback laws that the pages state.
+LAWS = {
+    "PivotedBarBalance-v0": balance,
+    "InclineTilt-v0": cascade,
+    "InclineBrake-v0": switching_line,
+    "CylinderInCylinderTilt-v0": hold,
+    "CylinderInCylinderPump-v0": energy_pump,
+    "CylinderInCylinderDamping-v0": calm,
+}
+
+
+def returns(env_id, policy, episodes=4096):
+    """Return mean and standard error of the first episodes of as many environments."""
+    envs = gym.make_vec(env_id, num_envs=episodes)
+    observations, _ = envs.reset(seed=1)
+    total, going = np.zeros(episodes), np.ones(episodes, dtype=bool)
+    while going.any():
+        observations, rewards, terminations, truncations, _ = envs.step(policy(observations)[:, None])
+        total += np.where(going, rewards, 0.0)
+        going &= ~(terminations | truncations)
+    return total.mean(), total.std() / math.sqrt(episodes)
+
+
+@each_id
+def test_stated_returns(env_id):
+    """Random actions, zero control, and the page's feedback law return what the page says."""
+    rng = np.random.default_rng(0)
+    zero = -1.0 if env_id in ("InclineBrake-v0", "CylinderInCylinderDamping-v0") else 0.0
+    policies = [lambda o: rng.uniform(-1.0, 1.0, len(o)), lambda o: np.full(len(o), zero)]
+    policies += [LAWS[env_id]] if env_id in LAWS else []
+    rows = {row["Id"]: row for row in table(page(make(env_id))["Optimal Value"])}
+    _, *cells = rows[env_id].values()
+    for cell, policy in zip(cells, policies, strict=True):
+        stated, error = cell.split(" ± ")
+        mean, standard_error = returns(env_id, policy)
+        assert agrees(stated, mean) or abs(float(stated) - mean) <= standard_error, (mean, cell)
+        assert agrees(error, standard_error), (standard_error, cell)
+
+
+# --- README and the other pages ---
+
+
+def readme():
+    return (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def environments():
+    """Return README's table of environments by id."""
+    rows = table(readme().partition("## Environments")[2].partition("Keywords of")[0])
+    return {re.match(r"\[([\w-]+)\]", row["id"])[1]: row for row in rows}
+
+
+def test_readme_names_every_id():
+    assert list(environments()) == IDS
+    gallery = readme().partition("## ")[0]
+    assert re.findall(r"docs/images/([\w-]+)\.png", gallery) == IDS
+
+
+@each_id
+def test_readme_row(env_id):
+    """README's table repeats what the page says, where it gives a number."""
+    env, row = make(env_id), environments()[env_id]
+    returns = {r["Id"]: r for r in table(page(env)["Optimal Value"])}[env_id]
+    random, *_, best = (value.split(" ± ")[0] for value in list(returns.values())[1:])
+    assert agrees(row["random"], float(random))
+    if row["optimum"].startswith("≥"):
+        assert agrees(row["optimum"].removeprefix("≥ "), float(best))
+    else:
+        assert row["optimum"] in plain(page(env)["Optimal Value"])
+    stated = re.search(r"is at most ([\d.]+) rad/s", plain(page(env)["Numerical Accuracy"]))
+    assert row["certified"] == (stated[1] if stated else "exact")
+    (control,) = table(page(env)["Action Space"])
+    assert control["At 1"] in row["control"] and control["Unit"] in row["control"]
+    assert len(row["observation"].split(", ")) == len(env.task.observation)
+
+
+@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md", "docs/physics.md", "docs/numerics.md"])
+def test_links(file):
+    path = ROOT / file
+    text = path.read_text(encoding="utf-8")
+    headings = {
+        re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-")
+        for h in re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    }
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        if target.startswith("#"):
+            assert target[1:] in headings, target
+        elif not target.startswith("http"):
+            assert (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md"])
+def test_make_targets(file):
+    """Every ``make target`` that is named exists."""
+    text = (ROOT / file).read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    named = set(re.findall(r"`make ([a-z][a-z-]*)", text)) | set(
+        re.findall(r"^make ([a-z-]+)", text, re.MULTILINE)
+    )
+    assert named and named <= targets
