@@ -28,6 +28,7 @@ from agents.evaluate import KNOWN_RETURNS, evaluate, evaluate_batch, score
 from lag_envs import TASKS, __version__
 from lag_envs.tasks import load_task
 
+DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
 #: Seed of the first episode that agents are compared on. Training never comes near it.
 FIRST_FRESH_SEED = 1_000_000_000
@@ -75,7 +76,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, help="seed of training (default 0)")
     p.add_argument("--steps", type=int, help="environment steps to train for, in all")
     p.add_argument(
-        "--output", type=Path, default=Path("runs/demo"), metavar="FOLDER", help="default %(default)s"
+        "--output", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
     )
     again = p.add_mutually_exclusive_group()
     again.add_argument("--resume", action="store_true", help="go on with the run in the output folder")
@@ -179,8 +180,11 @@ class Run:
 
     def command(self, *more: str) -> str:
         """Return a command that takes this run up again."""
-        output = [] if self.folder == Path("runs/demo") else ["--output", shlex.quote(str(self.folder))]
-        return " ".join(["python -m agents.demo", *more, *output])
+        python = Path(sys.executable)
+        if python.is_relative_to(Path.cwd()):
+            python = python.relative_to(Path.cwd())
+        output = [] if self.folder == DEFAULT_FOLDER else ["--output", str(self.folder)]
+        return shlex.join([str(python), "-m", "agents.demo", *more, *output])
 
 
 def open_run(args: argparse.Namespace) -> Run:
@@ -214,6 +218,10 @@ def open_run(args: argparse.Namespace) -> Run:
         return old
     if args.resume:
         raise UserError(f"there is no run in {args.output} to resume")
+    if args.output.exists() and any(args.output.iterdir()) and not args.new:
+        raise UserError(
+            f"{args.output} holds files but no run; choose another --output, or use it with --new"
+        )
     for name in ("model.zip", "learning_curve.png", "episode.mp4", "results.json", "run.json"):
         (args.output / name).unlink(missing_ok=True)
     shutil.rmtree(args.output / "tensorboard", ignore_errors=True)
@@ -315,6 +323,10 @@ def train(model: Any, run: Run, stop: Stop) -> None:
 
     class Watch(BaseCallback):
         """Show the progress, test and save now and then, and end the training when asked to."""
+
+        def _on_training_start(self) -> None:
+            if not run.curve:
+                self.keep()
 
         def _on_step(self) -> bool:
             bar.update(self.num_timesteps - bar.n)

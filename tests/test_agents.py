@@ -283,7 +283,7 @@ def test_demo_trains_other_environments_and_starts_anew(run, tmp_path):
         status, output = run(*new, "--env", "InclineBrake-v0", "--steps", "1", "--no-video", folder=tmp_path)
         assert status == 0, output
     assert not (tmp_path / "episode.mp4").exists()
-    assert len(json.loads((tmp_path / "run.json").read_text())["curve"]) == 1
+    assert len(json.loads((tmp_path / "run.json").read_text())["curve"]) == 2
     status, output = run("--resume", "--seed", "5", folder=tmp_path)
     assert status == 2 and "has seed 0" in output
 
@@ -309,6 +309,13 @@ def test_demo_with_a_damaged_run_file(content, run, tmp_path):
     (tmp_path / "run.json").write_text(content)
     status, output = run("--resume", folder=tmp_path)
     assert status == 2 and "run.json cannot be read" in output
+
+
+def test_demo_leaves_folders_of_others_alone(run, tmp_path):
+    (tmp_path / "model.zip").write_text("somebody's")
+    status, output = run(folder=tmp_path)
+    assert status == 2 and "holds files but no run" in output
+    assert (tmp_path / "model.zip").read_text() == "somebody's"
 
 
 def test_recipes_are_for_environments_that_exist():

@@ -32,7 +32,9 @@ SLOW = -3  #: status of a step that the fast formula does not cover
 
 def constants_of(task: Task) -> dict[str, float]:
     """Return every number that a task's compiled functions take, by name."""
-    start = {f"centre{i}": c for i, c in enumerate(task.centre)} | {f"half{i}": h for i, h in enumerate(task.start)}
+    start = {f"centre{i}": c for i, c in enumerate(task.centre)} | {
+        f"half{i}": h for i, h in enumerate(task.start)
+    }
     return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
 
 
@@ -97,7 +99,9 @@ class Program:
         def start(xp: Any, *values: Any) -> list:
             draws, rest = split(values, states + len(self.g))
             numbers = vars(k(rest))
-            state = [numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)]
+            state = [
+                numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)
+            ]
             return [*state, *(task.target_range * (2.0 * draw - 1.0) for draw in draws[states:])]
 
         clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
@@ -107,7 +111,11 @@ class Program:
         has_last = type(task).last_reward is not Task.last_reward
         self.last = _lines("l", last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
         draws, kicked = [f"draw{i}" for i in range(task.draws)], [f"e{i}" for i in range(width)]
-        self.kick = _draw(draws, "np.uint64(n)") + _lines("h", kick, [*draws, *self.z, *given], kicked) if draws else []
+        self.kick = (
+            _draw(draws, "np.uint64(n)") + _lines("h", kick, [*draws, *self.z, *given], kicked)
+            if draws
+            else []
+        )
         self.moved = kicked if draws else self.z
         self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
         self.observe = _lines("v", observe, [*g, *self.y, *given], self.o)
@@ -223,8 +231,9 @@ class Program:
                     *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
                     "n = n + 1.0",
                     "if n >= k_limit:", "    over = over + 2.0",
+                    *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *key, *self.kick, *self.move, *self.observe, *_store(_at, [*y, "n", "over", "r", *self.o]),
+                    *_store(_at, [*y, "n", "over", "r", *self.o]),
                 ]),
             ]),
         ]  # fmt: skip
@@ -272,7 +281,12 @@ class Program:
             ]),
             "return np.int64(refused), overs",
         ]  # fmt: skip
-        return _function("step_all", "f, ids, par, action, obs, reward, terminated, truncated, target_given, count", body, self.advance)
+        return _function(
+            "step_all",
+            "f, ids, par, action, obs, reward, terminated, truncated, target_given, count",
+            body,
+            self.advance,
+        )
 
     @cached_property
     def start_all(self) -> Callable:

@@ -28,7 +28,6 @@ from lag_envs.envs.single import (
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
-
 BOOL = np.dtype(np.bool_)
 
 

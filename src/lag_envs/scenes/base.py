@@ -49,10 +49,17 @@ class Motion(NamedTuple):
 
 
 def parameter(
-    default: float | None, unit: str, *, above: float | None = None, least: float | None = None, below: float | None = None
+    default: float | None,
+    unit: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
 ) -> Any:
     """Declare a physical parameter: default, unit, and the range that it must lie in."""
-    return dataclasses.field(default=default, metadata={"unit": unit, "above": above, "least": least, "below": below})
+    return dataclasses.field(
+        default=default, metadata={"unit": unit, "above": above, "least": least, "below": below}
+    )
 
 
 def check_number(name: str, value: Any, unit: str = "") -> float:
@@ -191,7 +198,9 @@ class Scene(ABC):
         """Return the state's entries followed by cosine and sine of its angle, if it has one."""
         array = np.asarray(state, dtype=np.float64)
         if array.shape[-1:] != (len(self.state_names),):
-            raise ValueError(f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}")
+            raise ValueError(
+                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+            )
         y = tuple(np.moveaxis(array, -1, 0))
         return y if self.angle is None else (*y, np.cos(y[self.angle]), np.sin(y[self.angle]))
 
@@ -202,9 +211,13 @@ class Scene(ABC):
         except (TypeError, ValueError) as error:
             raise ValueError(f"state must be {len(self.state_names)} numbers, got {state!r}") from error
         if array.shape != (len(self.state_names),):
-            raise ValueError(f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}")
+            raise ValueError(
+                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+            )
         if not np.isfinite(array).all():
-            raise ValueError(f"state must be finite, got {dict(zip(self.state_names, array.tolist(), strict=True))}")
+            raise ValueError(
+                f"state must be finite, got {dict(zip(self.state_names, array.tolist(), strict=True))}"
+            )
         return array
 
     def check_control(self, control: ArrayLike) -> Array:
@@ -215,7 +228,9 @@ class Scene(ABC):
             raise ValueError(f"the control must be a number, got {control!r}") from error
         bad = ~np.isfinite(array)
         if bad.any():
-            raise ValueError(f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}")
+            raise ValueError(
+                f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
+            )
         return array
 
     def simulate(self, state: ArrayLike, controls: ArrayLike, dt: float) -> Array:
@@ -250,11 +265,19 @@ class Scene(ABC):
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)
         x = pendulum.largest_x(dt, self.order)
-        row = self._simulate(trajectory, controls, dt, x, *(v for v in map(float, self.constants().values()) if v != 0.0))
+        row = self._simulate(
+            trajectory, controls, dt, x, *(v for v in map(float, self.constants().values()) if v != 0.0)
+        )
         if not row and not np.isfinite(trajectory[-1]).all():
             row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
         if row:
-            raise self.refusal(trajectory[row - 1], controls[row - 1], dt, trajectory[:row], f"step {row - 1} of {len(controls)}")
+            raise self.refusal(
+                trajectory[row - 1],
+                controls[row - 1],
+                dt,
+                trajectory[:row],
+                f"step {row - 1} of {len(controls)}",
+            )
         return trajectory
 
     @cached_property
@@ -270,7 +293,9 @@ class Scene(ABC):
         """Order of the Taylor series."""
         return pendulum.ORDER
 
-    def refusal(self, state: Array, control: float, dt: float, trajectory: Array | None, where: str) -> StepRefused:
+    def refusal(
+        self, state: Array, control: float, dt: float, trajectory: Array | None, where: str
+    ) -> StepRefused:
         """Return the error for a step that was refused."""
         start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
         error = StepRefused(
@@ -312,7 +337,9 @@ class Scene(ABC):
         u = np.asarray(control, dtype=np.float64)
         return {"drive": self.drive_power(m, u), "drag": 2.0 * self.dissipation(m.v, u)}
 
-    def energy_balance(self, state: ArrayLike, control: float, dt: float, *, nodes: int = 16) -> dict[str, float]:
+    def energy_balance(
+        self, state: ArrayLike, control: float, dt: float, *, nodes: int = 16
+    ) -> dict[str, float]:
         """Compare a step's change of energy with the work done on it [J].
 
         Work and loss are integrated by Gauss-Legendre quadrature on the exact flow within the step.
@@ -350,9 +377,15 @@ class Scene(ABC):
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
-        y, u, k = self.lift(self.check_state(state)), check_number("control", control), SimpleNamespace(**self.constants())
+        y, u, k = (
+            self.lift(self.check_state(state)),
+            check_number("control", control),
+            SimpleNamespace(**self.constants()),
+        )
         coefficients = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
-        return pendulum.truncation_bound(float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order)
+        return pendulum.truncation_bound(
+            float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order
+        )
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression in functions of time and symbols of the parameters."""
@@ -373,7 +406,9 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
         ("at most", 1.0 / SMALLEST, number > 1.0 / SMALLEST),
     ):
         if broken:
-            raise ValueError(f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " "))
+            raise ValueError(
+                f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
+            )
     return number
 
 

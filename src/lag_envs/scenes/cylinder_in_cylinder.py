@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, parameter, friction_ratio
+from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter
 from lag_envs.scenes.shapes import (
     Arrow,
     Circle,
@@ -93,7 +93,9 @@ class CylinderInCylinder(Scene):
         if self.control not in tuple(CONTROLS):
             raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
         if not self.radius < self.shell_radius:
-            raise ValueError(f"radius must be below shell_radius={self.shell_radius:g} m, got {self.radius:g} m")
+            raise ValueError(
+                f"radius must be below shell_radius={self.shell_radius:g} m, got {self.radius:g} m"
+            )
         if self.inertia is None:
             object.__setattr__(self, "inertia", 0.5 * self.mass * self.radius * self.radius)
 
@@ -194,7 +196,9 @@ class CylinderInCylinder(Scene):
     def reactions(self, m: Motion, u: Any) -> dict[str, Any]:
         """Return normal force (contact is lost below 0), friction, needed μ and the torque that turns the shell."""
         normal = self.mass * (self.arm * m.v.theta * m.v.theta + self.gravity * np.cos(m.q.theta))
-        friction = self.inertia * (self.shell_radius * m.a.psi - self.arm * m.a.theta) / (self.radius * self.radius)
+        friction = (
+            self.inertia * (self.shell_radius * m.a.psi - self.arm * m.a.theta) / (self.radius * self.radius)
+        )
         forces = {"normal": normal, "friction": friction, "needed_friction": friction_ratio(friction, normal)}
         if self.control == "tilt":
             forces["drive_torque"] = friction * self.shell_radius + self.damping * (m.v.psi - m.v.theta)
@@ -242,4 +246,3 @@ class CylinderInCylinder(Scene):
         """Return a window on the whole shell."""
         size = 1.28 * self.shell_radius
         return Window(-size, -size, size, size)
-

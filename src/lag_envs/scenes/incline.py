@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, parameter, friction_ratio
 from lag_envs.scenes import shapes
+from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter
 from lag_envs.scenes.shapes import Arrow, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow
@@ -81,7 +81,9 @@ class Incline(Scene):
         if self.control not in tuple(CONTROLS):
             raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
         if self.control != "damping" and self.tilt is not None:
-            raise ValueError(f"tilt={self.tilt:g} rad would be ignored: with control={self.control!r} the tilt is controlled")
+            raise ValueError(
+                f"tilt={self.tilt:g} rad would be ignored: with control={self.control!r} the tilt is controlled"
+            )
         if self.control == "damping" and self.tilt is None:
             object.__setattr__(self, "tilt", 0.26)
         if self.inertia is None:
@@ -171,13 +173,19 @@ class Incline(Scene):
         k = SimpleNamespace(**self.constants())
         coefficients = self.drive(y, u, k, np)
         x, v = self.unpack(y, u, k)[:2]
-        phi, rate = {"damping": (self.tilt, 0.0), "tilt": (u, 0.0), "tilt_rate": (y[-1] if self.angle is None else y[2], u)}[self.control]
+        phi, rate = {
+            "damping": (self.tilt, 0.0),
+            "tilt": (u, 0.0),
+            "tilt_rate": (y[-1] if self.angle is None else y[2], u),
+        }[self.control]
         if isinstance(coefficients, slope.Turn):
             acceleration = coefficients.rolling * (self.gravity * y[4] + x * u * u) - coefficients.drag * v
         else:
             acceleration = coefficients.pull - coefficients.drag * v
         return Motion(
-            SimpleNamespace(x=x, phi=phi), SimpleNamespace(x=v, phi=rate), SimpleNamespace(x=acceleration, phi=0.0)
+            SimpleNamespace(x=x, phi=phi),
+            SimpleNamespace(x=v, phi=rate),
+            SimpleNamespace(x=acceleration, phi=0.0),
         )
 
     def reactions(self, m: Motion, u: Any) -> dict[str, Any]:

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, check_number, parameter
 from lag_envs.scenes import shapes
+from lag_envs.scenes.base import Motion, Scene, check_number, parameter
 from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow, pendulum_flow
@@ -146,7 +146,11 @@ class PivotedBar(Scene):
         """Return T [J]."""
         arm = self.mass * self.com_distance
         about_pivot = arm * self.com_distance + self.inertia
-        return 0.5 * self.mass * v.s * v.s + arm * v.s * v.theta * xp.cos(q.theta) + 0.5 * about_pivot * v.theta * v.theta
+        return (
+            0.5 * self.mass * v.s * v.s
+            + arm * v.s * v.theta * xp.cos(q.theta)
+            + 0.5 * about_pivot * v.theta * v.theta
+        )
 
     def potential(self, q: Any, xp: Any) -> Any:
         """Return V [J]."""

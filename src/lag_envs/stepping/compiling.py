@@ -8,13 +8,13 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 from lag_envs.stepping.tracing import Trace
 
 
-@lru_cache(maxsize=None)
+@cache
 def compile_function(name: str, source: str, /, *helpers: Callable, **constants: float) -> Callable:
     """Compile the function ``name`` that ``source`` defines.
 
@@ -42,7 +42,12 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     """
     from lag_envs.stepping import primitives
 
-    parts = [inspect.getsource(primitives), source, repr(sorted(constants.items())), *(h.__name__ for h in helpers)]
+    parts = [
+        inspect.getsource(primitives),
+        source,
+        repr(sorted(constants.items())),
+        *(h.__name__ for h in helpers),
+    ]
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     unique = f"{name}_{digest}"
     # Under this file's name the cache finds a folder to write to and a date to check.

@@ -8,8 +8,8 @@ why a batch and a single environment agree bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import islice
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,7 +36,7 @@ class Flow(NamedTuple):
     compile: Callable
 
 
-@lru_cache(maxsize=None)
+@cache
 def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
     return Flow(
@@ -60,10 +60,14 @@ SLIDE = Flow(
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
 )
-TURN = Flow(4, slope.Turn, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn)
+TURN = Flow(
+    4, slope.Turn, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn
+)
 
 
-def section(prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> tuple[list[str], list]:
+def section(
+    prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]
+) -> tuple[list[str], list]:
     """Record ``formula(xp, *inputs)``.
 
     Parameters
@@ -88,7 +92,9 @@ def section(prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequ
     results = list(formula(trace, *(trace.inputs(i)[0] if isinstance(i, str) else i for i in inputs)))
     constant = [isinstance(r, float | bool) for r in results]
     named = {name: r for name, r, c in zip(outputs, results, constant, strict=True) if not c}
-    return trace.code(named), [r if c else name for name, r, c in zip(outputs, results, constant, strict=True)]
+    return trace.code(named), [
+        r if c else name for name, r, c in zip(outputs, results, constant, strict=True)
+    ]
 
 
 def split(values: Sequence, *sizes: int) -> list[list]:

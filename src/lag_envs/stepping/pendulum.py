@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -283,7 +283,7 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     return theta, omega, c, s, int(n + m)
 
 
-@lru_cache(maxsize=None)
+@cache
 def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
     """Compile `_flow` for a pendulum that has only some of the terms.
 

@@ -55,7 +55,9 @@ def fma(typingctx, a, b, c):  # type: ignore[no-untyped-def]
     """Return a * b + c, rounded once."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.fma(*(context.cast(builder, v, t, types.float64) for v, t in zip(args, signature.args, strict=True)))
+        return builder.fma(
+            *(context.cast(builder, v, t, types.float64) for v, t in zip(args, signature.args, strict=True))
+        )
 
     return types.float64(a, b, c), codegen
 
@@ -66,7 +68,10 @@ def select(typingctx, condition, a, b):  # type: ignore[no-untyped-def]
     kind = types.boolean if a == types.boolean else types.float64
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        c, x, y = (context.cast(builder, v, t, u) for v, t, u in zip(args, signature.args, (types.boolean, kind, kind), strict=True))
+        c, x, y = (
+            context.cast(builder, v, t, u)
+            for v, t, u in zip(args, signature.args, (types.boolean, kind, kind), strict=True)
+        )
         return builder.select(c, x, y)
 
     return kind(condition, a, b), codegen

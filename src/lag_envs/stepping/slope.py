@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -94,35 +94,43 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 
     Notes
     -----
-    Newton's method on the closed form, from a side on which it is monotone: where the cylinder speeds up, x(t) is
-    convex, so from the step's end; else x(t) is concave and lies below the line that it approaches, so from where
-    that line crosses.
+    Newton's method on the closed form, from below: from the time that it would take without drag, or on the line that
+    x(t) approaches if it slows down. A cylinder that speeds up is never far from the former. For one that slows down
+    Newton's method is monotone but may advance by no more than 1/drag at a time, so there it is also applied to the
+    logarithm of the boundary layer, e^-z = m(z), which is monotone too, and the later of both times is taken.
     """
-    drag, pull = force
-    faster = drag * v <= pull
-    line = 0.0  # without pull there is no such line
-    if not (isinstance(pull, float) and pull == 0.0):
-        line = xp.maximum(-(drag * drag * x + (drag * v - pull)) / (drag * pull), 0.0)
-    time = xp.where(faster, dt, line)
-    for _ in range(8):
+    pull, drag = force
+    excess = drag * v - pull
+    slower = excess > 0.0
+    free = -2.0 * x / (v + xp.sqrt(v * v - 2.0 * pull * x))
+    line = -(drag * drag * x + excess) / (drag * xp.maximum(pull, 1e-300))
+    time = xp.minimum(xp.where(slower, xp.maximum(free, line), free), dt)
+    for _ in range(7):
         z = drag * time
         small = z <= SMALL_DECAY
         phi1 = xp.where(small, 1.0 - z * polynomial(_PHI2, z), (1.0 - xp.exp(-z)) / z)
         phi2 = xp.where(small, polynomial(_PHI2, z), (1.0 - phi1) / z)
         place = x + time * (v * phi1 + pull * time * phi2)
         speed = v * (1.0 - z * phi1) + pull * time * phi1
-        time = clip(time - place / speed, 0.0, dt, xp)
+        layer = 1.0 + drag * (drag * x + pull * time) / excess
+        valid = slower & (z > SMALL_DECAY) & (layer > 0.0)
+        layer = xp.where(valid, layer, 1.0)
+        later = (z - (z + xp.log(layer)) / (1.0 + pull / (excess * layer))) / drag
+        later = xp.where(valid, later, 0.0)
+        time = clip(xp.maximum(time - place / speed, later), 0.0, dt, xp)
     return time
 
 
-@lru_cache(maxsize=None)
+@cache
 def compile_slide(present: tuple[bool, ...]) -> Callable:
     """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative where it is refused."""
 
     def force(*coefficients: Any) -> Pull:
         return Pull(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
 
-    fast = compile_traced("slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, force(p, d), dt))
+    fast = compile_traced(
+        "slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, force(p, d), dt)
+    )
     holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(force(p, d), dt),))
     return compile_python("flow", _slide_any, fast, holds)
 
@@ -216,7 +224,7 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
     return x, v, c * r, s * r, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
 
 
-@lru_cache(maxsize=None)
+@cache
 def compile_turn(present: tuple[bool, ...]) -> Callable:
     """Compile ``flow(x, v, c, s, rolling, gravity, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
 
@@ -225,7 +233,9 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
 
     arguments = "x, v, c, s, rolling, gravity, drag, rate, h"
     series, change = (
-        compile_traced(name, arguments, lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, turn(*rest[:4]), rest[4]))
+        compile_traced(
+            name, arguments, lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, turn(*rest[:4]), rest[4])
+        )
         for name, f in (("series", turn_series), ("change", turn_change))
     )
     pair = compile_traced("turn_pair", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))

@@ -33,6 +33,7 @@ _CODE = {
     "where": "select({}, {}, {})",
     "sqrt": "math.sqrt({})",
     "exp": "exp({})",
+    "log": "math.log({})",
     "sin": "math.sin({})",
     "cos": "math.cos({})",
     "abs": "abs({})",
@@ -52,6 +53,7 @@ _FLOAT = {
     "where": lambda c, a, b: a if c else b,
     "sqrt": math.sqrt,
     "exp": math.exp,
+    "log": math.log,
     "sin": math.sin,
     "cos": math.cos,
     "abs": abs,
@@ -225,6 +227,10 @@ class Trace:
         """Return the exponential."""
         return self.record("exp", a)
 
+    def log(self, a: Any) -> Any:
+        """Return the natural logarithm."""
+        return self.record("log", a)
+
     def sin(self, a: Any) -> Any:
         """Return the sine."""
         return self.record("sin", a)
@@ -318,7 +324,10 @@ def _print(node: Number, uses: dict[str, int], show: Callable[[Any], str]) -> st
     op, (a, b) = str(node.op), (*node.args, None)[:2]
     if op in ("+", "-"):
         sign = "" if op == "+" else "-"
-        for product, other, template in ((a, b, "fma({}, {}, " + sign + "{})"), (b, a, "fma(" + sign + "{}, {}, {})")):
+        for product, other, template in (
+            (a, b, "fma({}, {}, " + sign + "{})"),
+            (b, a, "fma(" + sign + "{}, {}, {})"),
+        ):
             if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
                 return template.format(*map(show, product.args), show(other))
     return _CODE[op].format(*map(show, node.args))
