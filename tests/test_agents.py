@@ -255,7 +255,7 @@ def test_demo_can_be_interrupted_resumed_and_evaluated(run, tmp_path):
     assert status == 2 and "unfinished" in output and "--resume" in output and "--new" in output
 
     goal = saved["trained"] + 1000
-    status, output = run("--resume", "--steps", str(goal), folder=folder)
+    status, output = run("--resume", "--steps", str(goal), "--no-video", folder=folder)
     assert status == 0, output
     assert "energy shaping + LQR" in output
     results = json.loads((folder / "results.json").read_text())
@@ -265,7 +265,7 @@ def test_demo_can_be_interrupted_resumed_and_evaluated(run, tmp_path):
     assert len(results["agents"]["PPO"]["returns"]) == len(set(results["evaluation_seeds"])) == 2
     assert results["versions"]["torch"]
     assert (folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
-    assert (folder / "episode.mp4").stat().st_size > 10_000
+    assert not (folder / "episode.mp4").exists()
     assert list((folder / "tensorboard").glob("*/events*"))
     curve = json.loads((folder / "run.json").read_text())["curve"]
     assert curve[: len(saved["curve"])] == saved["curve"] and curve[-1][0] == results["steps"]
@@ -279,10 +279,10 @@ def test_demo_can_be_interrupted_resumed_and_evaluated(run, tmp_path):
 
 
 def test_demo_trains_other_environments_and_starts_anew(run, tmp_path):
-    for new in ([], ["--new"]):
-        status, output = run(*new, "--env", "InclineBrake-v0", "--steps", "1", "--no-video", folder=tmp_path)
+    for more in ([], ["--new", "--no-video"]):
+        status, output = run(*more, "--env", "InclineBrake-v0", "--steps", "1", folder=tmp_path)
         assert status == 0, output
-    assert not (tmp_path / "episode.mp4").exists()
+        assert (tmp_path / "episode.mp4").exists() is (not more)
     assert len(json.loads((tmp_path / "run.json").read_text())["curve"]) == 2
     status, output = run("--resume", "--seed", "5", folder=tmp_path)
     assert status == 2 and "has seed 0" in output

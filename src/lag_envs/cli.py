@@ -79,7 +79,7 @@ def run_info(args: argparse.Namespace) -> int:
     task = _task(_known(args.id))
     scene = task.scene
     low, high = _controls(task)
-    text = [args.id, "", inspect.getdoc(type(task)) or ""]
+    text = [args.id, "", *_description(task)]
     text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
     states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
     text += [f"State: {', '.join(states)}"]
@@ -105,8 +105,16 @@ def run_info(args: argparse.Namespace) -> int:
         [*(_parameter(field, scene) for field in dataclasses.fields(scene)), *_own_parameters(task)]
     )
     text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
+    place = f"{type(task).__module__}.{type(task).__name__}"
+    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  python -m pydoc {place}"]
     print("\n".join(text))
     return 0
+
+
+def _description(task: Task) -> list[str]:
+    """Return the summary of the task's class and the section that describes it; the others are left out."""
+    summary, _, rest = (inspect.getdoc(type(task)) or "").partition("\n\n## Description\n\n")
+    return [summary, "", rest.partition("\n\n## ")[0]]
 
 
 def _parameter(field: dataclasses.Field, scene: Any) -> tuple[str, str, str]:

@@ -1,18 +1,19 @@
 """From a task to compiled functions: one program for the single and for the vector environment.
 
-A program records the formulas of a task and its scene as lines of code and prints them into a few functions. All
-keep one order within a step: control, held step, reward and ending, kick, observation.
+A program records the formulas of a task and its scene as lines of code and prints them into a few functions.
+All keep one order within a step: control, held step, reward and ending, kick, observation.
 
-Memory of one environment is a column of numbers, its rows. Kept from step to step: lifted state ``y``, target ``g`` where
-there is one, control ``u``, steps taken ``n`` (in a batch, where the episode is over, minus the kind of its end: 1
-terminated, 2 truncated, 3 both). Needed within a step: lifted state at its end ``z``, reward ``r``, kind of end ``over``,
-whether the step was an ``ordinary`` one (1; 0 special; 2 none but a restart), observation ``o``.
+Memory of one environment is a column of numbers, its rows. Kept from step to step: lifted state ``y``, target
+``g`` where there is one, control ``u``, steps taken ``n`` (in a batch, where the episode is over, minus the
+kind of its end: 1 terminated, 2 truncated, 3 both). Needed within a step: lifted state at its end ``z``,
+reward ``r``, kind of end ``over``, whether the step was an ``ordinary`` one (1; 0 special; 2 none but a
+restart), observation ``o``.
 
-A batch is cut into blocks of 64 environments. A block's kept rows are copied to one place of work, stepped, and copied
-back. There rows lie behind one another at distances known when compiling, so the compiler sees that they do not
-overlap and turns the loop over a block into vector instructions; with one array per row it gives up on proving that.
-Rows needed within a step exist only there and stay in the processor's nearest cache: with many environments,
-moving memory is half of the time.
+A batch is cut into blocks of 64 environments. A block's kept rows are copied to one place of work, stepped,
+and copied back. There rows lie behind one another at distances known when compiling, so the compiler sees
+that they do not overlap and turns the loop over a block into vector instructions; with one array per row it
+gives up on proving that. Rows needed within a step exist only there and stay in the processor's nearest
+cache: with many environments, moving memory is half of the time.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Program:
         scene, width = task.scene, task.scene.width
         self.n_state = states = len(scene.state_names)
         given = list(constants.values())
-        g = self.g or [0.0]
+        g: list[Any] = self.g or [0.0]
 
         def k(values: Sequence) -> SimpleNamespace:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
@@ -123,7 +124,7 @@ class Program:
         self.sample = _draw(draws, "np.uint64(0)") + _lines("s", start, [*draws, *given], names)
         self.lift = lift_lines(states, scene.angle, "y")
 
-    # --- one environment: rows, then constants, in one array --------------------------------------------------
+    # --- one environment: rows, then constants, in one array -----------------------------------------------
 
     @cached_property
     def step_one(self) -> Callable:
@@ -145,7 +146,7 @@ class Program:
 
     @cached_property
     def start_one(self) -> Callable:
-        """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling what is not given."""
+        """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling the rest."""
         rows = [*self.y[: self.n_state], *self.g]
         body = [
             *self._constants_one(), *_load(self._at_one, rows),
@@ -191,15 +192,15 @@ class Program:
             *self.lift, "u = 0.0", "n = 0.0",
         ]  # fmt: skip
 
-    # --- a batch: blocks of rows of 64 environments -----------------------------------------------------------
+    # --- a batch: blocks of rows of 64 environments --------------------------------------------------------
 
     @cached_property
     def step_all(self) -> Callable:
-        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, target_given, count)`` to (status, over).
+        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, target_given, count)``.
 
-        Steps every environment; one whose episode was over is restarted instead. The status is 0; or i + 1 where
-        environment i was refused and kept its state; or -(i + 1), before anything was stepped, where action i
-        is not finite. ``over`` counts the environments whose episode is over now.
+        Steps every environment; one whose episode was over is restarted instead. Returns (status, over). The
+        status is 0; or i + 1 where environment i was refused and kept its state; or -(i + 1), before anything
+        was stepped, where action i is not finite. ``over`` counts the environments whose episode is over now.
         """
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
@@ -275,7 +276,7 @@ class Program:
                 "if slow > 0:", *_indent(_block(lane, redo)),
                 "if restarts > 0:", *_indent(_block(lane, restart)),
                 *_block(lane, output),
-                # One loop per entry: a loop that writes to many arrays would have to check them all for overlap.
+                # One loop per entry: one that writes to many arrays would have to check them for overlap.
                 *(line for entry in _observations(self.o) for line in _block(lane, [entry])),
                 *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
             ]),
@@ -300,7 +301,9 @@ class Program:
             *_indent([
                 *_load(_at, [*varying, *self.y, *self.g, "u", "n"]),
                 "if mask[first + i]:",
-                *_indent([*_next_episode("first + i", "second + first + i", "last + first + i"), *self._start]),
+                *_indent([
+                    *_next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
+                ]),
                 *self.observe, *_store(_at, [*self.y, *self.g, "u", "n"]), *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip

@@ -335,7 +335,7 @@ def _open_window(width: int, height: int) -> pygame.Surface:
 _desk = _Desk()
 
 
-# --- geometry, in pixels ------------------------------------------------------------------------------------
+# --- geometry, in pixels ----------------------------------------------------------------------------------
 
 
 def _near(points: list[Point]) -> list[Point]:
@@ -392,7 +392,7 @@ def _dashes(points: list[Point], length: float) -> Iterator[list[Point]]:
         yield dash
 
 
-# --- the read-out -------------------------------------------------------------------------------------------
+# --- the read-out -----------------------------------------------------------------------------------------
 
 
 @cache
@@ -456,7 +456,7 @@ def _draw_scale(picture: pygame.Surface, scale: float) -> None:
     picture.blit(label, ((left + right - label.get_width()) // 2, y - 15))
 
 
-# --- pictures of all environments ---------------------------------------------------------------------------
+# --- pictures of all environments -------------------------------------------------------------------------
 
 
 def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -> list[Path]:

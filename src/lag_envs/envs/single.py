@@ -34,7 +34,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     **options
-        Parameters of the scene and of the task, such as ``mass``, ``damping``, ``dt``, ``duration``, ``target``.
+        Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...
 
     Notes
     -----
@@ -49,9 +49,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+    # Gymnasium's own attribute; an environment replaces it and never changes it.
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
-    def __init__(self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any) -> None:
+    def __init__(
+        self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any
+    ) -> None:
         check_render_mode(render_mode)
         self.task: Task = load_task(task)(**options)
         self.scene = self.task.scene
@@ -78,7 +81,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._step = self._program.step_one
         self._viewer: Any = None
 
-    # --- Gymnasium's interface --------------------------------------------------------------------------------
+    # --- Gymnasium's interface -----------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -90,7 +93,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         seed : int, optional
             Seeds starts, targets and kicks of this and of the following episodes.
         options : dict, optional
-            ``"state"``: the start, in the scene's order and units; ``"target"``: the target, where the task has one.
+            ``"state"``: the start, in the scene's order and units; ``"target"``, where the task has one.
 
         Returns
         -------
@@ -119,13 +122,17 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if given_target is not None:
             self._rows[self._row["g"]] = given_target
         observation = np.empty(self._size, dtype=np.float32)
-        self._program.start_one(self._rows, observation, self._ids, given_state is not None, given_target is not None)
+        self._program.start_one(
+            self._rows, observation, self._ids, given_state is not None, given_target is not None
+        )
         self._ready = True
         if self.render_mode == "human":
             self.render()
         return observation, self._info()
 
-    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], SupportsFloat, bool, bool, dict[str, Any]]:
         """Hold one control for one control interval.
 
         Parameters
@@ -155,7 +162,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             raise ValueError(f"the action must be finite, got {action!r}")
         if not self._ready:
             raise ResetNeeded(
-                "call reset() before step(): " + ("the episode has terminated" if self._started else "no episode has begun")
+                "call reset() before step(): "
+                + ("the episode has terminated" if self._started else "no episode has begun")
             )
         observation = np.empty(self._size, FLOAT32)
         reward, over = self._step(self._rows, observation, a, self._ids)
@@ -167,10 +175,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self.render()
         return observation, reward, over % 2 == 1, over >= 2, self._info() if self.diagnostics else {}
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the scene; returns an RGB picture of shape (height, width, 3) for the mode "rgb_array"."""
         if self.render_mode is None:
-            gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array" or "human"')
+            gym.logger.warn(
+                'no render mode is set; make the environment with render_mode="rgb_array" or "human"'
+            )
             return None
         if not self._started:
             raise ResetNeeded("call reset() before render(): no episode has begun")
@@ -186,7 +196,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._viewer.close()
             self._viewer = None
 
-    # --- what can be looked at --------------------------------------------------------------------------------
+    # --- what can be looked at -----------------------------------------------------------------------------
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -216,14 +226,16 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     _spec: EnvSpec | None = None
 
-    # --- the rest ---------------------------------------------------------------------------------------------
+    # --- the rest ------------------------------------------------------------------------------------------
 
     def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
         start = [rows[self._row[name]] for name in [*program.y, "u"]]
         constants = constants_of(self.task)
-        *end, status = program.advance(*start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants))
+        *end, status = program.advance(
+            *start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants)
+        )
         if status < 0:
             raise self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
         for name, value in zip(program.z, end, strict=True):
@@ -246,16 +258,16 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def absent(constants: list[dict[str, float]]) -> frozenset[str]:
-    """Return the names of the constants that are zero in all environments: what is not there costs nothing."""
+    """Return the names of the constants that are zero in all environments: these cost nothing."""
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
-def action_space() -> gym.spaces.Box:
+def action_space() -> gym.spaces.Box[np.float32]:
     """Return the space of actions, the same for every task."""
     return gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
 
 
-def observation_space(tasks: list[Task]) -> gym.spaces.Box:
+def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that holds the observations of all the tasks."""
     high = np.max([np.asarray(task.bounds()) for task in tasks], axis=0).astype(np.float32)
     return gym.spaces.Box(-high, high, dtype=np.float32)
@@ -287,4 +299,8 @@ def one_action(action: Any) -> float:
 
 def diagnostics(scene: Any, state: NDArray[np.float64], control: Any) -> dict[str, Any]:
     """Return what `info` reports when asked: forces and energies, and the control that was applied."""
-    return {"control": control, **scene.forces(state, control), "energy": scene.energy(state, control)["total"]}
+    return {
+        "control": control,
+        **scene.forces(state, control),
+        "energy": scene.energy(state, control)["total"],
+    }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,10 +31,12 @@ BOOL = np.dtype(np.bool_)
 
 
 class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], Any]):
-    """Many environments of one task, stepped together; made by ``gym.make_vec(id, num_envs=..., **parameters)``.
+    """Many environments of one task, stepped together.
 
-    Sub-environment i of a batch seeded s goes through the same numbers, bit for bit, as the single environment seeded
-    s + i.
+    Made by ``gym.make_vec(id, num_envs=..., **parameters)``.
+
+    Sub-environment i of a batch seeded s goes through the same numbers, bit for bit, as the single
+    environment seeded s + i.
 
     Parameters
     ----------
@@ -52,12 +53,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     **options
-        Parameters of the scene and of the task. A sequence of `num_envs` values gives each environment its own.
+        Parameters of the scene and of the task. `num_envs` values give each environment its own.
 
     Notes
     -----
-    ``reset(options=...)`` takes ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,) and ``"reset_mask"``, a boolean array
-    (num_envs,) of the environments to reset.
+    ``reset(options=...)`` takes ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,) and
+    ``"reset_mask"``, a boolean array (num_envs,) of the environments to reset.
 
     Examples
     --------
@@ -131,7 +132,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers: list[Any] = []
 
-    # --- Gymnasium's interface --------------------------------------------------------------------------------
+    # --- Gymnasium's interface -----------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -141,10 +142,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         Parameters
         ----------
         seed : int or sequence of int, optional
-            A seed s seeds environment i with s + i; a sequence seeds each with its own, None leaving one as it is.
+            A seed s seeds environment i with s + i; a sequence seeds each with its own, None leaves it alone.
         options : dict, optional
-            ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool. Rows
-            that the mask leaves out are ignored.
+            ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool.
+            Rows that the mask leaves out are ignored.
 
         Returns
         -------
@@ -169,7 +170,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             target = self._check_rows("target", target, (self.num_envs,))
             target = np.array([self._tasks[i].check_target(target[i]) for i in lanes])
         if not self._started and not mask.all():
-            raise ResetNeeded("the first reset must reset every environment, got a reset_mask that leaves some out")
+            raise ResetNeeded(
+                "the first reset must reset every environment, got a reset_mask that leaves some out"
+            )
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
         if not self._started:
             self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
@@ -191,7 +194,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def step(
         self, actions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[
+        NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
+    ]:
         """Hold one control for one control interval in every environment.
 
         Parameters
@@ -211,15 +216,18 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ResetNeeded
             Before the first reset; with autoreset disabled also while an episode is over.
         StepRefused
-            Where an environment's step cannot be taken to full accuracy. That environment keeps its state, the others
-            have been stepped.
+            Where an environment's step cannot be taken to full accuracy. That environment keeps its state,
+            the others have been stepped.
         """
         actions = self._check_actions(actions)
         if not self._started:
             raise ResetNeeded("call reset() before step(): no episode has begun")
         if self._over and self._mode == AutoresetMode.DISABLED:
             done = np.flatnonzero(self._read("n") < 0.0)
-            raise ResetNeeded(f"the episodes of environments {done.tolist()} are over: reset them with options['reset_mask']")
+            raise ResetNeeded(
+                f"the episodes of environments {done.tolist()} are over: "
+                "reset them with options['reset_mask']"
+            )
         n, program = self.num_envs, self._program
         # One row per entry is quicker to fill; the transpose is what the caller sees.
         observations = np.empty((len(program.o), n), dtype=FLOAT32)
@@ -237,7 +245,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             n,
         )
         if status < 0:
-            raise ValueError(f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}")
+            raise ValueError(
+                f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}"
+            )
         self._over = over
         if status > 0:
             self._refuse(status - 1)
@@ -247,7 +257,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             observations, infos = self._restart(observations, terminations | truncations, infos)
         return observations, rewards, terminations, truncations, infos
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each environment."""
         if self.render_mode is None:
             gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array"')
@@ -259,7 +269,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
             self._viewers = [Viewer(task, "rgb_array") for task in self._tasks]
         targets = self.target if self.target is not None else [None] * self.num_envs
-        return tuple(v.draw(s, u, g) for v, s, u, g in zip(self._viewers, self.state, self.control, targets, strict=True))
+        return tuple(
+            v.draw(s, u, g)
+            for v, s, u, g in zip(self._viewers, self.state, self.control, targets, strict=True)
+        )
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let go of the pictures."""
@@ -267,11 +280,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             viewer.close()
         self._viewers = []
 
-    # --- what can be looked at --------------------------------------------------------------------------------
+    # --- what can be looked at -----------------------------------------------------------------------------
 
     @property
     def state(self) -> NDArray[np.float64]:
-        """Copy of the states, shape (num_envs, n_state), in the order of ``scene.state_names``, in SI units."""
+        """Copy of the states, shape (num_envs, n_state), ordered as ``scene.state_names``, in SI units."""
         return np.stack([self._read(f"y{j}") for j in range(len(self.scene.state_names))], axis=1)
 
     @property
@@ -284,7 +297,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         """The controls applied last, shape (num_envs,), in SI units; 0 after a reset."""
         return self._read("u")
 
-    # --- the rest ---------------------------------------------------------------------------------------------
+    # --- the rest ------------------------------------------------------------------------------------------
 
     def _read(self, row: str) -> NDArray[np.float64]:
         return self._blocks[:, self._row[row]].reshape(-1)[: self.num_envs].copy()
@@ -299,7 +312,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return self._memory[: blocks * rows * BLOCK].reshape(blocks, rows, BLOCK)
 
     def _start(self, observations: NDArray[np.float32], mask: NDArray[np.bool_], *given: bool) -> None:
-        """Begin episodes where the mask is set; ``given``: whether to write all observations, states, targets."""
+        """Begin episodes where the mask is set.
+
+        ``given``: whether to write all observations, whether states are given, whether targets are.
+        """
         self._program.start_all(
             self._memory, self._ids, self._par, observations.T, mask, *given, self.num_envs
         )
@@ -331,7 +347,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _refuse(self, i: int) -> None:
         scene = self._tasks[i].scene
-        raise scene.refusal(self.state[i], float(self.control[i]), self.task.dt, None, f"the step of environment {i}")
+        raise scene.refusal(
+            self.state[i], float(self.control[i]), self.task.dt, None, f"the step of environment {i}"
+        )
 
     def _check_actions(self, actions: Any) -> NDArray[np.floating]:
         array = np.asarray(actions)
@@ -378,7 +396,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and pictures."""
-        return copy.copy({k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")})
+        return copy.copy(
+            {k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")}
+        )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
@@ -389,9 +409,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
     """Return the autoreset mode named by a string or the enum itself."""
     for known in AutoresetMode:
-        if mode == known or (isinstance(mode, str) and mode.replace("_", "").lower() == known.value.replace("_", "").lower()):
+        if mode == known or (
+            isinstance(mode, str) and mode.replace("_", "").lower() == known.value.replace("_", "").lower()
+        ):
             return known
-    raise ValueError(f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {mode!r}")
+    raise ValueError(
+        f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {mode!r}"
+    )
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
@@ -406,8 +430,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
         return [kind(**options)] * n
     tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
-        raise ValueError(f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}")
+        raise ValueError(
+            f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}"
+        )
     return tasks
-
-
-del math

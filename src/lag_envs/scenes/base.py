@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not vanish or overflow.
+#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not
+#: vanish or overflow.
 SMALLEST = 1e-60
 
 
@@ -80,13 +81,14 @@ def check_number(name: str, value: Any, unit: str = "") -> float:
 class Scene(ABC):
     """A mechanical scene: parameters, energies, equation of motion, forces. Immutable.
 
-    A subclass is a frozen dataclass whose fields are declared with `parameter`. It defines the energies, which are
-    the source of truth, and the equation of motion in its flow's normal form, which tests derive from them.
-    Formulas use only ``+ - * /`` and functions of the namespace `xp`, so that floats, arrays, SymPy symbols and
-    recording numbers can pass through them. Rewards, Gymnasium and windows have no place here.
+    A subclass is a frozen dataclass whose fields are declared with `parameter`. It defines the energies,
+    which are the source of truth, and the equation of motion in its flow's normal form, which tests derive
+    from them. Formulas use only ``+ - * /`` and functions of the namespace `xp`, so that floats, arrays,
+    SymPy symbols and recording numbers can pass through them. Rewards, Gymnasium and windows have no place
+    here.
     """
 
-    # --- what a scene defines -------------------------------------------------------------------------------
+    # --- what a scene defines ------------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -106,7 +108,7 @@ class Scene(ABC):
     @property
     @abstractmethod
     def coordinates(self) -> tuple[str, ...]:
-        """Coordinates of the Lagrangian: the free one first, then the one that is moved from outside, if any."""
+        """Coordinates of the Lagrangian: the free one, then the one that is moved from outside, if any."""
 
     @property
     @abstractmethod
@@ -176,7 +178,7 @@ class Scene(ABC):
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""
 
-    # --- what follows ---------------------------------------------------------------------------------------
+    # --- what follows --------------------------------------------------------------------------------------
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -299,8 +301,9 @@ class Scene(ABC):
         """Return the error for a step that was refused."""
         start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
         error = StepRefused(
-            f"{where} was refused: from ({start}) with control {control:g} and dt={dt:g} s it would need more than "
-            f"{pendulum.MAX_SUBSTEPS:,} substeps, or has no finite result; take a smaller dt or milder parameters"
+            f"{where} was refused: from ({start}) with control {control:g} and dt={dt:g} s it would need "
+            f"more than {pendulum.MAX_SUBSTEPS:,} substeps, or has no finite result; "
+            "take a smaller dt or milder parameters"
         )
         error.trajectory = None if trajectory is None else trajectory.copy()
         return error
@@ -332,7 +335,7 @@ class Scene(ABC):
         return self.reactions(self.motion(state, control), np.asarray(control, dtype=np.float64))
 
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
-        """Return the power fed in by the drive and the power lost to drag [W]; energy changes by their difference."""
+        """Return the power of the drive and that lost to drag [W]; energy changes by their difference."""
         m = self.motion(state, control)
         u = np.asarray(control, dtype=np.float64)
         return {"drive": self.drive_power(m, u), "drag": 2.0 * self.dissipation(m.v, u)}
@@ -358,7 +361,8 @@ class Scene(ABC):
         Returns
         -------
         dict
-            ``change`` of energy, ``work`` of the drive, ``loss`` to drag, and ``residual`` = change - work + loss.
+            ``change`` of energy, ``work`` of the drive, ``loss`` to drag, and ``residual`` = change - work +
+            loss.
         """
         dt = check_step(dt)
         points, weights = np.polynomial.legendre.leggauss(nodes)
@@ -371,9 +375,10 @@ class Scene(ABC):
         return {"change": change, "work": work, "loss": loss, "residual": change - work + loss}
 
     def truncation_bound(self, state: ArrayLike, control: float, dt: float) -> pendulum.Bound | None:
-        """Return what is known of a step before it is taken: substeps and proved bounds on what they leave out.
+        """Return what is known of a step before it is taken: substeps, and bounds on what they leave out.
 
-        None for a scene that is stepped in closed form; see `pendulum.truncation_bound`.
+        The bounds are proved. None for a scene that is stepped in closed form; see
+        `pendulum.truncation_bound`.
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
@@ -388,7 +393,7 @@ class Scene(ABC):
         )
 
     def lagrangian(self) -> sympy.Expr:
-        """Return the Lagrangian T - V as a SymPy expression in functions of time and symbols of the parameters."""
+        """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
         from lag_envs.lagrange import lagrangian
 
         return lagrangian(self)

@@ -1,9 +1,11 @@
-"""A cylinder that rolls without slipping inside a hollow cylinder, the shell::
+r"""A cylinder that rolls without slipping inside a hollow cylinder, the shell.
+
+::
 
         . - - - .        theta   place of the small cylinder's axis, 0 at the bottom,
-      /     |     \\              positive counter-clockwise
+      /     |     \              positive counter-clockwise
      |      |_a    |     psi     angle of the shell, positive counter-clockwise
-      \\      \\    /      a = R - r, from axis to axis
+      \      \    /      a = R - r, from axis to axis
         ' - -(o)'
 
 With K = I/(m r²) and k = 1/(1 + K), the rolling cylinder turns at Omega = (R psi' - a theta')/r::
@@ -66,12 +68,13 @@ class CylinderInCylinder(Scene):
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt"}
-        What the control is: a drag coefficient [N m s] in a fixed shell, or the shell's acceleration ψ'' [rad/s²].
+        What the control is: a drag coefficient [N m s] in a fixed shell, or the shell's acceleration ψ''
+        [rad/s²].
 
     Notes
     -----
-    State (theta, theta_dot); for the control "tilt" (theta, theta_dot, psi_dot). The zero of the potential energy
-    lies at the height of the shell's axis.
+    State (theta, theta_dot); for the control "tilt" (theta, theta_dot, psi_dot). The zero of the potential
+    energy lies at the height of the shell's axis.
 
     Examples
     --------
@@ -194,7 +197,7 @@ class CylinderInCylinder(Scene):
         )
 
     def reactions(self, m: Motion, u: Any) -> dict[str, Any]:
-        """Return normal force (contact is lost below 0), friction, needed μ and the torque that turns the shell."""
+        """Return normal force (contact is lost below 0), friction, needed μ and the torque on the shell."""
         normal = self.mass * (self.arm * m.v.theta * m.v.theta + self.gravity * np.cos(m.q.theta))
         friction = (
             self.inertia * (self.shell_radius * m.a.psi - self.arm * m.a.theta) / (self.radius * self.radius)

@@ -1,8 +1,10 @@
-"""A cylinder that rolls without slipping on an incline::
+r"""A cylinder that rolls without slipping on an incline.
 
-      \\   x ->  down the slope is positive, and so is the angular velocity of rolling down
-       \\ O
-        \\_____)  phi   tilt; the plane turns about the point x = 0 of its surface
+::
+
+      \   x ->  down the slope is positive, and so is the angular velocity of rolling down
+       \ O
+        \_____)  phi   tilt; the plane turns about the point x = 0 of its surface
 
 With K = I/(m R²) and k = 1/(1 + K), centre at x along and R above the surface::
 
@@ -11,8 +13,8 @@ With K = I/(m R²) and k = 1/(1 + K), centre at x along and R above the surface:
 Fixed tilt:    x'' = k g sin(phi) - (c k/m) x'
 Turning tilt:  (1 + K)(x'' + R phi'') = g sin(phi) + x phi'² - (c/m) x'
 
-While the rate phi' is held, w = x' + R phi' obeys an equation without phi'', and stays continuous when the rate
-is switched, whereas x' jumps by -R times the switch. So w is the state.
+While the rate phi' is held, w = x' + R phi' obeys an equation without phi'', and stays continuous when the
+rate is switched, whereas x' jumps by -R times the switch. So w is the state.
 """
 
 from __future__ import annotations
@@ -54,13 +56,13 @@ class Incline(Scene):
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt", "tilt_rate"}
-        What the control is: a drag coefficient [N s/m] on the fixed tilt; the tilt φ [rad], quasi-static (each step is one of
-        a fixed plane); or the rate φ' [rad/s] of a moving plane, held over the step.
+        What the control is: a drag coefficient [N s/m] on the fixed tilt; the tilt φ [rad], quasi-static
+        (each step is one of a fixed plane); or the rate φ' [rad/s] of a moving plane, held over the step.
 
     Notes
     -----
-    State (x, x_dot); for the control "tilt_rate" (x, w, phi) with w = x' + Rφ'. The zero of the potential energy
-    lies at the height of the point x = 0 of the surface.
+    State (x, x_dot); for the control "tilt_rate" (x, w, phi) with w = x' + Rφ'. The zero of the potential
+    energy lies at the height of the point x = 0 of the surface.
 
     Examples
     --------
@@ -82,7 +84,8 @@ class Incline(Scene):
             raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
         if self.control != "damping" and self.tilt is not None:
             raise ValueError(
-                f"tilt={self.tilt:g} rad would be ignored: with control={self.control!r} the tilt is controlled"
+                f"tilt={self.tilt:g} rad would be ignored: "
+                f"with control={self.control!r} the tilt is controlled"
             )
         if self.control == "damping" and self.tilt is None:
             object.__setattr__(self, "tilt", 0.26)
@@ -189,7 +192,10 @@ class Incline(Scene):
         )
 
     def reactions(self, m: Motion, u: Any) -> dict[str, Any]:
-        """Return normal force, friction (down the slope positive on the cylinder's turning, up on its place), needed μ."""
+        """Return normal force, friction, needed μ.
+
+        Friction is positive where it speeds up the turning down the slope and slows the way down.
+        """
         rolling = m.a.x + self.radius * m.a.phi
         turn = m.v.phi * m.v.phi
         normal = self.mass * (

@@ -1,9 +1,11 @@
-"""A bar on a pivot whose support moves::
+r"""A bar on a pivot whose support moves.
+
+::
 
               s ->
         ------A------   support, moved with acceleration u = s''
-               \\
-                \\  L    theta = 0 hangs straight down,
+               \
+                \  L    theta = 0 hangs straight down,
                  G      positive counter-clockwise; y points up
 
 Lagrangian (A at (s, 0), centre of mass G at distance L from it, I about G)::
@@ -55,8 +57,8 @@ class PivotedBar(Scene):
 
     Notes
     -----
-    State (s, s_dot, theta, theta_dot), without track (theta, theta_dot). Control s'' [m/s²].
-    The zero of the potential energy lies at the pivot. Without track the energy is that in the support's frame.
+    State (s, s_dot, theta, theta_dot), without track (theta, theta_dot). Control s'' [m/s²]. The zero of the
+    potential energy lies at the pivot. Without track the energy is that in the support's frame.
 
     Examples
     --------
@@ -183,7 +185,7 @@ class PivotedBar(Scene):
         }
 
     def drive_power(self, m: Motion, u: Any) -> Any:
-        """Return the power of the support's force [W]; without track that of the inertial force in its frame."""
+        """Return the power of the support's force [W]; without track that of its frame's inertial force."""
         if self.track is None:
             return -self.mass * self.com_distance * u * m.v.theta * np.cos(m.q.theta)
         return self.reactions(m, u)["support_horizontal"] * m.v.s

@@ -23,7 +23,8 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     name : str
         The function's name in the source.
     source : str
-        Python source of one function; it may use `fma`, `select`, `math`, NumPy, the helpers and the constants.
+        Python source of one function; it may use `fma`, `select`, `math`, NumPy, the helpers and the
+        constants.
     *helpers : callable
         What this function returned for the functions that the source calls, known there by their names.
     **constants : float

@@ -25,12 +25,13 @@ if TYPE_CHECKING:
 class Flow(NamedTuple):
     """An exact flow: what it moves, and two ways to run it.
 
-    ``fast(variables, coefficients, dt)`` is the formula of an ordinary step, ``within(variables, coefficients,
-    dt, x, xp)`` tells whether this step is one, and ``compile(present)`` makes the scalar function for any step.
+    ``fast(variables, coefficients, dt)`` is the formula of an ordinary step,
+    ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
+    makes the scalar function for any step.
     """
 
     size: int
-    coefficients: type
+    coefficients: type[pendulum.Drive | slope.Pull | slope.Turn]
     fast: Callable
     within: Callable
     compile: Callable
@@ -39,10 +40,15 @@ class Flow(NamedTuple):
 @cache
 def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
+
+    def fast(variables: Sequence, drive: pendulum.Drive, dt: Any) -> tuple:
+        theta, omega, c, s = variables
+        return pendulum.step(theta, omega, c, s, drive, dt, order)
+
     return Flow(
         4,
         pendulum.Drive,
-        lambda variables, drive, dt: pendulum.step(*variables, drive, dt, order),
+        fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda present: pendulum.compile_flow(present, order),
     )
@@ -56,7 +62,7 @@ def _turn(variables: Sequence, turn: slope.Turn, dt: Any) -> tuple:
 SLIDE = Flow(
     2,
     slope.Pull,
-    lambda variables, pull, dt: slope.slide(*variables, pull, dt),
+    lambda variables, pull, dt: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
 )
@@ -117,8 +123,8 @@ def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
 class Stepper:
     """One scene's control step as lines of code.
 
-    The lines take the lifted state ``y0, y1, ...``, the control ``u``, the step ``dt``, the bound's ``x`` and the
-    scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's end.
+    The lines take the lifted state ``y0, y1, ...``, the control ``u``, the step ``dt``, the bound's ``x`` and
+    the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's end.
 
     Parameters
     ----------

@@ -180,7 +180,8 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
     """Return x/h such that the bound holds anywhere in the interval, for small h."""
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
-    # What the field adds to the speed is limited by its acceleration and by the energy 2 field from top to bottom.
+    # What the field adds to the speed is limited by its acceleration and, from top to bottom, by its energy,
+    # 2 field.
     speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + push * dt
     if gamma * speed > field + push:
         speed = max(abs(omega), (field + push) / gamma)
@@ -265,7 +266,7 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         return theta, omega, c, s, -1
     h = layer / n
-    # What rounding takes from the two sums is handed on (Kahan): equal terms would be rounded all to the same side.
+    # What rounding takes from the two sums is handed on (Kahan): equal terms would all round to one side.
     lost_angle = lost_speed = 0.0
     for i in range(int(n)):
         angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)

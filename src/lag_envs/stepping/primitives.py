@@ -1,9 +1,9 @@
 """What compiled code is made of beside Python's arithmetic: a few instructions, and the random generator.
 
-The generator is counter-based: a draw is a pure function of (key, episode, step, index). So it can be made inside a
-compiled loop, costs a few integer operations, and does not depend on how many environments are stepped together.
-The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence whose origin is itself such a mix of
-key and episode.
+The generator is counter-based: a draw is a pure function of (key, episode, step, index). So it can be made
+inside a compiled loop, costs a few integer operations, and does not depend on how many environments are
+stepped together. The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence whose origin is
+itself such a mix of key and episode.
 
 References
 ----------

@@ -7,10 +7,10 @@ Fixed slope
 
     A sum of terms without cancellation for any drag >= 0; without drag it is the quadratic.
 Turning slope
-    ``x'' = k g sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series has
-    the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large, short steps are
-    taken one after the other; where that is for the drag, the matrix of a short step is squared until it spans
-    the whole one ("scaling and squaring").
+    ``x'' = k g sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series
+    has the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large, short
+    steps are taken one after the other; where that is for the drag, the matrix of a short step is squared
+    until it spans the whole one ("scaling and squaring").
 
 References
 ----------
@@ -79,7 +79,7 @@ def _slide_any(x, v, pull, drag, dt, _):  # type: ignore[no-untyped-def]
 
 
 def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
-    """Return the time at which a cylinder that rolls down from x < 0 passes 0, given that it does so within dt.
+    """Return the time at which a cylinder rolling down from x < 0 passes 0, if it does so within dt.
 
     Parameters
     ----------
@@ -94,10 +94,11 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 
     Notes
     -----
-    Newton's method on the closed form, from below: from the time that it would take without drag, or on the line that
-    x(t) approaches if it slows down. A cylinder that speeds up is never far from the former. For one that slows down
-    Newton's method is monotone but may advance by no more than 1/drag at a time, so there it is also applied to the
-    logarithm of the boundary layer, e^-z = m(z), which is monotone too, and the later of both times is taken.
+    Newton's method on the closed form, from below: from the time that it would take without drag, or on the
+    line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the former. For
+    one that slows down Newton's method is monotone but may advance by no more than 1/drag at a time, so there
+    it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone too, and the
+    later of both times is taken.
     """
     pull, drag = force
     excess = drag * v - pull
@@ -123,7 +124,7 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 
 @cache
 def compile_slide(present: tuple[bool, ...]) -> Callable:
-    """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative where it is refused."""
+    """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative if refused."""
 
     def force(*coefficients: Any) -> Pull:
         return Pull(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
@@ -179,7 +180,7 @@ def _growth(rolling: Any, drag: Any, rate: Any, h: Any, xp: Any) -> Any:
 
 
 def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[no-untyped-def]
-    """Advance by dt for any coefficients; return x, x', the angle's cos and sin, and 1 or, refused, -1 or -2."""
+    """Advance by dt for any coefficients; return x, x', cosφ, sinφ, and 1, or -1 or -2 if refused."""
     growth = dt * (2.0 * drag + 3.0 * abs(rate))
     n = np.ceil(max(1.0, growth / SMALL_TURN))
     if n == 1.0 or (drag <= abs(rate) and n <= 1e5):
@@ -196,9 +197,9 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
         doublings += 1
         if doublings > 60:
             return x, v, c, s, -1
-    # Rows (x, x'), columns (x, x', cos, sin): what a short step adds, from its effect on unit vectors. The unit
-    # matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose a
-    # bit with each squaring.
+    # Rows (x, x'), columns (x, x', cos, sin): what a short step adds, from its effect on unit vectors. The
+    # unit matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose
+    # a bit with each squaring.
     m = np.empty((2, 4))
     m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
     m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, rolling, gravity, drag, rate, h)

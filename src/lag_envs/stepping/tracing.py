@@ -39,7 +39,7 @@ _CODE = {
     "abs": "abs({})",
     "floor": "np.floor({})",
 }
-_FLOAT = {
+_FLOAT: dict[str, Callable] = {
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
     "*": lambda a, b: a * b,
@@ -247,7 +247,8 @@ class Trace:
 def balanced_sum(products: Iterable[tuple[Any, Any]]) -> Any:
     """Sum products, given in the order in which their factors become known.
 
-    All but the last two run in two chains side by side, which a processor can finish while it waits for the rest.
+    All but the last two run in two chains side by side, which a processor can finish while it waits for the
+    rest.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Tasks on the scenes: start, control, reward, ending, observation.
 
-``TASKS`` maps the id of every environment to where its task stands and to parameters that the id fixes. To add
-an environment, write its task and add a line here.
+``TASKS`` maps the id of every environment to where its task stands and to parameters that the id fixes. To
+add an environment, write its task and add a line here.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ FASTEST_START = 100.0
 class Task(ABC):
     """A task on a scene.
 
-    A subclass says what its class attributes and abstract methods ask for. Formulas follow the same
-    rules as a scene's: numbers in, ``+ - * /`` and `xp`, numbers out. ``y`` is the lifted state before the step, ``z`` the
-    one after it, ``u`` the control that was applied, ``g`` the target, ``k`` the constants by name.
+    A subclass says what its class attributes and abstract methods ask for. Formulas follow the same rules as
+    a scene's: numbers in, ``+ - * /`` and `xp`, numbers out. ``y`` is the lifted state before the step, ``z``
+    the one after it, ``u`` the control that was applied, ``g`` the target, ``k`` the constants by name.
 
     Parameters
     ----------
@@ -53,22 +53,32 @@ class Task(ABC):
     draws: ClassVar[int] = 0
 
     def __init__(
-        self, *, dt: float | None = None, duration: float | None = None, target: float | None = None, **parameters: Any
+        self,
+        *,
+        dt: float | None = None,
+        duration: float | None = None,
+        target: float | None = None,
+        **parameters: Any,
     ) -> None:
         known = {f.name for f in dataclasses.fields(self.scene_type)}
         unknown = sorted(set(parameters) - known)
         if unknown:
-            options = [*sorted(known), "dt", "duration", *(["target"] if self.target_range is not None else [])]
+            options = [
+                *sorted(known),
+                "dt",
+                "duration",
+                *(["target"] if self.target_range is not None else []),
+            ]
             raise TypeError(f"unknown keyword {unknown[0]!r}; this environment takes {', '.join(options)}")
-        self.scene = self.scene_type(**(self.defaults | parameters))
+        self.scene: Scene = self.scene_type(**(self.defaults | parameters))
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
         seconds = self.interval * self.steps if duration is None else duration
         if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds >= self.dt:
             raise ValueError(f"duration must be at least dt={self.dt:g} s, got {seconds!r}")
-        self.duration = float(seconds)
-        self.target = None if target is None else self.check_target(target)
+        self.duration: float = float(seconds)
+        self.target: float | None = None if target is None else self.check_target(target)
         self.check()
 
     def check(self) -> None:
@@ -85,7 +95,7 @@ class Task(ABC):
         return self.duration if math.isinf(self.duration) else float(round(self.duration / self.dt))
 
     def constants(self) -> dict[str, float]:
-        """Return what the compiled step needs: the scene's constants, the task's, and those of the stepping."""
+        """Return what the compiled step needs: constants of scene, task and stepping."""
         own = {name: float(value) for name, value in self.numbers().items()}
         stepping = {"scale": self.dt / self.interval, "limit": self.limit}
         return self.scene.constants() | own | stepping
@@ -102,18 +112,20 @@ class Task(ABC):
         return check_number("target", target)
 
     def check_start(self, state: ArrayLike) -> NDArray[np.float64]:
-        """Return a start given by hand as float64 array, or raise a ValueError where the task cannot start there."""
+        """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
         array = self.scene.check_state(state)
         for name, unit, value in zip(self.scene.state_names, self.scene.state_units, array, strict=True):
             if unit.endswith("/s") and abs(value) > FASTEST_START:
-                raise ValueError(f"{name} must lie within ±{FASTEST_START:g} {unit} at the start, got {value:g} {unit}")
+                raise ValueError(
+                    f"{name} must lie within ±{FASTEST_START:g} {unit} at the start, got {value:g} {unit}"
+                )
         self.check_safe(array)
         return array
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Raise ValueError for a start outside the set in which the episode goes on."""
 
-    # --- the picture ----------------------------------------------------------------------------------------
+    # --- the picture ---------------------------------------------------------------------------------------
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Return what is to be seen, from back to front: the scene, and what matters to the task."""
@@ -129,7 +141,7 @@ class Task(ABC):
             return []
         return [Reading(self.scene.state_names[0] + "*", now.target, self.scene.state_units[0], "target")]
 
-    # --- what a task defines --------------------------------------------------------------------------------
+    # --- what a task defines -------------------------------------------------------------------------------
 
     @property
     @abstractmethod
@@ -176,7 +188,7 @@ class Task(ABC):
 
     @abstractmethod
     def bounds(self) -> Sequence[float]:
-        """Return for each entry of the observation a bound on its size, proved for every start that is accepted."""
+        """Return a bound on the size of each observation entry, proved for every start that is accepted."""
 
 
 def finite(bound: float) -> float:
@@ -185,5 +197,5 @@ def finite(bound: float) -> float:
 
 
 def kick_chance(task: Task, chance: float) -> float:
-    """Return the chance of a kick in one step such that a second has as many as at the task's own interval."""
+    """Return a step's chance of a kick such that a second has as many as at the task's own interval."""
     return -math.expm1(task.dt / task.interval * math.log1p(-chance))

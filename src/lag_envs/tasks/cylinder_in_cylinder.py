@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
 
+    scene: CylinderInCylinder
     scene_type = CylinderInCylinder
     interval, steps = 0.05, 200
     limit_control: float
@@ -52,7 +53,10 @@ class _Shell(Task):
         k = self.scene.constants()
         pull = k["weight"] + k["push"] * self.limit_control + k["drag"] * self.fastest_shell
         swing = FASTEST_START + pull * self.duration
-        return [finite(b) for b in (self.largest_angle + swing * self.dt, swing, self.fastest_shell * (1.0 + 1e-6))]
+        return [
+            finite(b)
+            for b in (self.largest_angle + swing * self.dt, swing, self.fastest_shell * (1.0 + 1e-6))
+        ]
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add how far the cylinder may go."""
@@ -65,7 +69,8 @@ class _Shell(Task):
         """Refuse a start at which the episode would be over, or with the shell too fast."""
         if abs(state[0]) > self.largest_angle:
             raise ValueError(
-                f"the episode would be over at theta={state[0]:g} rad: |theta| must be at most {self.largest_angle} rad"
+                f"the episode would be over at theta={state[0]:g} rad: "
+                f"|theta| must be at most {self.largest_angle} rad"
             )
         if abs(state[2]) > self.fastest_shell:
             raise ValueError(f"psi_dot must lie within ±{self.fastest_shell} rad/s, got {state[2]:g} rad/s")
@@ -177,7 +182,7 @@ class Tilt(_Shell):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
+    defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
     observation = ("theta", "theta_dot", "psi_dot", "target")
     target_range = 0.3
     limit_control, fastest_shell, largest_angle = 15.0, 6.0, 1.05
@@ -309,7 +314,13 @@ class Pump(_Shell):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.024, "control": "tilt"}
+    defaults: ClassVar = {
+        "mass": 1.0,
+        "shell_radius": 0.5,
+        "radius": 0.1,
+        "damping": 0.024,
+        "control": "tilt",
+    }
     observation = ("theta", "theta_dot", "psi_dot")
     limit_control, fastest_shell, largest_angle = 4.0, 3.0, 1.3
     amplitude = 0.9
@@ -318,7 +329,9 @@ class Pump(_Shell):
         """Ask for a field: without one no energy belongs to the amplitude."""
         super().check()
         if self.scene.gravity == 0.0:
-            raise ValueError("gravity must be above 0 m/s²: the energy to pump to is that of an amplitude of 0.9 rad")
+            raise ValueError(
+                "gravity must be above 0 m/s²: the energy to pump to is that of an amplitude of 0.9 rad"
+            )
 
     def numbers(self) -> dict[str, float]:
         """Return the limits and E* of the amplitude 0.9 rad, per inertia [1/s²]."""
@@ -450,8 +463,9 @@ class Damping(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
+    scene: CylinderInCylinder
     scene_type = CylinderInCylinder
-    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
+    defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
@@ -461,7 +475,9 @@ class Damping(Task):
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
         if self.scene.gravity == 0.0:
-            raise ValueError("gravity must be above 0 m/s²: without it nothing holds the cylinder in the shell")
+            raise ValueError(
+                "gravity must be above 0 m/s²: without it nothing holds the cylinder in the shell"
+            )
 
     @property
     def start(self) -> Sequence[float]:
@@ -514,6 +530,8 @@ class Damping(Task):
         theta, theta_dot = state
         normal = self.scene.forces(state)["normal"]
         if normal < 0.0:
-            raise ValueError(f"there is no contact at theta={theta:g} rad, theta_dot={theta_dot:g} rad/s: N={normal:g} N")
+            raise ValueError(
+                f"there is no contact at theta={theta:g} rad, theta_dot={theta_dot:g} rad/s: N={normal:g} N"
+            )
         if abs(theta) > 1e3:
             raise ValueError(f"theta must lie within ±1000 rad at the start, got {theta:g} rad")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,8 +119,9 @@ class Tilt(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
+    scene: Incline
     scene_type = Incline
-    defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
+    defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
     interval, steps = 0.05, 200
     target_range = 0.3
     edge = 0.5
@@ -177,7 +178,7 @@ class Tilt(Task):
         return [*z[: len(self.scene.state_names)], g]
 
     def bounds(self) -> Sequence[float]:
-        """Return bounds: within the edges |w'| <= k (g sin(tilt) + |x| rate²) + drag R rate, and drag only slows."""
+        """Return bounds: inside, |w'| <= k (g sin(tilt) + |x| rate²) + drag R rate, and drag only slows."""
         k = self.scene.constants()
         rate = 0.0 if self.quasi_static else self.limit_control
         radius = self.scene.radius
@@ -186,7 +187,10 @@ class Tilt(Task):
         push = gravity * math.sin(self.largest_tilt) + reach * rate * rate + k["drag"] * radius * rate
         speed = FASTEST_START + radius * rate + push * self.duration
         state = [self.edge + speed * self.dt, speed]
-        return [finite(b) for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), self.edge)]
+        return [
+            finite(b)
+            for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), self.edge)
+        ]
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Return a plank that ends at the edges, with the target and the largest tilt."""
@@ -211,7 +215,9 @@ class Tilt(Task):
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start off the plane or beyond the largest tilt."""
         if abs(state[0]) > self.edge:
-            raise ValueError(f"the episode would be over at x={state[0]:g} m: |x| must be at most {self.edge} m")
+            raise ValueError(
+                f"the episode would be over at x={state[0]:g} m: |x| must be at most {self.edge} m"
+            )
         if not self.quasi_static and abs(state[2]) > self.largest_tilt:
             raise ValueError(f"phi must lie within ±{self.largest_tilt} rad, got {state[2]:g} rad")
 
@@ -313,8 +319,9 @@ class Brake(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
+    scene: Incline
     scene_type = Incline
-    defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
+    defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
     observation = ("distance", "v")
     limit_control = 6.0
     gentle = 0.5
@@ -324,7 +331,9 @@ class Brake(Task):
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
         if self.scene.tilt < 0.0:
-            raise ValueError(f"tilt must be at least 0 rad for the cylinder to roll down, got {self.scene.tilt:g} rad")
+            raise ValueError(
+                f"tilt must be at least 0 rad for the cylinder to roll down, got {self.scene.tilt:g} rad"
+            )
 
     @property
     def centre(self) -> Sequence[float]:
@@ -351,6 +360,7 @@ class Brake(Task):
     def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
         """Return minus the time to the line, and -5 (v - v_s)₊ with the speed v there."""
         force = self.scene.drive(y, u, k, xp)
+        assert isinstance(force, slope.Pull)
         time = slope.crossing_time(y[0], y[1], force, dt, xp)
         # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
         speed = y[1] + force.pull * time + force.drag * y[0]

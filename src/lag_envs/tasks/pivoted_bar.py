@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 
 
 def _speed_bound(task: Task, limit: float) -> float:
-    """Return a bound on |theta'| over an episode: start + (|field| + |drive|) times its length; damping only helps."""
+    """Return a bound on |theta'| in an episode: start + (|field| + |drive|) · length; damping only helps."""
     k = task.scene.constants()
     return FASTEST_START + (k["weight"] + k["pull"] * limit) * task.duration
 
@@ -132,8 +132,9 @@ class SwingUp(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
+    scene: PivotedBar
     scene_type = PivotedBar
-    defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
+    defaults: ClassVar = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
     limit_control = 5.0
 
     @property
@@ -158,13 +159,13 @@ class SwingUp(Task):
 
     def numbers(self) -> dict[str, float]:
         """Return the limit U of the control and the track's half length S."""
-        track = {"track": self.scene.track if math.isfinite(self.scene.track) else 0.5} if self.has_track else {}
-        return {"limit_control": self.limit_control, **track}
+        limit, track = {"limit_control": self.limit_control}, self.scene.track
+        return limit if track is None else {**limit, "track": track if math.isfinite(track) else 0.5}
 
     def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
         """Return the acceleration nearest to U·a from which the support can still stop inside the track."""
         wanted = k.limit_control * a
-        if not self.has_track or math.isinf(self.scene.track):
+        if self.scene.track is None or math.isinf(self.scene.track):
             return wanted
         # With v the speed at the step's end, and braking from there at U, the support stops at
         # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, it passes S or -S where v² + |reach| > 2US.
@@ -174,7 +175,7 @@ class SwingUp(Task):
         v = s_dot + dt * wanted
         reach = start + per_step * v
         side = xp.where(reach < 0.0, -1.0, 1.0)
-        # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed that is not too much.
+        # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed allowed.
         half = 0.5 * per_step
         highest = xp.sqrt(xp.maximum(half * half + ends - side * start, 0.0)) - half
         hardest = clip((highest - side * s_dot) * (1.0 / dt), -top, top, xp)
@@ -193,10 +194,10 @@ class SwingUp(Task):
 
     def bounds(self) -> Sequence[float]:
         """Return bounds on the observation."""
-        u, support = self.limit_control, []
-        if self.has_track:
+        u, track = self.limit_control, self.scene.track
+        support: list[float] = []
+        if track is not None:
             fastest = FASTEST_START + u * self.duration
-            track = self.scene.track
             if math.isfinite(track):
                 support = [1.0 + 1e-6, 0.5 * (math.sqrt(2.0 * u * track) * (1.0 + 1e-6))]
             else:
@@ -210,7 +211,7 @@ class SwingUp(Task):
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start from which the support cannot stop inside the track."""
-        if self.has_track:
+        if self.scene.track is not None:
             s, s_dot = state[:2]
             if math.isinf(self.scene.track):
                 if abs(s) > 1e3:
@@ -218,7 +219,8 @@ class SwingUp(Task):
             elif abs(s) + s_dot * s_dot / (2.0 * self.limit_control) > self.scene.track:
                 raise ValueError(
                     f"from s={s:g} m with s_dot={s_dot:g} m/s the support cannot stop inside the track: "
-                    f"|s| + s_dot²/(2U) must be at most {self.scene.track:g} m with U={self.limit_control:g} m/s²"
+                    f"|s| + s_dot²/(2U) must be at most {self.scene.track:g} m "
+                    f"with U={self.limit_control:g} m/s²"
                 )
 
 
@@ -327,7 +329,7 @@ class Balance(SwingUp):
 
     limit_control = 3.0
     draws = 2
-    observation = ("s", "s_dot", "e", "theta_dot")  # type: ignore[assignment]
+    observation = ("s", "s_dot", "e", "theta_dot")
     largest_angle = 0.35
 
     def check(self) -> None:
@@ -336,9 +338,15 @@ class Balance(SwingUp):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 
     @property
+    def track(self) -> float:
+        """The support's travel to either side [m]; `check` has asked for one."""
+        assert self.scene.track is not None
+        return self.scene.track
+
+    @property
     def start(self) -> Sequence[float]:
         """Nearly upright."""
-        return [0.4 * self.scene.track, 0.2, 0.15, 0.3]
+        return [0.4 * self.track, 0.2, 0.15, 0.3]
 
     @property
     def centre(self) -> Sequence[float]:
@@ -347,7 +355,11 @@ class Balance(SwingUp):
 
     def numbers(self) -> dict[str, float]:
         """Return limits, track and the chance of a kick."""
-        return {"limit_control": self.limit_control, "track": self.scene.track, "chance": kick_chance(self, 0.01)}
+        return {
+            "limit_control": self.limit_control,
+            "track": self.track,
+            "chance": kick_chance(self, 0.01),
+        }
 
     def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
         """Return U·a; running off the track ends the episode, so nothing guards it."""
@@ -379,7 +391,7 @@ class Balance(SwingUp):
         slide = FASTEST_START + u * self.duration
         swing = _speed_bound(self, u) + kicks
         return [
-            finite(self.scene.track + slide * self.dt),
+            finite(self.track + slide * self.dt),
             finite(slide),
             finite(self.largest_angle + swing * self.dt),
             finite(swing),
@@ -394,14 +406,14 @@ class Balance(SwingUp):
 
     def window(self, now: Moment) -> Window:
         """Look at the upper half."""
-        reach, side = self.scene.reach, self.scene.track + 0.5 * self.scene.reach
+        reach, side = self.scene.reach, self.track + 0.5 * self.scene.reach
         return Window(-side, -0.3 * reach, side, 1.15 * reach)
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Refuse a start at which the episode would be over."""
         s, _, theta, _ = state
-        if abs(theta - math.pi) > self.largest_angle or abs(s) > self.scene.track:
+        if abs(theta - math.pi) > self.largest_angle or abs(s) > self.track:
             raise ValueError(
                 f"the episode would be over at s={s:g} m, theta={theta:g} rad: |theta - pi| must be at most "
-                f"{self.largest_angle} rad and |s| at most {self.scene.track:g} m"
+                f"{self.largest_angle} rad and |s| at most {self.track:g} m"
             )
