@@ -7,11 +7,32 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 from lag_envs.stepping.tracing import Trace
+
+
+_BLOCK = "block_[0-9a-f]{16}"
+_blocks: dict[str, tuple] = {}
+
+
+def record_block(trace: Trace, outputs: dict[str, Any]) -> str:
+    """Return the line of code that computes a trace's outputs, as one call of a straight-line function.
+
+    Numba need not infer the types of what happens inside, which is what most of compiling would take.
+    """
+    operations = tuple(trace.operations(outputs.values()))
+    made = {operation.name for operation in operations}
+    values = {name: getattr(value, "name", value) for name, value in outputs.items()}
+    used = [arg for operation in operations for arg in operation.args] + list(values.values())
+    inputs = tuple(dict.fromkeys(arg for arg in used if isinstance(arg, str) and arg not in made))
+    parts = (operations, inputs, tuple(values.values()))
+    name = f"block_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
+    _blocks[name] = parts
+    return f"{', '.join(values)}, = {name}({', '.join(inputs)})"
 
 
 @cache
@@ -23,8 +44,8 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     name : str
         The function's name in the source.
     source : str
-        Python source of one function; it may use `fma`, `select`, `math`, NumPy, the helpers and the
-        constants.
+        Python source of one function; it may use recorded blocks, `primitives.NAMES`, the helpers
+        and the constants.
     *helpers : callable
         What this function returned for the functions that the source calls, known there by their names.
     **constants : float
@@ -55,6 +76,7 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), __file__, "exec")
     namespace: dict[str, Any] = dict(primitives.NAMES, **constants, __name__=__name__)
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
+    namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)
     return primitives.jit(namespace[unique])
 
@@ -80,5 +102,5 @@ def compile_traced(name: str, arguments: str, formula: Callable) -> Callable:
     trace = Trace()
     outputs = formula(trace, *trace.inputs(*arguments.split(", ")))
     names = [f"out{i}" for i in range(len(outputs))]
-    lines = [f"def {name}({arguments}):", *trace.code(dict(zip(names, outputs, strict=True)))]
-    return compile_function(name, "\n    ".join([*lines, f"return {', '.join(names)}"]) + "\n")
+    line = record_block(trace, dict(zip(names, outputs, strict=True)))
+    return compile_function(name, f"def {name}({arguments}):\n    {line}\n    return {', '.join(names)}\n")

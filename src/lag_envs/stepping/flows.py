@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.tracing import Trace
 
 if TYPE_CHECKING:
@@ -98,9 +98,8 @@ def section(
     results = list(formula(trace, *(trace.inputs(i)[0] if isinstance(i, str) else i for i in inputs)))
     constant = [isinstance(r, float | bool) for r in results]
     named = {name: r for name, r, c in zip(outputs, results, constant, strict=True) if not c}
-    return trace.code(named), [
-        r if c else name for name, r, c in zip(outputs, results, constant, strict=True)
-    ]
+    values = [r if c else name for name, r, c in zip(outputs, results, constant, strict=True)]
+    return [record_block(trace, named)] if named else [], values
 
 
 def split(values: Sequence, *sizes: int) -> list[list]:

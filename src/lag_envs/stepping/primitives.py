@@ -14,13 +14,16 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
+
+from lag_envs.stepping.tracing import BOOLEAN, Operation
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -55,11 +58,9 @@ def fma(typingctx, a, b, c):  # type: ignore[no-untyped-def]
     """Return a * b + c, rounded once."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.fma(
-            *(context.cast(builder, v, t, types.float64) for v, t in zip(args, signature.args, strict=True))
-        )
+        return builder.fma(*args)
 
-    return types.float64(a, b, c), codegen
+    return types.float64(types.float64, types.float64, types.float64), codegen
 
 
 @intrinsic
@@ -93,38 +94,84 @@ def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     return types.void(), codegen
 
 
-@intrinsic
-def _power_of_two(typingctx, n):  # type: ignore[no-untyped-def]
-    """Return 2**n for a whole number n in [-1022, 1023], by writing the exponent's bits."""
+def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Sequence[Any]) -> Callable:
+    """Return a function that carries out recorded operations, written straight in LLVM's language.
+
+    Parameters
+    ----------
+    operations : sequence of Operation
+        What to do.
+    inputs : sequence of str
+        The arguments, all float64.
+    outputs : sequence of str or float
+        Which results to return, as a tuple.
+    """
+    boolean = {operation.name for operation in operations if operation.op in BOOLEAN}
+    result = types.Tuple([types.boolean if value in boolean else types.float64 for value in outputs])
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        exponent = builder.add(builder.fptosi(args[0], ir.IntType(64)), ir.Constant(ir.IntType(64), 1023))
-        return builder.bitcast(builder.shl(exponent, ir.Constant(ir.IntType(64), 52)), ir.DoubleType())
+        known = dict(zip(inputs, args, strict=True))
 
-    return types.float64(types.float64), codegen
+        def value(of: Any) -> ir.Value:
+            if isinstance(of, str):
+                return known[of]
+            return ir.Constant(ir.IntType(1), int(of)) if isinstance(of, bool) else ir.Constant(_DOUBLE, of)
+
+        for name, op, arguments in operations:
+            known[name] = _emit(builder, op, [value(a) for a in arguments])
+        return context.make_tuple(builder, signature.return_type, [value(o) for o in outputs])
+
+    # Numba wants the arguments by name.
+    scope = {"answer": lambda: (result(*[types.float64] * len(inputs)), codegen)}
+    exec(f"def block(typingctx, {', '.join(inputs)}): return answer()", scope)
+    return intrinsic(scope["block"])
 
 
-@njit(cache=True, forceinline=True)
-def exp(x):  # type: ignore[no-untyped-def]
-    """Return e**x to 1 ulp, clipped to |x| <= 700; arithmetic only, so that loops with it become vectors."""
-    x = select(x < -700.0, -700.0, select(x > 700.0, 700.0, x))
-    n = np.floor(fma(x, 1.4426950408889634, 0.5))
-    r = fma(-n, 1.9082149292705877e-10, fma(-n, 0.693147180369123816490, x))
-    p = 1.0 / 6227020800.0
-    p = fma(p, r, 1.0 / 479001600.0)
-    p = fma(p, r, 1.0 / 39916800.0)
-    p = fma(p, r, 1.0 / 3628800.0)
-    p = fma(p, r, 1.0 / 362880.0)
-    p = fma(p, r, 1.0 / 40320.0)
-    p = fma(p, r, 1.0 / 5040.0)
-    p = fma(p, r, 1.0 / 720.0)
-    p = fma(p, r, 1.0 / 120.0)
-    p = fma(p, r, 1.0 / 24.0)
-    p = fma(p, r, 1.0 / 6.0)
-    p = fma(p, r, 1.0 / 2.0)
-    p = fma(p, r, 1.0 / 1.0)
-    p = fma(p, r, 1.0 / 1.0)
-    return p * _power_of_two(n)
+_DOUBLE = ir.DoubleType()
+_INT = ir.IntType(64)
+
+
+def _emit(b: ir.IRBuilder, op: str, args: list[ir.Value]) -> ir.Value:
+    """Write one operation."""
+    if op in ("sqrt", "sin", "cos", "log", "floor", "abs"):
+        name = "llvm.fabs" if op == "abs" else f"llvm.{op}"
+        return b.call(b.module.declare_intrinsic(name, [_DOUBLE]), args)
+    if op in ("<", "<="):
+        return b.fcmp_ordered(op, *args)
+    return {
+        "+": b.fadd,
+        "-": b.fsub,
+        "*": b.fmul,
+        "/": b.fdiv,
+        "neg": b.fneg,
+        "a*b+c": b.fma,
+        "a*b-c": lambda x, y, z: b.fma(x, y, b.fneg(z)),
+        "c-a*b": lambda x, y, z: b.fma(b.fneg(x), y, z),
+        "where": b.select,
+        "&": b.and_,
+        "|": b.or_,
+        "~": b.not_,
+        "exp": lambda x: _exp(b, x),
+    }[op](*args)
+
+
+def _exp(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    """Write e**x to 1 ulp, clipped to |x| <= 700: arithmetic only, so that a loop with it becomes vectors."""
+
+    def number(value: float) -> ir.Constant:
+        return ir.Constant(_DOUBLE, value)
+
+    for limit, beyond in ((-700.0, "<"), (700.0, ">")):
+        x = b.select(b.fcmp_ordered(beyond, x, number(limit)), number(limit), x)
+    # x = n log 2 + r with |r| <= log(2)/2; log 2 in two parts.
+    n = _emit(b, "floor", [b.fma(x, number(1.4426950408889634), number(0.5))])
+    r = b.fma(b.fneg(n), number(0.6931471803691238), x)
+    r = b.fma(b.fneg(n), number(1.9082149292705877e-10), r)
+    p = number(1.0 / math.factorial(13))
+    for k in range(12, -1, -1):
+        p = b.fma(p, r, number(1.0 / math.factorial(k)))
+    exponent = b.shl(b.add(b.fptosi(n, _INT), ir.Constant(_INT, 1023)), ir.Constant(_INT, 52))
+    return b.fmul(p, b.bitcast(exponent, _DOUBLE))
 
 
 def jit(function: Callable) -> Callable:
@@ -142,7 +189,6 @@ NAMES = {
     "math": math,
     "fma": fma,
     "select": select,
-    "exp": exp,
     "wide_vectors": wide_vectors,
     "uniform": uniform,
     "episode_key": episode_key,

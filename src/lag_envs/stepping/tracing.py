@@ -17,20 +17,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 _CODE = {
-    "+": "({} + {})",
-    "-": "({} - {})",
-    "*": "({} * {})",
-    "/": "({} / {})",
-    "neg": "(-{})",
-    "<": "({} < {})",
-    "<=": "({} <= {})",
-    "&": "({} & {})",
-    "|": "({} | {})",
-    "~": "(not {})",
-    "where": "select({}, {}, {})",
+    "a*b+c": "{} * {} + {}",
+    "a*b-c": "{} * {} - {}",
+    "c-a*b": "{2} - {0} * {1}",
+    "+": "{} + {}",
+    "-": "{} - {}",
+    "*": "{} * {}",
+    "/": "{} / {}",
+    "neg": "-{}",
+    "<": "{} < {}",
+    "<=": "{} <= {}",
+    "&": "{} & {}",
+    "|": "{} | {}",
+    "~": "not {}",
+    "where": "{1} if {0} else {2}",
     "sqrt": "math.sqrt({})",
     "exp": "exp({})",
     "log": "math.log({})",
@@ -60,7 +63,17 @@ _FLOAT: dict[str, Callable] = {
     "floor": math.floor,
 }
 
-_LONGEST = 160  # characters of an expression that is still moved into another
+#: What a sum becomes when its first or its second term is a product that nobody else uses.
+FUSED = {"+": ("a*b+c", "a*b+c"), "-": ("a*b-c", "c-a*b")}
+BOOLEAN = frozenset({"<", "<=", "&", "|", "~"})
+
+
+class Operation(NamedTuple):
+    """One step of straight-line code; arguments are names of earlier results, or constants."""
+
+    name: str
+    op: str
+    args: tuple[str | float | bool, ...]
 
 
 class Number:
@@ -143,7 +156,7 @@ class Trace:
     >>> trace = Trace()
     >>> a, b = trace.inputs("a", "b")
     >>> trace.code({"out": a * b + 0.0 * a + b})
-    ['out = fma(a, b, b)']
+    ['t1 = a * b + b', 'out = t1']
     """
 
     def __init__(self, prefix: str = "t") -> None:
@@ -170,36 +183,36 @@ class Trace:
             self._known[key] = node
         return self._known[key]
 
-    def code(self, outputs: dict[str, Any]) -> list[str]:
-        """Return the lines that compute the outputs, unused operations left out."""
+    def operations(self, outputs: Iterable[Any]) -> list[Operation]:
+        """Return what computes the outputs, in order: unused operations left out, products fused into sums."""
         uses: dict[str, int] = {}
-
-        def visit(value: Any) -> None:
-            stack = [value]
-            while stack:
-                v = stack.pop()
-                if isinstance(v, Number):
-                    uses[v.name] = uses.get(v.name, 0) + 1
-                    if uses[v.name] == 1:
-                        stack.extend(v.args)
-
-        for value in outputs.values():
-            visit(value)
-        text: dict[str, str] = {}
-
-        def show(value: Any) -> str:
-            return text.get(value.name, value.name) if isinstance(value, Number) else _literal(value)
-
-        lines = []
+        stack = list(outputs)
+        while stack:
+            value = stack.pop()
+            if isinstance(value, Number):
+                uses[value.name] = uses.get(value.name, 0) + 1
+                if uses[value.name] == 1:
+                    stack.extend(value.args)
+        fused: dict[str, Operation] = {}
+        swallowed: set[str] = set()
         for node in self._nodes:
-            if node.name in uses:
-                code = _print(node, uses, show)
-                # What is used once moves to where it is used: fewer names are quicker to compile.
-                if uses[node.name] == 1 and len(code) < _LONGEST:
-                    text[node.name] = code
-                else:
-                    lines.append(f"{node.name} = {_bare(code)}")
-        return lines + [f"{name} = {_bare(show(value))}" for name, value in outputs.items()]
+            if node.name in uses and node.op in FUSED:
+                first, second = node.args
+                for op, product, other in zip(FUSED[node.op], (first, second), (second, first), strict=True):
+                    if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
+                        fused[node.name] = Operation(node.name, op, (*map(_name, product.args), _name(other)))
+                        swallowed.add(product.name)
+                        break
+        return [
+            fused.get(node.name) or Operation(node.name, str(node.op), tuple(map(_name, node.args)))
+            for node in self._nodes
+            if node.name in uses and node.name not in swallowed
+        ]
+
+    def code(self, outputs: dict[str, Any]) -> list[str]:
+        """Return lines of Python that compute the outputs, for people to read."""
+        lines = [f"{name} = {_CODE[op].format(*args)}" for name, op, args in self.operations(outputs.values())]
+        return lines + [f"{name} = {_name(value)}" for name, value in outputs.items()]
 
     # The functions that a formula may call, named as in NumPy.
 
@@ -320,26 +333,6 @@ def _simplify(op: str, args: tuple) -> Any:
     return None
 
 
-def _print(node: Number, uses: dict[str, int], show: Callable[[Any], str]) -> str:
-    """Return an operation as code; a sum swallows a product that nobody else uses."""
-    op, (a, b) = str(node.op), (*node.args, None)[:2]
-    if op in ("+", "-"):
-        sign = "" if op == "+" else "-"
-        for product, other, template in (
-            (a, b, "fma({}, {}, " + sign + "{})"),
-            (b, a, "fma(" + sign + "{}, {}, {})"),
-        ):
-            if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
-                return template.format(*map(show, product.args), show(other))
-    return _CODE[op].format(*map(show, node.args))
-
-
-def _bare(code: str) -> str:
-    """Return code without the parentheses around all of it."""
-    return code[1:-1] if code.startswith("(") else code
-
-
-def _literal(value: float | bool) -> str:
-    if isinstance(value, float) and not math.isfinite(value):
-        return {"inf": "math.inf", "-inf": "-math.inf"}.get(str(value), "math.nan")
-    return f"({value!r})" if value < 0 else repr(value)
+def _name(value: Any) -> str | float | bool:
+    """Return a number's name, or the constant."""
+    return value.name if isinstance(value, Number) else value
