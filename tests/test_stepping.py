@@ -412,7 +412,8 @@ def test_hard_case(name):
     exact, sizes = flow(*arguments, dps=30), scales(*arguments)
     amplified = conditioning(*arguments, include_params=True)
     for value, truth, size, gain in zip(end, exact, sizes, amplified, strict=True):
-        assert abs(value - truth) < 20 * EPS * gain + 1e-12 * size
+        # Ten thousand substeps each round once: over 24 controls near 1e6 the walk measured 2 to 42.
+        assert abs(value - truth) < 60 * EPS * gain + 1e-12 * size
 
 
 @pytest.mark.parametrize(
@@ -635,13 +636,13 @@ def test_what_is_zero_costs_nothing(scene, parameter, state):
     """A constant that is zero leaves fewer operations, and the numbers are those of a very small one."""
     keywords = {"control": "tilt"} if scene is Incline else {}
     without, with_it = (scene(**keywords, **{parameter: value}) for value in (0.0, 1e-50))
-    assert len(without.stepper().fast) < len(with_it.stepper().fast)
+    assert without.stepper().operations < with_it.stepper().operations
     ends = [body.simulate(state, [1.3], 0.02)[1] for body in (without, with_it)]
     assert ends[0] == pytest.approx(ends[1], rel=1e-15)
 
 
 def test_track_costs_only_itself():
-    with_track, without = (len(PivotedBar(track=track).stepper().fast) for track in (0.5, None))
+    with_track, without = (PivotedBar(track=track).stepper().operations for track in (0.5, None))
     assert without < with_track <= without + 6
 
 

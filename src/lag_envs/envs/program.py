@@ -9,15 +9,15 @@ kind of its end: 1 terminated, 2 truncated, 3 both). Needed within a step: lifte
 reward ``r``, kind of end ``over``, whether the step was an ``ordinary`` one (1; 0 special; 2 none but a
 restart), observation ``o``.
 
-A batch is cut into blocks of 64 environments. A block's kept rows are copied to one place of work, stepped,
-and copied back. There rows lie behind one another at distances known when compiling, so the compiler sees
-that they do not overlap and turns the loop over a block into vector instructions; with one array per row it
-gives up on proving that. Rows needed within a step exist only there and stay in the processor's nearest
-cache: with many environments, moving memory is half of the time.
+A batch is cut into blocks of 64 environments. The rows of a block lie behind one another at distances known
+when compiling, so the compiler sees that they do not overlap and turns the loop over a block into vector
+instructions; with one array per row it gives up on proving that. Rows needed within a step exist once for all
+blocks and so stay in the processor's nearest cache.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from types import SimpleNamespace
@@ -263,13 +263,9 @@ class Program:
             "        if not (abs(action[i]) < math.inf):",
             "            return -(i + 1), 0",
             "overs, refused = 0, np.uint64(0)",
-            f"blocks = np.uint64((count + {BLOCK - 1}) // {BLOCK})",
-            f"width = np.uint64({BLOCK * len(self.kept)})", "work = blocks * width",
-            "for block in range(blocks):",
+            *self._each_block,
             *_indent([
-                *self._block_start(),
                 "slow, restarts = 0, 0",
-                *_block("for i in range(width):", ["f[work + i] = f[base + i]"]),
                 *_block(lane, [f"{_at('a')} = action[first + i]"]),
                 *_block(lane, main),
                 *_block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
@@ -278,16 +274,11 @@ class Program:
                 *_block(lane, output),
                 # One loop per entry: one that writes to many arrays would have to check them for overlap.
                 *(line for entry in _observations(self.o) for line in _block(lane, [entry])),
-                *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
             ]),
             "return np.int64(refused), overs",
         ]  # fmt: skip
-        return _function(
-            "step_all",
-            "f, ids, par, action, obs, reward, terminated, truncated, target_given, count",
-            body,
-            self.advance,
-        )
+        arguments = "f, ids, par, action, obs, reward, terminated, truncated, target_given, count"
+        return self._batch("step_all", arguments, body, self.advance)
 
     @cached_property
     def start_all(self) -> Callable:
@@ -310,29 +301,38 @@ class Program:
         body = [
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            f"blocks = np.uint64((count + {BLOCK - 1}) // {BLOCK})",
-            f"width = np.uint64({BLOCK * len(self.kept)})", "work = blocks * width",
-            "for block in range(blocks):",
-            *_indent([
-                *self._block_start(),
-                *_block("for i in range(width):", ["f[work + i] = f[base + i]"]),
-                *_block("for i in range(size):", start),
-                *_block("for i in range(width):", ["f[base + i] = f[work + i]"]),
-            ]),
+            *self._each_block,
+            *_indent(_block("for i in range(size):", start)),
         ]  # fmt: skip
-        return _function("start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body)
+        return self._batch(
+            "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
+        )
 
-    def _block_start(self) -> list[str]:
-        # Unsigned, since a signed index might be negative, which NumPy's rules make a branch.
+    def _batch(self, name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
+        """Compile a function on a batch: kept rows lie in `f`, the others behind the constants in `par`."""
+
+        def place(match: re.Match) -> str:
+            if match[1] in self.kept:
+                return f"f[base + np.uint64({self.kept.index(match[1]) * BLOCK}) + i]"
+            return f"par[np.uint64({len(self.uniform) + self.scratch.index(match[1]) * BLOCK}) + i]"
+
+        # Indices are unsigned: a signed one might be negative, which by NumPy's rules makes a branch.
+        return _function(name, arguments, [re.sub(r"row_(\w+)\[i\]", place, line) for line in body], *helpers)
+
+    @property
+    def _each_block(self) -> list[str]:
+        """The head of the loop over blocks."""
         return [
-            f"first = block * np.uint64({BLOCK})", f"size = min(np.uint64({BLOCK}), second - first)",
-            "base = block * width",
-            *(f"row_{row} = work + np.uint64({j * BLOCK})" for j, row in enumerate(self.kept + self.scratch)),
-        ]  # fmt: skip
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            f"    first = block * np.uint64({BLOCK})",
+            f"    size = min(np.uint64({BLOCK}), second - first)",
+            f"    base = block * np.uint64({BLOCK * len(self.kept)})",
+        ]
 
 
 def _at(row: str) -> str:
-    return f"f[row_{row} + i]"
+    """Return a row's number in the environment at hand; `Program._batch` says where it lies."""
+    return f"row_{row}[i]"
 
 
 def _observations(names: Sequence[str], value: str = _at("{}")) -> list[str]:

@@ -110,9 +110,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 constants["limit"] = min(constants["limit"], float(max_episode_steps))
         self._compile()
         program = self._program
-        self._par = np.array([self._constants[0][name] for name in program.uniform])
+        uniform = [self._constants[0][name] for name in program.uniform]
+        #: The constants, then room for what a step needs.
+        self._par = np.array(uniform + [0.0] * len(program.scratch) * BLOCK)
         blocks = -(-self.num_envs // BLOCK)
-        self._memory = np.zeros(((blocks + 1) * len(program.kept) + len(program.scratch)) * BLOCK)
+        self._memory = np.zeros(blocks * len(program.kept) * BLOCK)
         #: Keys of the seeds, numbers of the episodes, keys of the episodes.
         self._ids = np.zeros(3 * self.num_envs, dtype=np.uint64)
         self._lanes = np.arange(self.num_envs)
@@ -308,8 +310,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     @property
     def _blocks(self) -> NDArray[np.float64]:
         """The rows that are kept, as (block, row, lane)."""
-        blocks, rows = -(-self.num_envs // BLOCK), len(self._row)
-        return self._memory[: blocks * rows * BLOCK].reshape(blocks, rows, BLOCK)
+        return self._memory.reshape(-1, len(self._row), BLOCK)
 
     def _start(self, observations: NDArray[np.float32], mask: NDArray[np.bool_], *given: bool) -> None:
         """Begin episodes where the mask is set.
@@ -357,7 +358,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {array.shape}")
         if array.dtype.kind not in "fiub":
             raise ValueError(f"actions must be real numbers, got an array of type {array.dtype}")
-        if array.dtype.char not in "fd" or not array.flags.writeable:  # what the compiled step takes as it is
+        if (
+            array.dtype.char not in "fd" or not array.dtype.isnative or not array.flags.writeable
+        ):  # what the compiled step takes as it is
             array = array.astype(np.float64)
         return array.ravel()
 

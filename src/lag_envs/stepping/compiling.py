@@ -8,31 +8,43 @@ from __future__ import annotations
 import hashlib
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
-from lag_envs.stepping.tracing import Trace
-
+from lag_envs.stepping.tracing import Trace, Value
 
 _BLOCK = "block_[0-9a-f]{16}"
 _blocks: dict[str, tuple] = {}
 
 
-def record_block(trace: Trace, outputs: dict[str, Any]) -> str:
-    """Return the line of code that computes a trace's outputs, as one call of a straight-line function.
+def record_block(trace: Trace, outputs: dict[str, Any]) -> tuple[list[str], list[Value]]:
+    """Return the code that computes a trace's outputs, as one call of a straight-line function.
 
     Numba need not infer the types of what happens inside, which is what most of compiling would take.
+
+    Returns
+    -------
+    lines : list of str
+        The code.
+    values : list of str or float
+        For each output its name, or the constant that it turned out to be.
     """
-    operations = tuple(trace.operations(outputs.values()))
+    operations, results = trace.operations(list(outputs.values()))
     made = {operation.name for operation in operations}
-    values = {name: getattr(value, "name", value) for name, value in outputs.items()}
-    used = [arg for operation in operations for arg in operation.args] + list(values.values())
+    named = {name: result for name, result in zip(outputs, results, strict=True) if isinstance(result, str)}
+    used = [arg for operation in operations for arg in operation.args] + list(named.values())
     inputs = tuple(dict.fromkeys(arg for arg in used if isinstance(arg, str) and arg not in made))
-    parts = (operations, inputs, tuple(values.values()))
-    name = f"block_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
-    _blocks[name] = parts
-    return f"{', '.join(values)}, = {name}({', '.join(inputs)})"
+    parts = (tuple(operations), inputs, tuple(named.values()))
+    block = f"block_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
+    _blocks[block] = parts
+    lines = [f"{', '.join(named)}, = {block}({', '.join(inputs)})"] if named else []
+    return lines, [name if name in named else result for name, result in zip(outputs, results, strict=True)]
+
+
+def count_operations(lines: Iterable[str]) -> int:
+    """Return how many operations the blocks in these lines of code consist of."""
+    return sum(len(_blocks[block][0]) for line in lines for block in re.findall(_BLOCK, line))
 
 
 @cache
@@ -87,7 +99,9 @@ def compile_python(name: str, function: Callable, *helpers: Callable, **constant
     return compile_function(name, source, *helpers, **constants)
 
 
-def compile_traced(name: str, arguments: str, formula: Callable) -> Callable:
+def compile_traced(
+    name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset()
+) -> Callable:
     """Run ``formula(xp, *arguments)`` once on recording numbers and compile what it did.
 
     Parameters
@@ -98,9 +112,13 @@ def compile_traced(name: str, arguments: str, formula: Callable) -> Callable:
         Its arguments, separated by commas.
     formula : callable
         Takes the `Trace` as namespace and one `Number` per argument; returns a tuple of numbers.
+    absent : frozenset of str
+        Arguments that are known to be zero.
     """
     trace = Trace()
-    outputs = formula(trace, *trace.inputs(*arguments.split(", ")))
+    names = arguments.split(", ")
+    outputs = formula(trace, *(trace.zero() if n in absent else trace.inputs(n)[0] for n in names))
     names = [f"out{i}" for i in range(len(outputs))]
-    line = record_block(trace, dict(zip(names, outputs, strict=True)))
-    return compile_function(name, f"def {name}({arguments}):\n    {line}\n    return {', '.join(names)}\n")
+    lines, values = record_block(trace, dict(zip(names, outputs, strict=True)))
+    body = [f"def {name}({arguments}):", *lines, f"return {', '.join(map(str, values))}"]
+    return compile_function(name, "\n    ".join(body) + "\n")

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.compiling import compile_function, count_operations, record_block
 from lag_envs.stepping.tracing import Trace
 
 if TYPE_CHECKING:
@@ -95,11 +95,14 @@ def section(
         For each output its name, or the constant that it turned out to be.
     """
     trace = Trace(prefix)
-    results = list(formula(trace, *(trace.inputs(i)[0] if isinstance(i, str) else i for i in inputs)))
-    constant = [isinstance(r, float | bool) for r in results]
-    named = {name: r for name, r, c in zip(outputs, results, constant, strict=True) if not c}
-    values = [r if c else name for name, r, c in zip(outputs, results, constant, strict=True)]
-    return [record_block(trace, named)] if named else [], values
+    results = formula(trace, *(_input(trace, i) for i in inputs))
+    return record_block(trace, dict(zip(outputs, results, strict=True)))
+
+
+def _input(trace: Trace, value: Any) -> Any:
+    if isinstance(value, str):
+        return trace.inputs(value)[0]
+    return trace.zero() if value == 0.0 else value
 
 
 def split(values: Sequence, *sizes: int) -> list[list]:
@@ -178,6 +181,11 @@ class Stepper:
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         self._any = [*prepared, call, *finished]
         self._flow = lambda: flow.compile(present)
+
+    @property
+    def operations(self) -> int:
+        """Number of operations of an ordinary step."""
+        return count_operations(self.fast)
 
     @property
     def arguments(self) -> str:

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping.compiling import compile_python, compile_traced
-from lag_envs.stepping.tracing import balanced_sum, polynomial
+from lag_envs.stepping.tracing import pairwise_sum, polynomial, sum_of_products
 
 ORDER = 16
 TOLERANCE = 1e-12
@@ -78,15 +78,15 @@ def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tup
     for k in range(1, order):
         # The convolution of W with itself is symmetric, so half of its products are enough.
         pairs = [(W[j], W[k - j]) for j in reversed(range((k + 1) // 2))]
-        H.append(balanced_sum(pairs if k % 2 else [(0.5 * W[k // 2], W[k // 2]), *pairs]))
+        H.append(sum_of_products(pairs if k % 2 else [(0.5 * W[k // 2], W[k // 2]), *pairs]))
         work = H[k - 1] * (gamma * (2.0 / k)) - d * W[k - 1] * (1.0 / k)
         if k > 1:
             work = work - r * W[k - 2] * (1.0 / k)
         Q.append(H[k] + work)
-        # P_k itself is not needed: it goes straight into W.
+        # P_k itself is not needed: it goes straight into W. What is known last enters last.
         early = sorted(range(k), key=lambda j: (max(j, k - 1 - j), j))
-        torque = balanced_sum((Q[j], W[k - 1 - j]) for j in early)
-        change = torque * (-1.0 / (k * (k + 1))) - W[k] * (gamma * (1.0 / (k + 1)))
+        torque = sum_of_products((Q[j], W[k - 1 - j]) for j in early)
+        change = W[k] * (gamma * (-1.0 / (k + 1))) + torque * (-1.0 / (k * (k + 1)))
         W.append(change + 0.5 * r if k == 1 else change)
     return W, H
 
@@ -106,12 +106,8 @@ def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
 def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
     """Return by how much θ and hθ' change in one step of the series, and (cosθ, sinθ) after it."""
     W, _ = taylor_coefficients(omega * h, c, s, scaled(drive, h), order)
-    # From the small terms to the large ones.
-    change, angle = W[order], W[order] * (1.0 / (order + 1))
-    for k in range(order - 1, 0, -1):
-        change = change + W[k]
-        angle = angle + W[k] * (1.0 / (k + 1))
-    angle = angle + W[0]
+    change = pairwise_sum(W[1:])
+    angle = pairwise_sum([w * (1.0 / (k + 1)) for k, w in enumerate(W)])
     return angle, change, *rotate(c, s, angle)
 
 
@@ -301,20 +297,19 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
         ``flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x)`` to
         ``(theta, omega, c, s, substeps)``; `substeps` is negative where the step is refused.
     """
-
-    def drive(*coefficients: Any) -> Drive:
-        return Drive(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
-
+    absent = frozenset(name for name, there in zip(Drive._fields, present, strict=True) if not there)
     coefficients = "alpha, beta, gamma, delta, ramp"
     series = compile_traced(
         "series",
         f"omega, c, s, {coefficients}, h",
-        lambda xp, omega, c, s, *rest: step_change(omega, c, s, drive(*rest[:5]), rest[5], order),
+        lambda xp, omega, c, s, *rest: step_change(omega, c, s, Drive(*rest[:5]), rest[5], order),
+        absent,
     )
     holds = compile_traced(
         "holds",
         f"omega, {coefficients}, h, x",
-        lambda xp, omega, *rest: (certified(omega, drive(*rest[:5]), rest[5], rest[6], xp),),
+        lambda xp, omega, *rest: (certified(omega, Drive(*rest[:5]), rest[5], rest[6], xp),),
+        absent,
     )
     turn = compile_traced("turn", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
     rate = compile_python("_rate", _rate)

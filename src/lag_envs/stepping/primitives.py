@@ -107,7 +107,8 @@ def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Seque
         Which results to return, as a tuple.
     """
     boolean = {operation.name for operation in operations if operation.op in BOOLEAN}
-    result = types.Tuple([types.boolean if value in boolean else types.float64 for value in outputs])
+    kinds = [types.boolean if o in boolean or isinstance(o, bool) else types.float64 for o in outputs]
+    result = types.Tuple(kinds)
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         known = dict(zip(inputs, args, strict=True))

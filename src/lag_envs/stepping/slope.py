@@ -125,14 +125,11 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 @cache
 def compile_slide(present: tuple[bool, ...]) -> Callable:
     """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative if refused."""
-
-    def force(*coefficients: Any) -> Pull:
-        return Pull(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
-
+    absent = frozenset(name for name, there in zip(Pull._fields, present, strict=True) if not there)
     fast = compile_traced(
-        "slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, force(p, d), dt)
+        "slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, Pull(p, d), dt), absent
     )
-    holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(force(p, d), dt),))
+    holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(Pull(p, d), dt),), absent)
     return compile_python("flow", _slide_any, fast, holds)
 
 
@@ -228,14 +225,14 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
 @cache
 def compile_turn(present: tuple[bool, ...]) -> Callable:
     """Compile ``flow(x, v, c, s, rolling, gravity, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
-
-    def turn(*coefficients: Any) -> Turn:
-        return Turn(*(v if there else 0.0 for v, there in zip(coefficients, present, strict=True)))
-
+    absent = frozenset(name for name, there in zip(Turn._fields, present, strict=True) if not there)
     arguments = "x, v, c, s, rolling, gravity, drag, rate, h"
     series, change = (
         compile_traced(
-            name, arguments, lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, turn(*rest[:4]), rest[4])
+            name,
+            arguments,
+            lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, Turn(*rest[:4]), rest[4]),
+            absent,
         )
         for name, f in (("series", turn_series), ("change", turn_change))
     )

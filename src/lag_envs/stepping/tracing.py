@@ -68,12 +68,16 @@ FUSED = {"+": ("a*b+c", "a*b+c"), "-": ("a*b-c", "c-a*b")}
 BOOLEAN = frozenset({"<", "<=", "&", "|", "~"})
 
 
+#: The name of an earlier result, or a constant.
+Value = str | float | bool
+
+
 class Operation(NamedTuple):
-    """One step of straight-line code; arguments are names of earlier results, or constants."""
+    """One step of straight-line code."""
 
     name: str
     op: str
-    args: tuple[str | float | bool, ...]
+    args: tuple[Value, ...]
 
 
 class Number:
@@ -163,6 +167,7 @@ class Trace:
         self._prefix = prefix
         self._nodes: list[Number] = []
         self._known: dict[tuple, Number] = {}
+        self._zeros: set[str] = set()
 
     def inputs(self, *names: str) -> list[Number]:
         """Return one `Number` per name."""
@@ -183,8 +188,30 @@ class Trace:
             self._known[key] = node
         return self._known[key]
 
-    def operations(self, outputs: Iterable[Any]) -> list[Operation]:
-        """Return what computes the outputs, in order: unused operations left out, products fused into sums."""
+    def zero(self) -> Number:
+        """Return a number known to be zero.
+
+        Its terms are dropped, like those of a literal 0.0, but only after products have been fused: so the
+        other terms round as they would if it were not zero, and environments with and without, say,
+        damping go through the same bits in one batch.
+        """
+        number = Number(self, f"zero{len(self._zeros)}")
+        self._zeros.add(number.name)
+        return number
+
+    def operations(self, outputs: Iterable[Any]) -> tuple[list[Operation], list[Value]]:
+        """Return what computes the outputs, in order and without detours, and what the outputs are then."""
+        results = [value.name if isinstance(value, Number) else value for value in outputs]
+        operations = _drop_zeros(self._fused(outputs), results, self._zeros)
+        needed = set(results)
+        kept = []
+        for operation in reversed(operations):
+            if operation.name in needed:
+                kept.append(operation)
+                needed.update(operation.args)
+        return kept[::-1], results
+
+    def _fused(self, outputs: Iterable[Any]) -> list[Operation]:
         uses: dict[str, int] = {}
         stack = list(outputs)
         while stack:
@@ -211,8 +238,9 @@ class Trace:
 
     def code(self, outputs: dict[str, Any]) -> list[str]:
         """Return lines of Python that compute the outputs, for people to read."""
-        lines = [f"{name} = {_CODE[op].format(*args)}" for name, op, args in self.operations(outputs.values())]
-        return lines + [f"{name} = {_name(value)}" for name, value in outputs.items()]
+        operations, results = self.operations(list(outputs.values()))
+        lines = [f"{name} = {_CODE[op].format(*args)}" for name, op, args in operations]
+        return lines + [f"{name} = {value}" for name, value in zip(outputs, results, strict=True)]
 
     # The functions that a formula may call, named as in NumPy.
 
@@ -257,28 +285,34 @@ class Trace:
         return self.record("floor", a)
 
 
-def balanced_sum(products: Iterable[tuple[Any, Any]]) -> Any:
-    """Sum products, given in the order in which their factors become known.
-
-    All but the last two run in two chains side by side, which a processor can finish while it waits for the
-    rest.
+def sum_of_products(factors: Iterable[tuple[Any, Any]]) -> Any:
+    """Sum products one after the other, each but the first by one fused operation.
 
     Examples
     --------
-    >>> balanced_sum([(1.0, 2.0), (3.0, 4.0), (5.0, 6.0)])
+    >>> sum_of_products([(1.0, 2.0), (3.0, 4.0), (5.0, 6.0)])
     44.0
     """
-    products = list(products)
-    chains: list[Any] = []
-    for i, (a, b) in enumerate(products[:-2]):
-        if i < 2:
-            chains.append(a * b)
-        else:
-            chains[i % 2] = chains[i % 2] + a * b
-    total = sum(chains[1:], *chains[:1]) if chains else None
-    for a, b in products[-2:]:
-        total = a * b if total is None else total + a * b
+    (a, b), *rest = factors
+    total = a * b
+    for a, b in rest:
+        total = total + a * b
     return total
+
+
+def pairwise_sum(terms: Sequence[Any]) -> Any:
+    """Sum neighbours, then neighbouring sums, and so on: a short chain, and few roundings on the way.
+
+    Examples
+    --------
+    >>> pairwise_sum([1.0, 2.0, 3.0])
+    6.0
+    """
+    while len(terms) > 1:
+        terms = [a + b for a, b in zip(terms[::2], terms[1::2], strict=False)] + list(
+            terms[len(terms) // 2 * 2 :]
+        )
+    return terms[0]
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
@@ -333,6 +367,36 @@ def _simplify(op: str, args: tuple) -> Any:
     return None
 
 
-def _name(value: Any) -> str | float | bool:
+def _drop_zeros(operations: list[Operation], results: list[Value], zeros: set[str]) -> list[Operation]:
+    """Return the operations without terms that are zero; rename the results accordingly."""
+    now: dict[Value, Value] = dict.fromkeys(zeros, 0.0)
+    kept = []
+    for name, op, names in operations:
+        args = tuple(now.get(arg, arg) for arg in names)
+        zero = [_is(arg, 0.0) for arg in args]
+        value: Value = name
+        if op in ("neg", "abs", "sqrt", "/", "sin") and zero[0]:
+            value = 0.0
+        elif op == "*" and any(zero):
+            value = 0.0
+        elif op == "+" and any(zero):
+            value = args[zero[0]]
+        elif op == "-" and any(zero):
+            op, args, value = ("neg", args[1:], name) if zero[0] else (op, args, args[0])
+        elif op in ("a*b+c", "c-a*b") and any(zero[:2]):
+            value = args[2]
+        elif op == "a*b-c" and any(zero[:2]):
+            op, args, value = ("neg", args[2:], name) if not zero[2] else (op, args, 0.0)
+        elif op in ("a*b+c", "a*b-c") and zero[2]:
+            op, args = "*", args[:2]
+        if value == name:
+            kept.append(Operation(name, op, args))
+        else:
+            now[name] = value
+    results[:] = [now.get(result, result) for result in results]
+    return kept
+
+
+def _name(value: Any) -> Value:
     """Return a number's name, or the constant."""
     return value.name if isinstance(value, Number) else value
