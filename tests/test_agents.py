@@ -101,7 +101,7 @@ def test_agents_without_knowledge():
 
 def test_score():
     assert score(ENV, 421.0) == 1.0
-    assert score(ENV, 0.6) == 0.0
+    assert score(ENV, -0.78) == 0.0
     assert score("PivotedBarBalance-v0", 400.0) is None
 
 

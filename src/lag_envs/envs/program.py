@@ -106,22 +106,20 @@ class Program:
             return [*state, *(task.target_range * (2.0 * draw - 1.0) for draw in draws[states:])]
 
         clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
-        self.control = clip + _lines("p", control, ["a", *self.y, *given], ["u"])
+        self.control = clip + _lines(control, ["a", *self.y, *given], ["u"])
         self.fast = [f"dt = {constants['dt']}", f"x = {constants['x']}", *self._stepper.fast]
-        self.judge = _lines("q", judge, ["u", *g, *self.y, *self.z, *given], ["r", "over"])
+        self.judge = _lines(judge, ["u", *g, *self.y, *self.z, *given], ["r", "over"])
         has_last = type(task).last_reward is not Task.last_reward
-        self.last = _lines("l", last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
+        self.last = _lines(last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
         draws, kicked = [f"draw{i}" for i in range(task.draws)], [f"e{i}" for i in range(width)]
         self.kick = (
-            _draw(draws, "np.uint64(n)") + _lines("h", kick, [*draws, *self.z, *given], kicked)
-            if draws
-            else []
+            _draw(draws, "np.uint64(n)") + _lines(kick, [*draws, *self.z, *given], kicked) if draws else []
         )
         self.moved = kicked if draws else self.z
         self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
-        self.observe = _lines("v", observe, [*g, *self.y, *given], self.o)
+        self.observe = _lines(observe, [*g, *self.y, *given], self.o)
         draws, names = ([f"{name}{i}" for i in range(states + len(self.g))] for name in ("draw", "s"))
-        self.sample = _draw(draws, "np.uint64(0)") + _lines("s", start, [*draws, *given], names)
+        self.sample = _draw(draws, "np.uint64(0)") + _lines(start, [*draws, *given], names)
         self.lift = lift_lines(states, scene.angle, "y")
 
     # --- one environment: rows, then constants, in one array -----------------------------------------------
@@ -352,9 +350,9 @@ def _block(head: str, body: Sequence[str]) -> list[str]:
     return [head, *_indent(body)]
 
 
-def _lines(prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> list[str]:
+def _lines(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> list[str]:
     """Record a formula; outputs that turned out constant are assigned as well."""
-    lines, values = section(prefix, formula, inputs, outputs)
+    lines, values = section(formula, inputs, outputs)
     return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
 
 

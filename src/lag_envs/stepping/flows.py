@@ -71,15 +71,11 @@ TURN = Flow(
 )
 
 
-def section(
-    prefix: str, formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]
-) -> tuple[list[str], list]:
+def section(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> tuple[list[str], list]:
     """Record ``formula(xp, *inputs)``.
 
     Parameters
     ----------
-    prefix : str
-        What its intermediate names begin with.
     formula : callable
         Returns one number per output.
     inputs : sequence of str or float
@@ -94,7 +90,7 @@ def section(
     values : list of str or float
         For each output its name, or the constant that it turned out to be.
     """
-    trace = Trace(prefix)
+    trace = Trace()
     results = formula(trace, *(_input(trace, i) for i in inputs))
     return record_block(trace, dict(zip(outputs, results, strict=True)))
 
@@ -168,10 +164,10 @@ class Stepper:
 
         given = list(constants.values())
         names = [*before, *flow.coefficients._fields]
-        prepared, values = section("a", prepare, [*self.start, "u", *given], names)
-        finished, _ = section("c", finish, [*after, *self.start, "u", "dt", *given], self.end)
-        moved, _ = section("b", move, [*values, "dt"], after)
-        tested, (condition,) = section("w", within, [*values, "dt", "x"], ["within"])
+        prepared, values = section(prepare, [*self.start, "u", *given], names)
+        finished, _ = section(finish, [*after, *self.start, "u", "dt", *given], self.end)
+        moved, _ = section(move, [*values, "dt"], after)
+        tested, (condition,) = section(within, [*values, "dt", "x"], ["within"])
         if isinstance(condition, bool):
             tested = [f"within = {condition}"]
 

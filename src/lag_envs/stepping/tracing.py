@@ -2,15 +2,15 @@
 
 Scenes, tasks and the Taylor recurrences are written as short loops on "numbers": floats, NumPy
 arrays, torch tensors and SymPy symbols all will do. For speed the same functions are run once on
-`Number` objects, which record every operation; the record is then printed as straight-line Python
-for Numba. Three things happen on the way:
+`Number` objects, which record every operation; the record then becomes one straight-line compiled function.
+Three things happen on the way:
 
-* An operation on constants is done at once, and a term multiplied by the literal ``0.0`` is dropped.
-  This is the one place where it is decided what a scene pays for: a coefficient that a scene
-  does not have is returned as ``0.0`` and leaves no trace in the compiled code.
-* Equal operations are recorded once.
+* Equal operations are recorded once, and operations on constants are done at once.
 * ``a * b + c`` with a product that nobody else uses becomes one fused multiply-add. The fusion is thus
   chosen here and not by the compiler, so that one environment and ten thousand give the same bits.
+* A term that is zero is dropped. This is the one place where it is decided what a scene pays for: a
+  coefficient that a scene does not have is returned as ``0.0``, a parameter that is zero is known to be
+  (`Trace.zero`), and both leave nothing behind in the compiled code.
 """
 
 from __future__ import annotations
@@ -163,8 +163,7 @@ class Trace:
     ['t1 = a * b + b', 'out = t1']
     """
 
-    def __init__(self, prefix: str = "t") -> None:
-        self._prefix = prefix
+    def __init__(self) -> None:
         self._nodes: list[Number] = []
         self._known: dict[tuple, Number] = {}
         self._zeros: set[str] = set()
@@ -183,7 +182,7 @@ class Trace:
             return simple
         key = (op, *(a.name if isinstance(a, Number) else (type(a), str(a)) for a in args))
         if key not in self._known:
-            node = Number(self, f"{self._prefix}{len(self._nodes)}", op, args)
+            node = Number(self, f"t{len(self._nodes)}", op, args)
             self._nodes.append(node)
             self._known[key] = node
         return self._known[key]
