@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-#: Mean returns of the random policy (4,096 episodes; `tests/test_docs.py` measures them again) and of the best
-#: policy known: an estimate of the optimum by value iteration, or where that was beaten, a feedback law's return.
+#: Mean returns of the random policy (4,096 episodes; `tests/test_docs.py` measures them again) and of the
+#: best one known: the optimum as estimated by value iteration, or a feedback law's return where that is more.
 KNOWN_RETURNS = {
     "PivotedBar-v0": (-0.78, 421.0),
     "PivotedBarFree-v0": (-2.43, 421.0),

@@ -654,5 +654,5 @@ def test_a_refused_step_changes_nothing():
     for _ in range(2):
         with pytest.raises(StepRefused, match="the step was refused: from \\(theta="):
             env.step(np.ones(1))
-        assert (env.state == state).all()
+        assert (env.state == state).all() and env.control == 0.0
     env.reset(seed=2)

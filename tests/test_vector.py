@@ -605,3 +605,44 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
     envs.reset(options={"state": np.zeros((3, 2)), "reset_mask": np.array([False, True, False])})
     with pytest.raises(StepRefused):
         envs.step(np.ones((3, 1)))
+
+
+# --- what a review found ---
+
+
+@each_mode
+def test_a_fixed_target_returns_after_one_given_by_hand(mode):
+    native, sync = pair("InclineTilt-v0", 3, mode, target=0.2, duration=0.3)
+    given = {"target": np.array([0.1, 0.1, 0.1])}
+    native.reset(seed=1, options=given)
+    assert native.target.tolist() == [0.1] * 3
+    sync.reset(seed=1, options={"target": 0.1})
+    assert_alike(native, sync, 20)
+    assert native.target.tolist() == [0.2] * 3
+
+
+def test_a_restarting_environment_ignores_its_action():
+    envs = gym.make_vec("InclineTilt-v0", num_envs=2, duration=0.1)
+    envs.reset(seed=1)
+    for _ in range(2):
+        _, _, _, truncations, _ = envs.step(np.zeros((2, 1), np.float32))
+    assert truncations.all()
+    observations, *_ = envs.step(np.array([[np.nan], [0.0]], np.float32))
+    assert np.isfinite(observations).all()
+    with pytest.raises(ValueError, match="environment 0"):
+        envs.step(np.array([[np.nan], [0.0]], np.float32))
+
+
+def test_a_refusal_carries_what_the_others_did():
+    envs = gym.make_vec("PivotedBarFree-v0", num_envs=2, com_distance=[0.3, 1e-30], damping=0.0)
+    envs.reset(seed=1)
+    with pytest.raises(StepRefused) as error:
+        envs.step(np.zeros((2, 1), np.float32))
+    observations, rewards, *_ = error.value.results
+    assert observations.shape == (2, 3) and np.isfinite(rewards[0])
+
+
+@pytest.mark.parametrize("steps", [0, -2, 2.5, "7", True])
+def test_impossible_max_episode_steps(steps):
+    with pytest.raises(ValueError, match="max_episode_steps must be a whole number of at least 1"):
+        gym.make_vec("PivotedBar-v0", num_envs=2, max_episode_steps=steps)

@@ -28,6 +28,7 @@ from lag_envs.stepping.flows import Stepper, lift_lines, section, split
 from lag_envs.tasks.base import Task
 
 BLOCK = 64
+DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
 SLOW = -3  #: status of a step that the fast formula does not cover
 
 
@@ -59,6 +60,8 @@ class Program:
         self.constants = [name for name in names if name not in absent]
         self.uniform = [name for name in self.constants if name not in varying]
         self.varying = [name for name in self.constants if name in varying]
+        if max(task.draws, len(scene.state_names) + 1) > DRAWS:
+            raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={task.draws}")
         self.y, self.z = self._stepper.start, self._stepper.end
         self.o = [f"o{i}" for i in range(len(task.observation))]
         self.g = ["g"] if task.target_range is not None else []
@@ -103,7 +106,11 @@ class Program:
             state = [
                 numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)
             ]
-            return [*state, *(task.target_range * (2.0 * draw - 1.0) for draw in draws[states:])]
+            if not self.g:
+                return state
+            if task.target is not None:
+                return [*state, k(rest).goal]
+            return [*state, task.target_range * (2.0 * draws[states] - 1.0)]
 
         clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
         self.control = clip + _lines(control, ["a", *self.y, *given], ["u"])
@@ -194,7 +201,7 @@ class Program:
 
     @cached_property
     def step_all(self) -> Callable:
-        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, target_given, count)``.
+        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, count)``.
 
         Steps every environment; one whose episode was over is restarted instead. Returns (status, over). The
         status is 0; or i + 1 where environment i was refused and kept its state; or -(i + 1), before anything
@@ -241,7 +248,8 @@ class Program:
             *_indent([
                 *_load(_at, [*varying, *self.g]),
                 *_next_episode("first + i", "second + first + i", "last + first + i"),
-                "state_given = False", *self._start, "r = 0.0", "over = 0.0", *self.observe,
+                "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
+                *self.observe,
                 *_store(_at, [*y, *self.g, "u", "n", "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
@@ -250,6 +258,9 @@ class Program:
             "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
             "overs += over > 0.0",
         ]  # fmt: skip
+        # An environment that is to be restarted ignores its action, whatever it is.
+        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
+        running = f"f[{place}] >= 0.0"
         body = [
             "wide_vectors()",
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
@@ -258,7 +269,7 @@ class Program:
             "for i in range(second):", "    bad += not (abs(action[i]) < math.inf)",
             "if bad > 0:",
             "    for i in range(count):",
-            "        if not (abs(action[i]) < math.inf):",
+            f"        if not (abs(action[i]) < math.inf) and {running}:",
             "            return -(i + 1), 0",
             "overs, refused = 0, np.uint64(0)",
             *self._each_block,
@@ -275,7 +286,7 @@ class Program:
             ]),
             "return np.int64(refused), overs",
         ]  # fmt: skip
-        arguments = "f, ids, par, action, obs, reward, terminated, truncated, target_given, count"
+        arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
         return self._batch("step_all", arguments, body, self.advance)
 
     @cached_property

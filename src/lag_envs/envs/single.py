@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import math
 from typing import Any, SupportsFloat
 
@@ -72,7 +72,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         #: Key of the seed, number of the episode, key of the episode.
         self._ids = np.zeros(3, dtype=np.uint64)
         self._row = {name: j for j, name in enumerate(rows)}
-        self._size = len(self.task.observation)
+        self._size, self._u = len(self.task.observation), self._row["u"]
         self._ready = False
         self._started = False
         self._bind()
@@ -110,7 +110,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         state, target = start_options(options)
         given_state = None if state is None else self.task.check_start(state)
-        given_target = self.task.target if target is None else self.task.check_target(target)
+        given_target = None if target is None else self.task.check_target(target)
         super().reset(seed=seed)
         if seed is not None:
             self._ids[:2] = int(seed) % 2**64, 0
@@ -166,10 +166,11 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 + ("the episode has terminated" if self._started else "no episode has begun")
             )
         observation = np.empty(self._size, FLOAT32)
+        before = self._rows[self._u]
         reward, over = self._step(self._rows, observation, a, self._ids)
         if over:
             if over == SLOW:
-                reward, over = self._slow_step(observation)
+                reward, over = self._slow_step(observation, before)
             self._ready = over % 2 == 0
         if self.render_mode == "human":
             self.render()
@@ -221,14 +222,14 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
         if value is not None and value.max_episode_steps is None and math.isfinite(self.task.limit):
-            value.max_episode_steps = int(self.task.limit)
+            value = dataclasses.replace(value, max_episode_steps=int(self.task.limit))
         self._spec = value
 
     _spec: EnvSpec | None = None
 
     # --- the rest ------------------------------------------------------------------------------------------
 
-    def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
+    def _slow_step(self, observation: NDArray[np.float32], control_before: float) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
         start = [rows[self._row[name]] for name in [*program.y, "u"]]
@@ -237,7 +238,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             *start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants)
         )
         if status < 0:
-            raise self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
+            refusal = self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
+            rows[self._u] = control_before
+            raise refusal
         for name, value in zip(program.z, end, strict=True):
             rows[self._row[name]] = value
         return program.finish_one(rows, observation, self._ids)
@@ -247,8 +250,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and windows."""
-        state = {k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_program")}
-        return copy.copy(state)
+        return {k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_program")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from lag_envs.envs.program import BLOCK, Program, constants_of
 from lag_envs.envs.single import (
     FLOAT32,
-    RENDER_MODES,
     absent,
     action_space,
     check_render_mode,
@@ -24,6 +22,8 @@ from lag_envs.envs.single import (
     observation_space,
     start_options,
 )
+from lag_envs.scenes import StepRefused
+from lag_envs.scenes.base import real_array
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -93,7 +93,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.scene = self.task.scene
         self.__doc__ = self.task.__doc__
         self.metadata = {
-            "render_modes": RENDER_MODES,
+            "render_modes": ["rgb_array"],
             "render_fps": max(1, round(1.0 / self.task.dt)),
             "autoreset_mode": self._mode,
         }
@@ -104,8 +104,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         self._constants = [constants_of(task) for task in self._tasks]
         if max_episode_steps is not None and max_episode_steps != -1:
-            if isinstance(max_episode_steps, bool) or not max_episode_steps >= 1:
-                raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
+            if (
+                type(max_episode_steps) is bool
+                or not isinstance(max_episode_steps, int)
+                or not max_episode_steps >= 1
+            ):
+                raise ValueError(
+                    f"max_episode_steps must be a whole number of at least 1, got {max_episode_steps!r}"
+                )
             for constants in self._constants:
                 constants["limit"] = min(constants["limit"], float(max_episode_steps))
         self._compile()
@@ -121,9 +127,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         for name in program.varying:
             values = [constants[name] for constants in self._constants]
             self._write(f"k_{name}", self._lanes, np.array(values))
-        self._targets_given = self.task.target is not None
-        if self._targets_given:
-            self._write("g", self._lanes, np.array([task.target for task in self._tasks]))
         self._started = False
         self._over = 0
 
@@ -186,10 +189,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 self._write(f"y{j}", lanes, column)
         if target is not None:
             self._write("g", lanes, target)
-        elif self._targets_given:
-            self._write("g", lanes, np.array([self._tasks[i].target for i in lanes]))
         observations = np.empty((len(self._program.o), self.num_envs), dtype=FLOAT32).T
-        self._start(observations, mask, True, state is not None, target is not None or self._targets_given)
+        self._start(observations, mask, True, state is not None, target is not None)
         self._started = True
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
         return observations, self._infos(mask)
@@ -243,7 +244,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             rewards,
             terminations,
             truncations,
-            self._targets_given,
             n,
         )
         if status < 0:
@@ -251,13 +251,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}"
             )
         self._over = over
-        if status > 0:
-            self._refuse(status - 1)
         observations = observations.T
         infos = self._infos(None) if self.diagnostics else {}
         if self._over and self._mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
-        return observations, rewards, terminations, truncations, infos
+        results = observations, rewards, terminations, truncations, infos
+        if status > 0:
+            raise self._refusal(status - 1, results)
+        return results
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each environment."""
@@ -330,7 +331,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             final[i] = observations[i].copy()
         last = {k: v if k.startswith("_") else np.where(over, v, 0) for k, v in infos.items()}
         last |= {k: over & v for k, v in last.items() if k.startswith("_")}
-        self._start(observations, over, False, False, self._targets_given)
+        self._start(observations, over, False, False, False)
         self._over = 0
         infos = self._infos(None) if self.diagnostics else {}
         ends = {"final_obs": final, "_final_obs": over.copy(), "final_info": last, "_final_info": over.copy()}
@@ -346,11 +347,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             infos = self._add_info(infos, diagnostics(self._tasks[i].scene, states[i], controls[i]), int(i))
         return infos
 
-    def _refuse(self, i: int) -> None:
-        scene = self._tasks[i].scene
-        raise scene.refusal(
-            self.state[i], float(self.control[i]), self.task.dt, None, f"the step of environment {i}"
-        )
+    def _refusal(self, i: int, results: tuple) -> StepRefused:
+        where = f"the step of environment {i}"
+        control = float(self.control[i])
+        error = self._tasks[i].scene.refusal(self.state[i], control, self.task.dt, None, where)
+        error.results = results
+        return error
 
     def _check_actions(self, actions: Any) -> NDArray[np.floating]:
         array = np.asarray(actions)
@@ -389,19 +391,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return pairs
 
     def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        try:
-            array = np.asarray(values, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"options[{name!r}] must be numbers of shape {shape}, got {values!r}") from error
+        array = real_array(f"options[{name!r}]", values)
         if array.shape != shape:
             raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
         return array
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and pictures."""
-        return copy.copy(
-            {k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")}
-        )
+        return {k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""

@@ -36,9 +36,12 @@ class StepRefused(ArithmeticError):
     ----------
     trajectory : array of shape (steps + 1, n_state), or None
         What `Scene.simulate` had computed before the step.
+    results : tuple, or None
+        What a vector environment's step would have returned for the others.
     """
 
     trajectory: Array | None = None
+    results: tuple | None = None
 
 
 class Motion(NamedTuple):
@@ -75,6 +78,17 @@ def check_number(name: str, value: Any, unit: str = "") -> float:
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
     return number
+
+
+def real_array(name: str, values: ArrayLike) -> Array:
+    """Return values as a new float64 array, or raise a ValueError that names them."""
+    try:
+        array = np.array(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} must be real numbers, got {values!r}") from error
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must be real numbers, got {values!r}")
+    return array.astype(np.float64)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -208,10 +222,7 @@ class Scene(ABC):
 
     def check_state(self, state: ArrayLike) -> Array:
         """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
-        try:
-            array = np.array(state, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"state must be {len(self.state_names)} numbers, got {state!r}") from error
+        array = real_array("state", state)
         if array.shape != (len(self.state_names),):
             raise ValueError(
                 f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
@@ -224,10 +235,7 @@ class Scene(ABC):
 
     def check_control(self, control: ArrayLike) -> Array:
         """Return controls as a float64 array, or raise a ValueError."""
-        try:
-            array = np.array(control, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"the control must be a number, got {control!r}") from error
+        array = real_array("the control", control)
         bad = ~np.isfinite(array)
         if bad.any():
             raise ValueError(
@@ -266,7 +274,7 @@ class Scene(ABC):
         dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)
-        x = pendulum.largest_x(dt, self.order)
+        x = pendulum.largest_x(dt, self.order or pendulum.ORDER)
         row = self._simulate(
             trajectory, controls, dt, x, *(v for v in map(float, self.constants().values()) if v != 0.0)
         )
@@ -292,8 +300,8 @@ class Scene(ABC):
 
     @property
     def order(self) -> int:
-        """Order of the Taylor series."""
-        return pendulum.ORDER
+        """Order of the flow's series; 0 for a closed form."""
+        return self.flow.order
 
     def refusal(
         self, state: Array, control: float, dt: float, trajectory: Array | None, where: str
@@ -377,8 +385,9 @@ class Scene(ABC):
     def truncation_bound(self, state: ArrayLike, control: float, dt: float) -> pendulum.Bound | None:
         """Return what is known of a step before it is taken: substeps, and bounds on what they leave out.
 
-        The bounds are proved. None for a scene that is stepped in closed form; see
-        `pendulum.truncation_bound`.
+        The bounds are proved for plain substeps; where heavy damping makes the step jump along the slow
+        manifold instead, accuracy is tested, not proved. None for a scene that is stepped in closed form or
+        by a series summed to rounding. See `pendulum.truncation_bound`.
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None

@@ -1,13 +1,15 @@
 """Numerics: how one control step is taken.
 
 ``tracing``
-    Runs a plain formula once on recording numbers and turns it into straight-line code.
+    Runs a plain formula once on recording numbers.
+``primitives``
+    Turns a record into compiled code; also the counter-based random generator.
 ``compiling``
-    Compiles that code with Numba and keeps the result on disk.
+    Compiles functions that call such blocks, and keeps the result on disk.
 ``pendulum``
     The driven, damped pendulum (bar, cylinder in shell): Taylor series with a proved bound.
 ``slope``
     The rolling cylinder on a slope: closed form (fixed slope), linear flow (moving slope).
-``primitives``
-    What the compiled code calls: fused multiply-add, selection, the counter-based random generator.
+``flows``
+    Puts a scene's control step together from one of these.
 """

@@ -2,7 +2,7 @@
 
 A scene names its flow and says how its state and held control become the flow's variables and coefficients.
 From that, this module makes the scalar ``advance`` that a single environment and `Scene.simulate` call,
-and the lines of the vectorised step. Both print the same recorded sections with the same roundings, which is
+and the lines of the vectorised step. Both call the same recorded blocks with the same roundings, which is
 why a batch and a single environment agree bit for bit.
 """
 
@@ -27,11 +27,12 @@ class Flow(NamedTuple):
 
     ``fast(variables, coefficients, dt)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step.
+    makes the scalar function for any step. ``order`` is that of the series, 0 for a closed form.
     """
 
     size: int
     coefficients: type[pendulum.Drive | slope.Pull | slope.Turn]
+    order: int
     fast: Callable
     within: Callable
     compile: Callable
@@ -48,6 +49,7 @@ def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
     return Flow(
         4,
         pendulum.Drive,
+        order,
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda present: pendulum.compile_flow(present, order),
@@ -62,12 +64,13 @@ def _turn(variables: Sequence, turn: slope.Turn, dt: Any) -> tuple:
 SLIDE = Flow(
     2,
     slope.Pull,
+    0,
     lambda variables, pull, dt: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
 )
 TURN = Flow(
-    4, slope.Turn, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn
+    4, slope.Turn, 0, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn
 )
 
 

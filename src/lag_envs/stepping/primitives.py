@@ -1,4 +1,4 @@
-"""What compiled code is made of beside Python's arithmetic: a few instructions, and the random generator.
+"""What compiled code is made of: recorded formulas as blocks, a few instructions, the random generator.
 
 The generator is counter-based: a draw is a pure function of (key, episode, step, index). So it can be made
 inside a compiled loop, costs a few integer operations, and does not depend on how many environments are
@@ -33,20 +33,20 @@ _DRAWS = np.uint64(16)  # draws set aside for each step
 _ONE = np.uint64(1)
 
 
-@njit(cache=True, forceinline=True)
+@njit(forceinline=True)
 def _mix(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> _S30)) * _M1
     z = (z ^ (z >> _S27)) * _M2
     return z ^ (z >> _S31)
 
 
-@njit(cache=True, forceinline=True)
+@njit(forceinline=True)
 def episode_key(key, episode):  # type: ignore[no-untyped-def]
     """Return the key of one episode (both uint64)."""
     return _mix(_mix(key) + episode * GOLDEN)
 
 
-@njit(cache=True, forceinline=True)
+@njit(forceinline=True)
 def uniform(key, step, index):  # type: ignore[no-untyped-def]
     """Return draw ``index`` (below 16) of step ``step`` of the episode with this key, in [0, 1)."""
     z = _mix(key + (step * _DRAWS + index + _ONE) * GOLDEN)
@@ -83,7 +83,7 @@ def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     """Ask for 512-bit vectors where the processor has them.
 
     LLVM prefers 256 bits on many such processors for the sake of mixed code; these loops are nothing but
-    arithmetic and run 1.5 to 1.7 times as fast with the full width. The result's bits do not depend on it.
+    arithmetic and run faster with the full width. The result's bits do not depend on it.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]

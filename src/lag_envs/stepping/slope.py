@@ -168,12 +168,8 @@ def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any
 
 def turns(turn: Turn, h: Any, xp: Any) -> Any:
     """Tell whether one step of the series is exact to rounding."""
-    return _growth(turn.rolling, turn.drag, turn.rate, h, xp) <= SMALL_TURN
-
-
-def _growth(rolling: Any, drag: Any, rate: Any, h: Any, xp: Any) -> Any:
     # rolling = 1/(1 + κ) lies below 1, so its root does too.
-    return h * (2.0 * drag + 3.0 * xp.abs(rate))
+    return h * (2.0 * turn.drag + 3.0 * xp.abs(turn.rate)) <= SMALL_TURN
 
 
 def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[no-untyped-def]

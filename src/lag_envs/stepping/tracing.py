@@ -19,29 +19,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
-_CODE = {
-    "a*b+c": "{} * {} + {}",
-    "a*b-c": "{} * {} - {}",
-    "c-a*b": "{2} - {0} * {1}",
-    "+": "{} + {}",
-    "-": "{} - {}",
-    "*": "{} * {}",
-    "/": "{} / {}",
-    "neg": "-{}",
-    "<": "{} < {}",
-    "<=": "{} <= {}",
-    "&": "{} & {}",
-    "|": "{} | {}",
-    "~": "not {}",
-    "where": "{1} if {0} else {2}",
-    "sqrt": "math.sqrt({})",
-    "exp": "exp({})",
-    "log": "math.log({})",
-    "sin": "math.sin({})",
-    "cos": "math.cos({})",
-    "abs": "abs({})",
-    "floor": "np.floor({})",
-}
 _FLOAT: dict[str, Callable] = {
     "+": lambda a, b: a + b,
     "-": lambda a, b: a - b,
@@ -159,8 +136,9 @@ class Trace:
     --------
     >>> trace = Trace()
     >>> a, b = trace.inputs("a", "b")
-    >>> trace.code({"out": a * b + 0.0 * a + b})
-    ['t1 = a * b + b', 'out = t1']
+    >>> operations, results = trace.operations([a * b + 0.0 * a + b])
+    >>> operations
+    [Operation(name='t1', op='a*b+c', args=('a', 'b', 'b'))]
     """
 
     def __init__(self) -> None:
@@ -234,12 +212,6 @@ class Trace:
             for node in self._nodes
             if node.name in uses and node.name not in swallowed
         ]
-
-    def code(self, outputs: dict[str, Any]) -> list[str]:
-        """Return lines of Python that compute the outputs, for people to read."""
-        operations, results = self.operations(list(outputs.values()))
-        lines = [f"{name} = {_CODE[op].format(*args)}" for name, op, args in operations]
-        return lines + [f"{name} = {value}" for name, value in zip(outputs, results, strict=True)]
 
     # The functions that a formula may call, named as in NumPy.
 
@@ -388,6 +360,10 @@ def _drop_zeros(operations: list[Operation], results: list[Value], zeros: set[st
             op, args, value = ("neg", args[2:], name) if not zero[2] else (op, args, 0.0)
         elif op in ("a*b+c", "a*b-c") and zero[2]:
             op, args = "*", args[:2]
+        elif op == "<" and args[0] == args[1]:
+            value = False
+        elif op == "where" and isinstance(args[0], bool):
+            value = args[1] if args[0] else args[2]
         if value == name:
             kept.append(Operation(name, op, args))
         else:

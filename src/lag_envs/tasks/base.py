@@ -92,18 +92,20 @@ class Task(ABC):
     @property
     def limit(self) -> float:
         """Steps of an episode; infinity for one without an end."""
-        return self.duration if math.isinf(self.duration) else float(round(self.duration / self.dt))
+        steps = self.duration / self.dt
+        return steps if math.isinf(steps) else float(round(steps))
 
     def constants(self) -> dict[str, float]:
         """Return what the compiled step needs: constants of scene, task and stepping."""
         own = {name: float(value) for name, value in self.numbers().items()}
         stepping = {"scale": self.dt / self.interval, "limit": self.limit}
-        return self.scene.constants() | own | stepping
+        goal = {} if self.target is None else {"goal": self.target}
+        return self.scene.constants() | own | stepping | goal
 
     @property
     def largest_x(self) -> float:
         """The bound's x up to which one step is certified."""
-        return pendulum.largest_x(self.dt, self.scene.order)
+        return pendulum.largest_x(self.dt, self.scene.order or pendulum.ORDER)
 
     def check_target(self, target: Any) -> float:
         """Return the target as float, or raise a ValueError."""

@@ -300,7 +300,7 @@ class Brake(Task):
 
     Stepped in closed form, written so that nothing cancels for any drag. Measured against 40 digits: below
     2e-16, relative to the size that docs/numerics.md defines. The crossing time is solved for by Newton's
-    method on the closed form, from a side on which it converges monotonically.
+    method on the closed form, started close below it.
 
     ## Optimal Value
 
