@@ -69,6 +69,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     (3, 5)
     """
 
+    _viewers: tuple[Any, ...] = ()  # there even where __init__ fails and Gymnasium closes what it made
+
     def __init__(
         self,
         task: str,
@@ -135,7 +137,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         varying = frozenset(name for name in first if any(c[name] != first[name] for c in self._constants))
         self._program = Program(self.task, absent(self._constants), varying)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
-        self._viewers: list[Any] = []
+        self._viewers = ()
 
     # --- Gymnasium's interface -----------------------------------------------------------------------------
 
@@ -270,7 +272,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._viewers:
             from lag_envs.envs.rendering import Viewer
 
-            self._viewers = [Viewer(task, "rgb_array") for task in self._tasks]
+            self._viewers = tuple(Viewer(task, "rgb_array") for task in self._tasks)
         targets = self.target if self.target is not None else [None] * self.num_envs
         return tuple(
             v.draw(s, u, g)
@@ -281,7 +283,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         """Let go of the pictures."""
         for viewer in self._viewers:
             viewer.close()
-        self._viewers = []
+        self._viewers = ()
 
     # --- what can be looked at -----------------------------------------------------------------------------
 
