@@ -3,18 +3,9 @@
 import numpy as np
 import pytest
 from mpmath import mp, mpf
-from reference import (
-    Pendulum,
-    conditioning,
-    elliptic,
-    flow,
-    linear,
-    pendulum,
-    random_cases,
-    scales,
-    slow_manifold,
-    taylor,
-)
+from reference import conditioning, flow, random_cases, scales
+
+from lag_envs.report.reference import Pendulum, elliptic, linear, pendulum, slow_manifold, taylor
 
 ZERO = mpf(0)
 KINDS = "task", "damped", "stiff", "extreme"

@@ -14,19 +14,17 @@ from mpmath import mp, mpf
 from reference import (
     EPS,
     VARIANTS,
-    Pendulum,
     conditioning,
-    elliptic,
     flow,
-    linear,
     moving_plane,
     random_cases,
     scales,
 )
-from reference import pendulum as pendulum_reference
 from scipy.integrate import solve_ivp
 
 from lag_envs import scenes
+from lag_envs.report.reference import Pendulum, elliptic, linear
+from lag_envs.report.reference import pendulum as pendulum_reference
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.pendulum import Drive

@@ -274,7 +274,7 @@ class Scene(ABC):
         dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)
-        x = pendulum.largest_x(dt, self.order or pendulum.ORDER)
+        x = self.largest_x(dt)
         row = self._simulate(
             trajectory, controls, dt, x, *(v for v in map(float, self.constants().values()) if v != 0.0)
         )
@@ -302,6 +302,10 @@ class Scene(ABC):
     def order(self) -> int:
         """Order of the flow's series; 0 for a closed form."""
         return self.flow.order
+
+    def largest_x(self, dt: float) -> float:
+        """Return the bound's x up to which one step of length dt is certified."""
+        return pendulum.largest_x(dt, self.order or pendulum.ORDER, self.flow.tolerance)
 
     def refusal(
         self, state: Array, control: float, dt: float, trajectory: Array | None, where: str

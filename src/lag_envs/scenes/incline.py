@@ -22,6 +22,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -130,7 +131,7 @@ class Incline(Scene):
             return {"pull": rolling * self.gravity, "drag": drag}
         if self.control == "tilt_rate":
             return {"rolling": rolling, "field": self.gravity, "radius": self.radius, "drag": drag}
-        sine = math.sin(self.tilt) if isinstance(self.tilt, float) else _symbolic_sine(self.tilt)
+        sine = _sine(self.tilt)
         return {"pull": rolling * self.gravity * sine, "drag": drag, "brake": rolling / self.mass}
 
     def drive(self, y: Sequence, u: Any, k: Any, xp: Any) -> slope.Pull | slope.Turn:
@@ -182,9 +183,9 @@ class Incline(Scene):
             "tilt_rate": (y[-1] if self.angle is None else y[2], u),
         }[self.control]
         if isinstance(coefficients, slope.Turn):
-            acceleration = coefficients.rolling * (self.gravity * y[4] + x * u * u) - coefficients.drag * v
+            acceleration = slope.rolling(x, v, y[4], coefficients)
         else:
-            acceleration = coefficients.pull - coefficients.drag * v
+            acceleration = slope.sliding(v, coefficients)
         return Motion(
             SimpleNamespace(x=x, phi=phi),
             SimpleNamespace(x=v, phi=rate),
@@ -276,7 +277,8 @@ class Incline(Scene):
         return Window(x - size, y - size, x + size, y + size)
 
 
-def _symbolic_sine(tilt: Any) -> Any:
-    import sympy
-
-    return sympy.sin(tilt)
+def _sine(angle: Any) -> Any:
+    """Return the sine of a float, or of a number of SymPy or mpmath by their own function."""
+    if isinstance(angle, float):
+        return math.sin(angle)
+    return import_module(type(angle).__module__.partition(".")[0]).sin(angle)

@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 class Flow(NamedTuple):
     """An exact flow: what it moves, and two ways to run it.
 
-    ``fast(variables, coefficients, dt)`` is the formula of an ordinary step,
+    ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step. ``order`` is that of the series, 0 for a closed form.
+    makes the scalar function for any step. ``order`` is that of the series, 0 for a closed form;
+    ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
     """
 
     size: int
@@ -36,13 +37,14 @@ class Flow(NamedTuple):
     fast: Callable
     within: Callable
     compile: Callable
+    tolerance: float = pendulum.TOLERANCE
 
 
 @cache
-def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
+def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLERANCE) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
 
-    def fast(variables: Sequence, drive: pendulum.Drive, dt: Any) -> tuple:
+    def fast(variables: Sequence, drive: pendulum.Drive, dt: Any, xp: Any) -> tuple:
         theta, omega, c, s = variables
         return pendulum.step(theta, omega, c, s, drive, dt, order)
 
@@ -52,11 +54,12 @@ def pendulum_flow(order: int = pendulum.ORDER) -> Flow:
         order,
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
-        lambda present: pendulum.compile_flow(present, order),
+        lambda present: pendulum.compile_flow(present, order, tolerance),
+        tolerance,
     )
 
 
-def _turn(variables: Sequence, turn: slope.Turn, dt: Any) -> tuple:
+def _turn(variables: Sequence, turn: slope.Turn, dt: Any, xp: Any) -> tuple:
     x, v, c, s = variables
     return *slope.turn_series(x, v, c, s, turn, dt), *slope.rotate(c, s, turn.rate * dt)
 
@@ -65,7 +68,7 @@ SLIDE = Flow(
     2,
     slope.Pull,
     0,
-    lambda variables, pull, dt: slope.slide(variables[0], variables[1], pull, dt),
+    lambda variables, pull, dt, xp: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
 )
@@ -159,7 +162,7 @@ class Stepper:
 
         def move(xp: Any, *values: Any) -> tuple:
             variables, coefficients, (dt,) = split(values, flow.size, terms)
-            return flow.fast(variables, flow.coefficients(*coefficients), dt)
+            return flow.fast(variables, flow.coefficients(*coefficients), dt, xp)
 
         def within(xp: Any, *values: Any) -> list:
             variables, coefficients, (dt, x) = split(values, flow.size, terms)

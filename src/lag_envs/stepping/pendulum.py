@@ -281,7 +281,7 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
 
 
 @cache
-def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
+def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float = TOLERANCE) -> Callable:
     """Compile `_flow` for a pendulum that has only some of the terms.
 
     Parameters
@@ -290,6 +290,8 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
         For each coefficient of `Drive`, whether it is there; the others leave no code behind.
     order : int, default 16
         Order of the series.
+    tolerance : float, default 1e-12
+        What substeps are chosen for [rad/s].
 
     Returns
     -------
@@ -313,6 +315,6 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER) -> Callable:
     )
     turn = compile_traced("turn", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
     rate = compile_python("_rate", _rate)
-    count = compile_python("_substeps", _substeps, rate, TOLERANCE=TOLERANCE)
+    count = compile_python("_substeps", _substeps, rate, TOLERANCE=tolerance)
     slow = compile_python("_slow_substep", _slow_substep, turn, order=order)
     return compile_python("flow", _flow, holds, series, count, slow, order=order, MAX_SUBSTEPS=MAX_SUBSTEPS)

@@ -43,6 +43,11 @@ class Pull(NamedTuple):
     drag: Any = 0.0  # [1/s]
 
 
+def sliding(v: Any, force: Pull) -> Any:
+    """Return x'' on a fixed slope."""
+    return force.pull - force.drag * v
+
+
 def slide(x: Any, v: Any, force: Pull, dt: Any) -> tuple:
     """Advance (x, x') by dt for drag·dt up to `SMALL_DECAY` in size."""
     decay = force.drag * dt
@@ -140,6 +145,11 @@ class Turn(NamedTuple):
     gravity: Any  # [m/s²]
     drag: Any  # [1/s]
     rate: Any  # Ω [rad/s]
+
+
+def rolling(x: Any, v: Any, s: Any, turn: Turn) -> Any:
+    """Return x'' on a turning slope; s is sinφ."""
+    return turn.rolling * (turn.gravity * s + x * (turn.rate * turn.rate)) - turn.drag * v
 
 
 def turn_change(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:

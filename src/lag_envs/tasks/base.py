@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene, check_number
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
-from lag_envs.stepping import pendulum
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
@@ -105,7 +104,7 @@ class Task(ABC):
     @property
     def largest_x(self) -> float:
         """The bound's x up to which one step is certified."""
-        return pendulum.largest_x(self.dt, self.scene.order or pendulum.ORDER)
+        return self.scene.largest_x(self.dt)
 
     def check_target(self, target: Any) -> float:
         """Return the target as float, or raise a ValueError."""

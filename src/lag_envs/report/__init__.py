@@ -1,0 +1,15 @@
+"""Error against run time, and stability: what ``lag-envs report`` measures, and how it is shown.
+
+=====================  =====================================================================
+`report`               the whole: settings, jobs, files
+`runner`               runs jobs in processes of their own, keeps what is finished
+`content`              what a section shows: text, tables, pictures, claims
+`page`                 HTML, Markdown, CSV and the README's tables from the measured rows
+`reference`            high precision, by methods that stepping does not use
+`steppers`             the steppers that people would otherwise use
+`peers`                other libraries' steppers, and MuJoCo
+`work_precision` ...   one module per section: its jobs, what they measure, what it shows
+=====================  =====================================================================
+
+None of this is used by the environments; it needs the extra ``report``.
+"""

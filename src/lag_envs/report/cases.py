@@ -1,0 +1,118 @@
+"""The scenes that the report measures, and random problems on them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
+from lag_envs.scenes.base import Scene
+
+
+class Variant(NamedTuple):
+    """A scene with one kind of control, and the ranges that problems on it are drawn from."""
+
+    name: str
+    kind: type[Scene]
+    parameters: dict[str, Any]
+    dt: float  #: control step [s]
+    spread: Sequence[float]  #: states lie within, in the scene's units
+    controls: tuple[float, float]
+
+    def scene(self, **changes: Any) -> Scene:
+        """Return the scene, with other parameters if asked for."""
+        return self.kind(**(self.parameters | changes))
+
+
+#: Damped as the tasks are, and wider ranges of states than tasks reach on the way.
+VARIANTS = {
+    variant.name: variant
+    for variant in (
+        Variant("PivotedBar", PivotedBar, {"damping": 0.001, "track": None}, 0.02, (math.pi, 12), (-5, 5)),
+        Variant("Incline, drag", Incline, {"tilt": math.pi / 12}, 0.02, (3, 3), (0, 6)),
+        Variant(
+            "Incline, moving",
+            Incline,
+            {"damping": 0.03, "control": "tilt_rate"},
+            0.05,
+            (0.5, 1, 0.1),
+            (-0.3, 0.3),
+        ),
+        Variant(
+            "CylinderInCylinder, drag", CylinderInCylinder, {"control": "damping"}, 0.02, (1.3, 5), (0, 2.4)
+        ),
+        Variant(
+            "CylinderInCylinder, tilt", CylinderInCylinder, {"damping": 0.024}, 0.05, (1.3, 5, 6), (-15, 15)
+        ),
+    )
+}
+
+
+class Case(NamedTuple):
+    """A start on a scene, and a control that is held."""
+
+    scene: Scene
+    state: tuple[float, ...]
+    control: float
+
+
+def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Case]:
+    """Return n random problems on a variant: states and controls uniform in its ranges.
+
+    Parameters
+    ----------
+    name : str
+        Name of the variant.
+    n, seed : int
+        How many, and of which sequence; a longer ensemble begins with the shorter one.
+    vary : bool, default True
+        Multiply every parameter that is not zero by a factor between 1/2 and 2, log-uniform.
+
+    Examples
+    --------
+    >>> [case.state for case in ensemble("PivotedBar", 2, seed=1)] == [
+    ...     case.state for case in ensemble("PivotedBar", 3, seed=1)[:2]
+    ... ]
+    True
+    """
+    variant = VARIANTS[name]
+    base = variant.scene()
+    cases = []
+    for i in range(n):
+        rng = np.random.default_rng([seed, i])
+        state = tuple(float(rng.uniform(-s, s)) for s in variant.spread)
+        control = float(rng.uniform(*variant.controls))
+        changes = {}
+        for field in dataclasses.fields(base):
+            value = getattr(base, field.name)
+            if vary and "unit" in field.metadata and value and field.name != "inertia":
+                changes[field.name] = value * 2.0 ** float(rng.uniform(-1, 1))
+        if changes.get("radius", 0.0) >= changes.get("shell_radius", math.inf):
+            changes["radius"] = 0.5 * changes["shell_radius"]
+        cases.append(Case(variant.scene(**changes), state, control))
+    return cases
+
+
+def scales(case: Case, dt: float) -> list[float]:
+    """Return the size that the error of each state entry is relative to, as the README defines accuracy.
+
+    Angles and lengths max(1, |q|, |q'| dt), their rates max(1, |q'|, what the field adds).
+    """
+    from types import SimpleNamespace
+
+    from lag_envs.stepping import pendulum
+
+    scene, state, u = case
+    y = scene.lift(np.asarray(state))
+    coefficients = scene.drive(y, u, SimpleNamespace(**scene.constants()), np)
+    q, v = (float(x) for x in scene.unpack(y, u, SimpleNamespace(**scene.constants()))[:2])
+    if isinstance(coefficients, pendulum.Drive):
+        gain = math.sqrt(math.hypot(coefficients.alpha, coefficients.beta))
+    else:
+        gain = getattr(scene, "gravity", 0.0) * dt
+    place, rate = max(1.0, abs(q), abs(v) * dt), max(1.0, abs(v), gain)
+    return [rate if unit.endswith("/s") else place for unit in scene.state_units]

@@ -1,0 +1,52 @@
+"""What a section of the report shows, apart from how it is set: text, tables, pictures, claims."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; numbers stay numbers, so that CSV has them in full."""
+
+    name: str  #: of the CSV file, and the anchor
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure, drawn when it is written."""
+
+    name: str  #: of the file
+    caption: str  #: says what is shown, of which cases, and the reference
+    draw: Callable[[], Figure]
+    raster: bool = False  #: many cells or points: PNG instead of SVG
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A statement that was measured; `holds` is None where there was nothing to measure it by."""
+
+    text: str
+    holds: bool | None
+    evidence: str
+
+
+@dataclass(frozen=True)
+class Content:
+    """A section."""
+
+    title: str
+    text: Sequence[str]  #: paragraphs: what was measured, how, against which reference
+    tables: Sequence[Table] = ()
+    pictures: Sequence[Picture] = ()
+    claims: Sequence[Claim] = ()
+    summary: Table | None = None  #: a small table for the README
+    details: Sequence[Table] = field(default=())  #: long tables: CSV only
