@@ -5,6 +5,8 @@ import pytest
 from mpmath import mp, mpf
 from reference import conditioning, flow, random_cases, scales
 
+from lag_envs import scenes
+from lag_envs.report import reference
 from lag_envs.report.reference import Pendulum, elliptic, linear, pendulum, slow_manifold, taylor
 
 ZERO = mpf(0)
@@ -274,3 +276,24 @@ def test_random_cases(kind):
     for case in cases:
         assert len(scales(*arguments(case))) == len(case["state"])
         assert np.all(np.isfinite([*case["state"], case["control"], case["dt"]]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_scenes_own_coefficients_are_the_typed_ones(kind):
+    """The report takes coefficients from the scene's formulas; here they are typed in again."""
+    for case in random_cases(kind, 12, seed=8):
+        scene = getattr(scenes, case["scene"])(**case["params"])
+        end = reference.flow(scene, case["state"], case["control"], case["dt"])
+        assert distance(end, flow(*arguments(case))) < 1e-29, case
+
+
+def test_remembered(tmp_path, monkeypatch):
+    problem = scenes.PivotedBar(track=None), (2.0, 0.1), 3.0, 0.02
+    monkeypatch.setattr(reference, "store", tmp_path)
+    first = reference.remembered(*problem)
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr(reference, "flow", None)  # not called again
+    assert distance(reference.remembered(*problem), first) < 1e-38
+    assert reference.errors([float(x) for x in first], first) == pytest.approx([0.0, 0.0], abs=1e-15)
+    with pytest.raises(TypeError):
+        reference.remembered(*problem[:3], 0.03)
