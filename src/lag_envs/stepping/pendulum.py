@@ -263,13 +263,19 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
         return theta, omega, c, s, -1
     h = layer / n
     # What rounding takes from the two sums is handed on (Kahan): equal terms would all round to one side.
-    lost_angle = lost_speed = 0.0
+    turned = lost_angle = lost_speed = 0.0
+    c0, s0 = c, s
     for i in range(int(n)):
         angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)
         angle, speed = angle - lost_angle, change / h - lost_speed
-        theta_end, omega_end = theta + angle, omega + speed
-        lost_angle, lost_speed = (theta_end - theta) - angle, (omega_end - omega) - speed
-        theta, omega = theta_end, omega_end
+        turned_end, omega_end = turned + angle, omega + speed
+        lost_angle, lost_speed = (turned_end - turned) - angle, (omega_end - omega) - speed
+        turned, omega = turned_end, omega_end
+        if i % 8 == 7:  # turned anew from the start, before the roundings of many small turns add up
+            p, q = math.cos(turned), math.sin(turned)
+            p, q = p + lost_angle * q, q - lost_angle * p
+            c, s = c0 * p - s0 * q, s0 * p + c0 * q
+    theta += turned
     if slow:
         h = (dt - layer) / m
         for i in range(int(m)):
