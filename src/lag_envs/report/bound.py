@@ -1,0 +1,460 @@
+"""The bound that is known before a step, against what the step really leaves out.
+
+Truncation is compared with truncation: the product's recurrence runs on numbers of 110 digits, so that
+nothing is rounded, and its sum is held against the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpmath import mp, mpf
+
+from lag_envs.report import reference
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.runner import Job, Result, Row
+from lag_envs.stepping import pendulum
+from lag_envs.stepping.pendulum import Drive
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SECTION = "bound"
+ORDERS = (8, 12, 14, 16, 20)
+DIGITS = 70
+MOST_SUBSTEPS = 100  # of the steps whose cost is looked at, which run as plain Python
+TOLERANCE = pendulum.TOLERANCE
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return the section's jobs."""
+    from lag_envs.tasks import TASKS
+
+    parts, size = (2, 6) if quick else (6, 30)
+    found = [
+        Job(SECTION, f"random drives {i + 1}", "bound:points", {"n": size, "seed": i}) for i in range(parts)
+    ]
+    found += [
+        Job(SECTION, f"substeps {i + 1}", "bound:cost", {"n": 12 if quick else 50, "seed": i})
+        for i in range(1 if quick else 6)
+    ]
+    names = [name for name in TASKS if not name.startswith("Incline")]
+    return found + [
+        Job(SECTION, name, "bound:environment", {"id": name, "n": 6 if quick else 40})
+        for name in (names[:1] if quick else names)
+    ]
+
+
+# --- measuring ---
+
+
+class Exact:
+    """An mpmath number that takes a float factor for the fraction it stands for, such as 1.0 / 3 for 1/3.
+
+    With it the recurrence that is compiled for floats has no rounding left, not even in its constants.
+    """
+
+    def __init__(self, value: mpf) -> None:
+        self.value = value
+
+    def __add__(self, other: Any) -> Exact:
+        return Exact(self.value + _value(other))
+
+    def __sub__(self, other: Any) -> Exact:
+        return Exact(self.value - _value(other))
+
+    def __rsub__(self, other: Any) -> Exact:
+        return Exact(_value(other) - self.value)
+
+    def __mul__(self, other: Any) -> Exact:
+        return Exact(self.value * _value(other))
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+
+def _value(other: Any) -> mpf:
+    if isinstance(other, Exact):
+        return other.value
+    fraction = Fraction(other).limit_denominator(1000)
+    return mpf(fraction.numerator) / fraction.denominator
+
+
+def series(theta: float, omega: float, drive: Drive, h: float, order: int) -> tuple[mpf, mpf]:
+    """Return (θ, θ') after one step of the series in exact arithmetic, from floats taken as exact."""
+    step = mpf(h)
+    cos, sin = mp.cos_sin(mpf(theta))
+    scaled = Drive(*map(Exact, pendulum.scaled(Drive(*map(mpf, drive)), step)))
+    W, _ = pendulum.taylor_coefficients(Exact(omega * step), Exact(cos), Exact(sin), scaled, order)
+    w = [x.value for x in W]
+    return theta + mp.fsum(x / (k + 1) for k, x in enumerate(w)), mp.fsum(w) / step
+
+
+def truth(theta: float, omega: float, drive: Drive, h: float, digits: int) -> tuple[mpf, mpf]:
+    """Return (θ, θ') after the step, from the reference at two precisions, which have to agree."""
+    problem = reference.Pendulum(*map(mpf, drive))
+    rough, fine = (
+        reference.pendulum(problem, mpf(theta), mpf(omega), mpf(h), d) for d in (digits, digits + 9)
+    )
+    if max(abs(a - b) / max(1, abs(b)) for a, b in zip(rough, fine, strict=True)) > mpf(10) ** (10 - digits):
+        raise reference.Unresolved(f"two precisions differ at {digits} digits")
+    return fine
+
+
+def truncation(
+    theta: float, omega: float, drive: Drive, h: float, order: int, digits: int = DIGITS
+) -> tuple[float, float]:
+    """Return what one step of the series leaves out of θ [rad] and of θ' [rad/s]."""
+    with mp.workdps(digits + 40):
+        ends = zip(series(theta, omega, drive, h, order), truth(theta, omega, drive, h, digits), strict=True)
+        angle, speed = (float(abs(a - b)) for a, b in ends)
+        return angle, speed
+
+
+def random_problem(rng: np.random.Generator) -> tuple[float, float, Drive]:
+    """Return θ, θ' and a drive, from calm to violent, each term present four times out of five."""
+    exponents = rng.uniform([-1, -1, -2, -1, -1], [3, 3, 2, 3, 4])
+    sizes = 10.0**exponents * rng.uniform(-1, 1, 5) * (rng.random(5) < 0.8)
+    sizes[2] = abs(sizes[2])
+    omega = rng.uniform(-1, 1) * 10.0 ** rng.uniform(-1, 1.5)
+    return float(rng.uniform(-4, 4)), float(omega), Drive(*map(float, sizes))
+
+
+def step_at(omega: float, drive: Drive, x: float) -> float:
+    """Return the longest step [s] that the bound certifies with this x."""
+    low, high = -40.0, 5.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        good = pendulum.certified(omega, drive, math.exp(middle), x, np)
+        low, high = (middle, high) if good else (low, middle)
+    return math.exp(low)
+
+
+def majorant(x: float, h: float, order: int) -> tuple[float, float]:
+    """Return the bounds on what one step leaves out of θ and θ'."""
+    tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0)
+    return tail / (order + 2), tail / h
+
+
+def points(n: int, seed: int) -> Iterator[Row]:
+    """Yield bound and truncation of one step of every order for n random drives."""
+    for i in range(n):
+        rng = np.random.default_rng([seed, i])
+        theta, omega, drive = random_problem(rng)
+        x = float(0.02 * 25.0 ** rng.uniform())
+        h = step_at(omega, drive, x)
+        for order in ORDERS:
+            bounds, actual = majorant(x, h, order), truncation(theta, omega, drive, h, order)
+            row = {"kind": "point", "order": order, "x": x, "h": h, "theta_0": theta, "omega_0": omega}
+            row |= {"drive": list(drive), "theta_bound": bounds[0], "theta": actual[0]}
+            yield row | {"theta_dot_bound": bounds[1], "theta_dot": actual[1]}
+
+
+def cost(n: int, seed: int) -> Iterator[Row]:
+    """Yield, for steps of any length, the substeps that the bound asks for and the fewest that are enough."""
+    for i in range(n):
+        rng = np.random.default_rng([9, seed, i])
+        theta, omega, drive = random_problem(rng)
+        h = step_at(omega, drive, float(0.1 * 40.0 ** rng.uniform()))
+        while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
+            h /= 2.0
+        with mp.workdps(60):
+            exact = reference.pendulum(
+                reference.Pendulum(*map(mpf, drive)), mpf(theta), mpf(omega), mpf(h), 30
+            )
+        field = math.sqrt(math.hypot(drive.alpha, drive.beta))
+        limits = (
+            TOLERANCE * max(1.0, abs(theta), abs(omega) * h),
+            TOLERANCE * max(1.0, abs(omega), field),
+        )
+        low, needed = 0, chosen if _enough(theta, omega, drive, h, chosen, exact, limits) else None
+        while needed and needed - low > 1:
+            middle = (low + needed) // 2
+            if _enough(theta, omega, drive, h, middle, exact, limits):
+                needed = middle
+            else:
+                low = middle
+        yield {"kind": "cost", "h": h, "chosen": chosen, "needed": needed, "drive": list(drive)}
+
+
+def _enough(
+    theta: float, omega: float, drive: Drive, dt: float, n: int, exact: Sequence[mpf], limits: Sequence[float]
+) -> bool:
+    """Tell whether n substeps, in float64, are as accurate as asked for."""
+    h = dt / n
+    y: Any = theta, omega, math.cos(theta), math.sin(theta)
+    for i in range(n):
+        theta, omega, c, s = y
+        y = pendulum.step(theta, omega, c, s, drive._replace(delta=drive.delta + drive.ramp * (i * h)), h)
+    return all(abs(e) <= m for e, m in zip(reference.errors(y[:2], exact), limits, strict=True))
+
+
+def environment(id: str, n: int) -> Iterator[Row]:
+    """Yield what the bound certifies of an environment, and n of its steps at random within that."""
+    from types import SimpleNamespace
+
+    from lag_envs.cli import _controls
+    from lag_envs.tasks import TASKS, load_task
+
+    place, fixed = TASKS[id]
+    task = load_task(place)(**fixed)
+    scene, dt, k = task.scene, task.dt, SimpleNamespace(**task.scene.constants())
+    low, high = _controls(task)
+    angle = scene.angle
+    assert angle is not None
+
+    def bound(speed: float, u: float) -> pendulum.Bound:
+        found = scene.truncation_bound(_state(task, 0.0, speed), u, dt)
+        assert found is not None
+        return found
+
+    reach = _largest(lambda speed: max(bound(speed, u).substeps for u in (low, high)) == 1)
+    rng = np.random.default_rng(1)
+
+    def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
+        y = scene.lift(np.array(_state(task, theta, speed)))
+        drive = Drive(*map(float, scene.drive(y, u, k, math)))
+        return truncation(theta, speed, drive, dt, scene.order, digits)
+
+    for _ in range(n):
+        theta, speed, u = (float(v) for v in rng.uniform([-math.pi, -reach, low], [math.pi, reach, high]))
+        known, actual = bound(speed, u), left_out(theta, speed, u)
+        row = {"kind": "environment", "id": id, "order": known.order, "dt": dt, "reach": reach}
+        row |= {"theta_bound": known.theta, "theta": actual[0], "theta_dot_bound": known.theta_dot}
+        yield row | {"theta_dot": actual[1], "speed": speed, "substeps": known.substeps}
+    places = [float(v) for v in rng.uniform(-math.pi, math.pi, max(4, n // 5))]
+    needed = _largest(
+        lambda speed: all(
+            left_out(theta, speed, u, 30)[1] <= TOLERANCE for theta in places for u in (low, high)
+        ),
+        steps=10,
+    )
+    yield {"kind": "reach", "id": id, "order": scene.order, "dt": dt, "certified": reach, "actual": needed}
+
+
+def _state(task: Any, theta: float, speed: float) -> list[float]:
+    """Return a state with the given angle and rate, the other entries at the edge of the task's starts."""
+    state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+    state[task.scene.angle : task.scene.angle + 2] = theta, speed
+    return state
+
+
+def _largest(good: Callable[[float], bool], steps: int = 40) -> float:
+    """Return the largest speed up to 1e4 rad/s that is good, by bisection."""
+    low, high = 0.0, 1e4
+    for _ in range(steps):
+        middle = math.sqrt(max(low, 1e-2) * high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low
+
+
+# --- showing ---
+
+COLOURS = {8: "#cc79a7", 12: "#56b4e9", 14: "#e69f00", 16: "#0072b2", 20: "#009e73"}
+QUANTITIES = (("theta", "θ", "rad"), ("theta_dot", "θ'", "rad/s"))
+
+
+def content(rows: list[Row], problems: list[Result]) -> Content:
+    """Return what the section shows."""
+    kinds = {
+        kind: [r for r in rows if r["kind"] == kind] for kind in ("point", "environment", "cost", "reach")
+    }
+    measured = kinds["point"] + kinds["environment"]
+    broken = [r for r in measured for name, _, _ in QUANTITIES if r[name] > r[f"{name}_bound"]]
+    closest = min((m for r in measured for m in _margins([r])), default=None)
+    tight = _table(
+        "bound-tightness",
+        "Bound over truncation of one step, both in exact arithmetic, for random drives. Never below 1 means "
+        "never broken. 50 % is the median. Per power: the (order + 1)th root of the median for θ', by how "
+        "much the bound sees the step as longer than it is.",
+        kinds["point"],
+        lambda r: f"order {r['order']}",
+    )
+    scenes = _reach_table(kinds["environment"], kinds["reach"])
+    counted = [r for r in kinds["cost"] if r["needed"]]
+    claims = [
+        Claim(
+            "The bound is never broken.",
+            not broken if measured else None,
+            f"{len(broken)} of {2 * len(measured)} comparisons broken"
+            + (f"; the closest is a factor of {closest:.3g}" if closest else ""),
+        ),
+        Claim(
+            "The substeps that the bound asks for are enough for 1e-12.",
+            len(counted) == len(kinds["cost"]) if kinds["cost"] else None,
+            f"{len(counted)} of {len(kinds['cost'])} random steps",
+        ),
+    ]
+    pictures = []
+    if kinds["point"]:
+        pictures.append(
+            Picture(
+                "bound-scatter",
+                "Proved bound against what a step really leaves out, for random drives and steps such that "
+                "x, the size that the bound follows from, lies between 0.02 and 0.5. Every point must lie "
+                f"left of the line. The truth is the reference with {DIGITS} digits; the series is summed "
+                "without rounding.",
+                lambda: _draw_scatter(kinds["point"]),
+            )
+        )
+    if counted:
+        pictures.append(
+            Picture(
+                "bound-cost",
+                "What the bound costs: substeps that it asks for against the fewest that reach 1e-12, order "
+                "16, random drives and steps. Circles grow with the number of cases. On the line nothing is "
+                "wasted.",
+                lambda: _draw_cost(counted),
+            )
+        )
+    return Content(
+        "A bound known before the step",
+        [
+            "Before a step is taken, a bound on what the Taylor series leaves out is known. Here it is "
+            "compared with what is left out. Both sides are truncation: the recurrence that is compiled for "
+            f"floats runs on numbers with {DIGITS + 40} digits, its constants included, and is held against "
+            "the reference solution. Rounding plays no part.",
+            "The bound holds for every field, drag and drive of a given size, whatever the angle, so it is "
+            "far above what most steps leave out. That costs little: a series of order N makes up for such a "
+            "factor by a step that is shorter by the factor's (N + 1)th root.",
+            _cost_text(kinds["cost"]),
+        ],
+        tables=[table for table in (tight, scenes, _problem_table(problems)) if table],
+        pictures=pictures,
+        claims=claims,
+        summary=scenes,
+        details=[_details(measured)] if measured else [],
+    )
+
+
+def _margins(rows: Sequence[Row]) -> list[float]:
+    """Return bound over truncation of both quantities, where something is left out at all."""
+    return [r[f"{name}_bound"] / r[name] for r in rows for name, _, _ in QUANTITIES if r[name]]
+
+
+def _quantiles(rows: Sequence[Row], name: str) -> list[float | None]:
+    ratios = [r[f"{name}_bound"] / r[name] for r in rows if r[name]]
+    if not ratios:
+        return [None] * 4
+    return [float(v) for v in np.quantile(ratios, [0.0, 0.1, 0.5, 0.9])]
+
+
+def _table(name: str, caption: str, rows: Sequence[Row], key: Callable[[Row], str]) -> Table | None:
+    if not rows:
+        return None
+    groups: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda r: r["order"]):
+        groups.setdefault(key(row), []).append(row)
+    lines = []
+    for group, found in groups.items():
+        angle, speed = _quantiles(found, "theta"), _quantiles(found, "theta_dot")
+        per_power = speed[2] and speed[2] ** (1.0 / (found[0]["order"] + 1))
+        lines.append([group, len(found), *angle, *speed, per_power])
+    parts = [f"{sign}: {q}" for _, sign, _ in QUANTITIES for q in ("least", "10 %", "50 %", "90 %")]
+    return Table(name, caption, ["series", "steps", *parts, "per power"], lines)
+
+
+def _reach_table(steps: Sequence[Row], reaches: Sequence[Row]) -> Table | None:
+    if not steps and not reaches:
+        return None
+    known = {r["id"]: r for r in reaches}
+    lines = []
+    for id in dict.fromkeys(r["id"] for r in [*steps, *reaches]):
+        found = [r for r in steps if r["id"] == id]
+        order, dt = (known.get(id) or found[0])["order"], (known.get(id) or found[0])["dt"]
+        least, _, median, _ = _quantiles(found, "theta_dot")
+        worst = max((r["theta_dot"] for r in found), default=None)
+        certified = known[id]["certified"] if id in known else found[0]["reach"]
+        actual = known[id]["actual"] if id in known else None
+        lines.append([id, dt, order, certified, actual, worst, least, median])
+    return Table(
+        "bound-environments",
+        "Each environment with a pendulum: the speed up to which one series per step is certified to leave "
+        "out less than 1e-12 rad/s under its largest controls, and the speed up to which it really does at "
+        "all angles tried; the largest truncation met within the certified speeds, and the bound over the "
+        "truncation (least, median).",
+        [
+            "id",
+            "dt [s]",
+            "order",
+            "certified to [rad/s]",
+            "really to [rad/s]",
+            "largest truncation [rad/s]",
+            "bound/truncation, least",
+            "median",
+        ],
+        lines,
+    )
+
+
+def _cost_text(rows: Sequence[Row]) -> str:
+    counted = [r for r in rows if r["needed"]]
+    if not counted:
+        return "The cost of the bound was not measured."
+    ratios = [r["chosen"] / r["needed"] for r in counted]
+    text = (
+        f"Over {len(counted)} random steps of 1 to {max(r['chosen'] for r in counted)} substeps the bound "
+        f"asks for {float(np.median(ratios)):.2g} times the fewest that reach 1e-12 (median; at most "
+        f"{max(ratios):.2g} times)."
+    )
+    missed = len(rows) - len(counted)
+    return text + (f" In {missed} cases the number asked for was not enough." if missed else "")
+
+
+def _problem_table(problems: Sequence[Result]) -> Table | None:
+    lines = [[p.name, p.problem] for p in problems]
+    return (
+        Table("bound-problems", "What could not be measured.", ["job", "problem"], lines) if lines else None
+    )
+
+
+def _details(rows: Sequence[Row]) -> Table:
+    columns = ["id", "order", "x", "h", "theta_0", "omega_0", "drive", "theta_bound", "theta"]
+    columns += ["theta_dot_bound", "theta_dot"]
+    lines = [[_cell(r.get(c)) for c in columns] for r in rows]
+    return Table("bound-steps", "Every step whose bound was compared.", columns, lines)
+
+
+def _cell(value: Any) -> Any:
+    return " ".join(map(repr, value)) if isinstance(value, list) else value
+
+
+def _draw_scatter(rows: Sequence[Row]) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    for axes, (name, sign, unit) in zip(figure.subplots(1, 2), QUANTITIES, strict=True):
+        found = [(r[name], r[f"{name}_bound"], r["order"]) for r in rows if r[name]]
+        ends = [min(min(a, b) for a, b, _ in found) / 3, max(b for _, b, _ in found) * 3]
+        axes.plot(ends, ends, color="black", linewidth=1.5)
+        axes.annotate(
+            "bound = truncation", ends[1:] * 2, (-6, -18), textcoords="offset points", ha="right", fontsize=9
+        )
+        for order in sorted({o for _, _, o in found}):
+            mine = [(a, b) for a, b, o in found if o == order]
+            x, y = zip(*mine, strict=True)
+            axes.scatter(x, y, s=12, color=COLOURS.get(order, "grey"), label=f"order {order}")
+        axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends)
+        axes.set(xlabel=f"truncation of {sign} [{unit}]", ylabel=f"bound [{unit}]")
+        axes.grid(alpha=0.3)
+    axes.legend(fontsize=9)
+    return figure
+
+
+def _draw_cost(rows: Sequence[Row]) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4.6), layout="constrained")
+    axes = figure.subplots()
+    places, counts = np.unique([(r["needed"], r["chosen"]) for r in rows], axis=0, return_counts=True)
+    end = max(r["chosen"] for r in rows) * 1.3
+    axes.plot([0.8, end], [0.8, end], color="black", linewidth=1.5)
+    axes.scatter(places[:, 0], places[:, 1], s=25.0 * np.sqrt(counts), color=COLOURS[16], alpha=0.7)
+    axes.set(xscale="log", yscale="log", xlim=(0.8, end), ylim=(0.8, end))
+    axes.set(xlabel="fewest substeps that reach 1e-12", ylabel="substeps that the bound asks for")
+    axes.grid(alpha=0.3)
+    return figure
