@@ -1,0 +1,214 @@
+"""A control step by any flow, compiled for one trajectory and for a batch, and the time that it takes.
+
+Both are made from the same recorded code, by the same compiler at the same vector width, whoever's method it
+is, so that times compare methods.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from statistics import median
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.report.cases import Case
+from lag_envs.report.steppers import with_flow
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.flows import Flow
+
+Array = NDArray[np.float64]
+K = TypeVar("K")
+BLOCK = 64  #: states of a batch whose numbers lie together in the processor's nearest cache
+
+
+class Kernels:
+    """The steps of a scene by one flow.
+
+    Parameters
+    ----------
+    scene : Scene
+        Which of its constants are zero decides the code; problems on the same kind of scene share it.
+    flow : Flow
+        Ours or a comparison stepper.
+
+    Examples
+    --------
+    >>> from lag_envs.report.cases import Case
+    >>> from lag_envs.scenes import PivotedBar
+    >>> bar = PivotedBar(track=None)
+    >>> case = Case(bar, (3.0, 0.0), 1.0)
+    >>> end = bar.simulate(case.state, [case.control] * 50, 0.02)[-1]
+    >>> Kernels(bar, bar.flow).end(case, 0.02, 50).tolist() == end.tolist()
+    True
+    """
+
+    def __init__(self, scene: Scene, flow: Flow) -> None:
+        self.scene = with_flow(scene, flow)
+        self._code = self.scene.stepper()
+        self._names = [name.removeprefix("k_") for name in self._code.constants]
+        #: Whether every step is an ordinary one, as those of the comparison steppers.
+        self.plain = any(line == "within = True" for line in self._code.fast)
+
+    def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
+        """Return what the compiled functions take behind states and controls."""
+        constants = scene.constants()
+        present = [name for name, value in constants.items() if value != 0.0]
+        if present != self._names:
+            raise ValueError(f"compiled for the constants {self._names}, got {present}")
+        return (dt, self.scene.largest_x(dt), *(float(constants[name]) for name in present))
+
+    @cached_property
+    def simulate(self) -> Callable:
+        """``simulate(trajectory, controls, dt, x, constants...)``, as `Scene.simulate` calls it."""
+        return self._code.compile_simulate()
+
+    def end(self, case: Case, dt: float, steps: int) -> Array:
+        """Return the state after some steps with the control held; NaN where a step was refused."""
+        trajectory = np.empty((steps + 1, len(case.state)))
+        trajectory[0] = case.state
+        refused = self.simulate(trajectory, np.full(steps, case.control), *self.arguments(case.scene, dt))
+        return np.full(len(case.state), np.nan) if refused else trajectory[-1]
+
+    @cached_property
+    def several(self) -> Callable:
+        """``several(trajectories, controls, dt, x, constants...)``: one trajectory after the other."""
+        extra = "".join(f", {name}" for name in self._code.constants)
+        lines = [
+            f"def several(trajectories, controls, dt, x{extra}):",
+            "refused = 0",
+            "for j in range(controls.shape[0]):",
+            f"    refused += simulate(trajectories[j], controls[j], dt, x{extra})",
+            "return refused",
+        ]
+        return compile_function("several", "\n    ".join(lines) + "\n", self.simulate)
+
+    @cached_property
+    def batch(self) -> Callable:
+        """``batch(rows, count, steps, dt, x, constants...)``: many states, block by block, each some steps.
+
+        Returns how many steps were refused. `fill` and `states` tell what lies where.
+        """
+        code = self._code
+        names = [*code.start, "u", "ordinary"]
+
+        def at(name: str) -> str:
+            return f"rows[base + np.uint64({BLOCK * names.index(name)}) + i]"
+
+        load = [f"{name} = {at(name)}" for name in [*code.start, "u"]]
+        fast = [*load, *code.fast]
+        if self.plain:
+            fast += [f"{at(y)} = {z}" for y, z in zip(code.start, code.end, strict=True)]
+        else:
+            fast += [f"{at(y)} = select(within, {z}, {y})" for y, z in zip(code.start, code.end, strict=True)]
+            fast += [f"{at('ordinary')} = select(within, 1.0, 0.0)"]
+        redo = [
+            "slow = 0",
+            "for i in lanes:",
+            f"    slow += {at('ordinary')} == 0.0",
+            "if slow > 0:",
+            "    for i in lanes:",
+            f"        if {at('ordinary')} == 0.0:",
+            *(f"            {line}" for line in load),
+            f"            {', '.join(code.start)}, status = advance({code.arguments})",
+            "            refused += status < 0",
+            *(f"            {at(y)} = {y}" for y in code.start),
+        ]
+        lines = [
+            f"def batch(rows, count, steps, dt, x{''.join(f', {name}' for name in code.constants)}):",
+            "wide_vectors()",
+            "refused = 0",
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            f"    base = block * np.uint64({BLOCK * len(names)})",
+            "    for step in range(steps):",
+            "        for i in lanes:",
+            *(f"            {line}" for line in fast),
+            *(() if self.plain else (f"        {line}" for line in redo)),
+            "return refused",
+        ]
+        source = "\n    ".join(lines).replace("lanes", f"range(np.uint64({BLOCK}))") + "\n"
+        return compile_function("batch", source, *(() if self.plain else (code.compile(),)))
+
+    def fill(self, cases: Sequence[Case]) -> Array:
+        """Return the rows of a batch; the last block is filled up with its first state."""
+        count = -(-len(cases) // BLOCK)
+        padded = [*cases, *[cases[0]] * (count * BLOCK - len(cases))]
+        y = self.scene.lift(np.array([case.state for case in padded]))
+        columns = np.array([*y, [case.control for case in padded], np.ones(len(padded))])
+        return columns.reshape(len(columns), count, BLOCK).transpose(1, 0, 2).ravel()
+
+    def states(self, rows: Array, count: int) -> Array:
+        """Return the states of a batch, one per line."""
+        width = self.scene.width + 2
+        columns = rows.reshape(-1, width, BLOCK).transpose(0, 2, 1).reshape(-1, width)
+        return columns[:count, : len(self.scene.state_names)]
+
+
+class Sample(NamedTuple):
+    """Something to be timed: `run` does so many control steps, after `prepare`, which is not timed."""
+
+    run: Callable[[], object]
+    steps: int
+    prepare: Callable[[], object] = lambda: None
+
+
+def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
+    """Return the sample of trajectories one after the other.
+
+    Parameters
+    ----------
+    kernels : Kernels
+        What is timed.
+    cases : sequence of Case
+        Starts, all on the same scene.
+    controls : array, shape (len(cases), T)
+        Controls of each trajectory.
+    dt : float
+        Control step [s].
+    """
+    several, arguments = kernels.several, kernels.arguments(cases[0].scene, dt)
+    paths = np.empty((len(cases), controls.shape[1] + 1, len(cases[0].state)))
+    paths[:, 0] = [case.state for case in cases]
+    return Sample(lambda: several(paths, controls, *arguments), controls.size)
+
+
+def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> Sample:
+    """Return the sample of a batch, each state with its control held for some steps."""
+    batch, arguments = kernels.batch, kernels.arguments(cases[0].scene, dt)
+    start = kernels.fill(cases)
+    rows = start.copy()
+    return Sample(
+        lambda: batch(rows, len(cases), steps, *arguments),
+        len(cases) * steps,
+        lambda: np.copyto(rows, start),
+    )
+
+
+def interleaved(
+    samples: Mapping[K, Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
+) -> dict[K, float]:
+    """Return the time of a control step [ns] of each sample, as median over rounds.
+
+    Every round takes each sample once, so that a slow spell of the machine falls on all of them.
+
+    Examples
+    --------
+    >>> ticks = iter(range(1000))
+    >>> interleaved({"a": Sample(lambda: None, 2)}, clock=lambda: next(ticks))
+    {'a': 500000000.0}
+    """
+    times: dict[K, list[float]] = {name: [] for name in samples}
+    for sample in samples.values():
+        sample.prepare()
+        sample.run()  # compiles, and warms up
+    for _ in range(rounds):
+        for name, sample in samples.items():
+            sample.prepare()
+            before = clock()
+            sample.run()
+            times[name].append((clock() - before) / sample.steps)
+    return {name: 1e9 * median(values) for name, values in times.items()}
