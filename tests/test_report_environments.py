@@ -1,0 +1,163 @@
+"""The report on whole episodes: its references, Gymnasium's equations, its claims, and the errors."""
+
+import itertools
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+from lag_envs import TASKS
+from lag_envs.report import environments, reference
+from lag_envs.report.runner import Result
+from lag_envs.report.steppers import comparison, with_flow
+
+#: Limit on the error of one second of any environment, relative to the state's size; measured 5.3e-16.
+ONE_SECOND = 2e-15
+
+
+def euler(rates, y, dt):
+    return y + dt * rates(y)
+
+
+def semi_implicit(rates, y, dt):
+    rate = y[1] + dt * rates(y)[1]
+    return np.array([y[0] + dt * rate, rate])
+
+
+def rk4(rates, y, dt):
+    a = rates(y)
+    b = rates(y + 0.5 * dt * a)
+    c = rates(y + 0.5 * dt * b)
+    d = rates(y + dt * c)
+    return y + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+
+
+STEPS = {"Pendulum-v1": semi_implicit, "CartPole-v1": euler, "Acrobot-v1": rk4}
+
+
+def float_rates(env, peer, u):
+    """Return a peer's equations on floats."""
+    return lambda y: np.array(peer.rates(y, u, env, lambda x: (np.cos(x), np.sin(x))))
+
+
+def short_episode(id, seconds=1.0, seed=0):
+    peer = environments.PEERS[id]
+    env = gym.make(id).unwrapped
+    env.reset(seed=seed)
+    steps = round(seconds / peer.step(env))
+    actions = environments.random_actions(env, seed)
+    if id == "Pendulum-v1":
+        actions = map(np.float64, actions)  # with float32 it rounds the torque's part to float32
+    return env, peer, environments.watch(env, peer, actions, steps, to_the_end=False)
+
+
+@pytest.mark.parametrize("id", environments.PEERS)
+@pytest.mark.filterwarnings("ignore")
+def test_peers_equations_are_those_of_their_code(id):
+    env, peer, episode = short_episode(id, 2.0)
+    for before, u, after in zip(episode.states, episode.controls, episode.states[1:], strict=False):
+        step = STEPS[id](float_rates(env, peer, u), before, peer.step(env))
+        for i in peer.wraps:
+            step[i] = math.remainder(step[i], 2.0 * math.pi)
+        np.testing.assert_allclose(step, after, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("id", environments.PEERS)
+@pytest.mark.filterwarnings("ignore")
+def test_peers_exact_states_agree_with_dop853(id):
+    integrate = pytest.importorskip("scipy.integrate")
+    env, peer, episode = short_episode(id)
+    y = episode.states[0]
+    for u in episode.controls:
+        rates = float_rates(env, peer, u)
+        y = integrate.solve_ivp(
+            lambda t, y, f=rates: f(y), (0, peer.step(env)), y, "DOP853", rtol=1e-13, atol=1e-13
+        ).y[:, -1]
+    exact = environments.solve(env, peer, episode.states[0], episode.controls)[-1]
+    np.testing.assert_allclose(np.array(exact, dtype=float), y, rtol=0, atol=1e-11)
+
+
+def test_peers_exact_states_agree_with_the_reference_of_ours():
+    env, peer, episode = short_episode("Pendulum-v1")
+    path = environments.solve(env, peer, episode.states[0], episode.controls)
+    with mp.workdps(60):
+        y = [mpf(x) for x in episode.states[0]]
+        for u in episode.controls:
+            p = reference.Pendulum(mpf(-15), mpf(0), mpf(0), 3 * mpf(u), mpf(0))
+            y = reference.pendulum(p, *y, mpf(env.dt), 45)
+        assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_one_second_of_every_environment(id):
+    (row,) = environments.ours(id, seed=0, duration=1.0)
+    assert row["seconds"] > 0.2
+    assert row["error"]["the end"] <= ONE_SECOND
+    assert row["error"]["the end"] <= environments.ROUNDINGS * row["amplified"]["the end"]
+    assert row["disagreement"] < 1e-25
+
+
+def test_kicks_are_part_of_the_exact_states(monkeypatch):
+    """With this seed there is one before the bar has fallen."""
+    (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
+    assert row["error"]["the end"] < ONE_SECOND
+    monkeypatch.setattr(environments, "episode_key", lambda key, episode: 0)
+    (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
+    assert row["error"]["the end"] > 0.01
+
+
+@pytest.fixture(scope="module")
+def rows():
+    jobs = [
+        environments.ours("InclineBrake-v0", 0, 1.0),
+        environments.ours("CylinderInCylinderPump-v0", 0, 1.0),
+        environments.theirs("Pendulum-v1", 1, 1.0),
+        environments.undriven(),
+        environments.undriven("Pendulum-v1"),
+    ]
+    return list(itertools.chain(*jobs))
+
+
+def test_small_report(rows):
+    content = environments.content(rows, [Result("environments", "Acrobot-v1, seed 0", "", problem="lost")])
+    assert [claim.holds for claim in content.claims] == [True] * len(content.claims)
+    for table in (*content.tables, *content.details, content.summary):
+        assert table.rows and all(len(line) == len(table.columns) for line in table.rows)
+    assert ["Acrobot-v1, seed 0", "lost"] == [content.tables[0].rows[-1][i] for i in (0, -1)]
+    for picture in content.pictures:
+        picture.draw()
+
+
+def test_report_without_rows():
+    content = environments.content([], [])
+    assert all(claim.holds is None for claim in content.claims)
+    assert not content.pictures and content.summary is None
+
+
+def test_episodes_with_cut_speeds_are_passed_over(rows):
+    """Pendulum-v1 cuts its speed at 8 rad/s with seed 1, so another one is taken."""
+    row = next(row for row in rows if row["case"] == "Pendulum-v1")
+    assert row["seed"] in (1, 1001)
+    _, episode, seed = environments.random_episode("Pendulum-v1", 1, 200, True)
+    assert seed == 1001 and np.abs(episode.states[:, 1]).max() < 8.0
+
+
+def test_undriven_pendulum(rows):
+    angles = {row["case"]: environments._angle(row) for row in rows if row["seed"] is None}
+    assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
+    assert angles["PivotedBarFree-v0 as Pendulum-v1, undriven"] < 2e-12
+    assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
+
+
+def test_a_worse_stepper_breaks_the_claims(rows):
+    """RK4, once per control step, in place of ours."""
+    env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
+    env.reset(seed=0)
+    episode = environments.play(env, environments.random_actions(env, 0))
+    scene = with_flow(env.scene, comparison("RK4", env.scene.flow))
+    worse = episode._replace(states=scene.simulate(episode.states[0], episode.controls, env.task.dt))
+    row = environments.against_exact(env.task, worse, seed=0) | {"case": "RK4", "seed": 0}
+    first, second, *_ = environments.content([*rows, row], []).claims
+    assert first.holds is second.holds is False
