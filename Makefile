@@ -12,7 +12,7 @@ OLDEST_GYMNASIUM := 1.2.2
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-oldest lint types check bench format clean
+.PHONY: help setup demo test test-slow test-oldest lint types check bench report report-docs format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -49,6 +49,12 @@ check: lint types test  ## all that CI runs: lint, types, tests, doctests
 
 bench: setup  ## compare the speed with other environments
 	$(BIN)/lag-envs bench $(ARGS)
+
+report: setup  ## measure errors and write a page about them, into the folder report
+	$(BIN)/lag-envs report $(ARGS)
+
+report-docs:  ## take the folder report over into docs and README
+	$(BIN)/python -m lag_envs.report.docs report
 
 format: setup  ## format the code and mend what ruff can mend
 	$(BIN)/ruff check --fix

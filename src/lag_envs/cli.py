@@ -13,8 +13,9 @@ import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -269,6 +270,49 @@ def _seconds(text: str) -> float:
     return value
 
 
+# --- report ---
+
+
+def declare_report(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``report``."""
+    parser.add_argument(
+        "folder", metavar="FOLDER", nargs="?", default="report", help="where to write (default: report)"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
+    )
+    parser.add_argument(
+        "--sections",
+        metavar="NAME,...",
+        help="only these: environments, work_precision, bound, stability, conservation, leave_out",
+    )
+    parser.add_argument(
+        "--processes", metavar="N", type=_count, default=os.cpu_count() or 1,
+        help="jobs side by side (default: one per core); timings always run alone",
+    )  # fmt: skip
+    parser.add_argument(
+        "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
+    )
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Measure errors and write the page."""
+    for package in ("jinja2", "matplotlib", "mpmath", "scipy", "sympy"):
+        if find_spec(package) is None:
+            raise UserError(f'{package} is missing: pip install "lag-envs[report]"')
+    from lag_envs.report.report import SECTIONS, NotAReport, Settings, make_report
+
+    names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
+    for name in names:
+        if name not in SECTIONS:
+            raise UserError(f"there is no section {name!r}; {_hint(name, SECTIONS)}")
+    settings = Settings(args.folder, args.quick, names, args.processes, args.date)
+    try:
+        return 0 if make_report(settings) else 130
+    except (NotAReport, OSError) as error:
+        raise UserError(str(error)) from error
+
+
 # --- the command ---
 
 COMMANDS: tuple[Command, ...] = (
@@ -306,12 +350,28 @@ examples:
         declare_bench,
         run_bench,
     ),
+    Command(
+        "report",
+        "measure errors, and write a page about them",
+        """Measure the error of every environment and scene against high precision, beside the usual steppers
+and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
+Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
+Ctrl-C the same command goes on. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.
+
+examples:
+  lag-envs report --quick                            a first look, under a minute
+  lag-envs report                                    everything, under 15 minutes on two cores
+  lag-envs report --sections bound,stability maps    two parts, into the folder maps""",
+        declare_report,
+        run_report,
+    ),
 )
 
 EXAMPLES = """examples:
   lag-envs list                      what environments there are
   lag-envs info PivotedBar-v0        all about one of them
   lag-envs bench --quick             how fast they are beside others
+  lag-envs report --quick            how wrong they are beside others
   lag-envs bench --help              more about one command"""
 
 
@@ -365,10 +425,16 @@ def _known(id: str) -> str:
     """Return the id, or raise a UserError that names similar ones."""
     if id in TASKS:
         return id
-    names = {name.lower(): name for name in TASKS}
-    close = difflib.get_close_matches(id.lower(), names, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(names[c] for c in close)}?" if close else "`lag-envs list` names all"
-    raise UserError(f"there is no environment {id!r}; {hint}")
+    raise UserError(f"there is no environment {id!r}; {_hint(id, TASKS, '`lag-envs list` names all')}")
+
+
+def _hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return which of the known names might be meant, or where to find them."""
+    names = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)
+    if close:
+        return f"did you mean {' or '.join(names[c] for c in close)}?"
+    return otherwise or f"there are {', '.join(names.values())}"
 
 
 def _task(id: str) -> Task:

@@ -1,0 +1,211 @@
+"""The report in compact form, as this project commits it: ``python -m lag_envs.report.docs REPORT PROJECT``.
+
+From a report's folder it writes, into a checkout, ``docs/accuracy.json`` (tables, claims, machine, versions),
+the figures, ``docs/accuracy.md``, and the generated parts of README.md. The texts are made from the JSON
+files alone, so a test can make them again and compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lag_envs.benchmark import TARGETS, quartiles
+from lag_envs.report import page
+from lag_envs.report.content import Table
+from lag_envs.report.report import FILE, content_of, write_json
+
+FIGURES = "images/accuracy"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write a report's compact form into a checkout."""
+    parser = argparse.ArgumentParser(description="Write a report's compact form into a checkout.")
+    parser.add_argument("report", type=Path, help="the report's folder")
+    parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
+    args = parser.parse_args(arguments)
+    found = json.loads((args.report / FILE).read_text(encoding="utf-8"))
+    if not found["complete"]:
+        print(f"{args.report} is not complete; `lag-envs report {args.report}` goes on", file=sys.stderr)
+        return 2
+    docs = args.project / "docs"
+    write_json(docs / "accuracy.json", compact(found))
+    figures = docs / FIGURES
+    figures.mkdir(parents=True, exist_ok=True)
+    for old in figures.iterdir():
+        old.unlink()
+    for content in content_of(found).values():
+        for picture in content.pictures:
+            page.draw(picture, figures)
+    update(args.project)
+    return 0
+
+
+def update(project: Path) -> None:
+    """Write the texts that follow from ``docs/accuracy.json`` and ``docs/speed.json``."""
+    for path, text in generated(project).items():
+        path.write_text(text, encoding="utf-8")
+
+
+def generated(project: Path) -> dict[Path, str]:
+    """Return the generated files, as they ought to be."""
+    accuracy, speed = (
+        json.loads((project / "docs" / name).read_text(encoding="utf-8"))
+        for name in ("accuracy.json", "speed.json")
+    )
+    readme = (project / "README.md").read_text(encoding="utf-8")
+    readme = replaced(readme, "accuracy", summary(accuracy))
+    readme = replaced(readme, "bench", speeds(speed))
+    return {project / "docs" / "accuracy.md": markdown(accuracy), project / "README.md": readme}
+
+
+def replaced(text: str, name: str, block: str) -> str:
+    r"""Return the text with what stands between two marks replaced.
+
+    Examples
+    --------
+    >>> replaced("a <!-- x:begin -->old<!-- x:end --> b", "x", "new")
+    'a <!-- x:begin -->\nnew\n<!-- x:end --> b'
+    """
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    before, _, rest = text.partition(begin)
+    _, found, after = rest.partition(end)
+    if not found:
+        raise ValueError(f"the text has no {begin} ... {end}")
+    return f"{before}{begin}\n{block}\n{end}{after}"
+
+
+def compact(found: dict[str, Any]) -> dict[str, Any]:
+    """Return what the texts need of a report."""
+    sections = []
+    for name, content in content_of(found).items():
+        sections.append(
+            {
+                "name": name,
+                "title": content.title,
+                "text": list(content.text),
+                "claims": [vars(claim) for claim in content.claims],
+                "summary": vars(content.summary) if content.summary else None,
+                "tables": [vars(table) for table in content.tables],
+                "pictures": [
+                    {"file": page.file_of(picture), "caption": picture.caption}
+                    for picture in content.pictures
+                ],
+                "problems": [f"{p['name']}: {p['problem']}" for p in found["sections"][name]["problems"]],
+            }
+        )
+    about = {key: found[key] for key in ("machine", "versions", "settings", "job_seconds")}
+    about["settings"] = {key: about["settings"][key] for key in ("quick", "date")}
+    return about | {"sections": sections}
+
+
+# --- texts ---
+
+
+def markdown(accuracy: dict[str, Any]) -> str:
+    """Return docs/accuracy.md."""
+    machine = accuracy["machine"]
+    lines = [
+        "# Error against run time, and stability",
+        "",
+        "Made by `lag-envs report`, which also writes an HTML page and all rows as CSV and JSON; this is its"
+        " compact form.",
+        f"{machine['processor']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']};"
+        f" {accuracy['settings']['date']}; {page.cell(accuracy['job_seconds'])} s of work.",
+        "",
+        ", ".join(f"{name} {number}" for name, number in accuracy["versions"].items()) + ".",
+    ]
+    for section in accuracy["sections"]:
+        lines += ["", f"## {section['title']}"]
+        for paragraph in section["text"]:
+            lines += ["", paragraph]
+        if section["claims"]:
+            lines += ["", "| claim | verdict | measured |", "| --- | --- | --- |"]
+            for claim in section["claims"]:
+                cells = claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"]
+                lines += [_row(cells)]
+        tables = [section["summary"], *section["tables"]]
+        for table in filter(None, tables):
+            lines += ["", f"*{table['caption']}*", "", *_table(table)]
+        for picture in section["pictures"]:
+            alt = picture["caption"].partition(". ")[0]
+            lines += ["", f"![{alt}]({FIGURES}/{picture['file']})", "", f"*{picture['caption']}*"]
+        if section["problems"]:
+            lines += ["", "Did not work:", "", *(f"- {problem}" for problem in section["problems"])]
+    return "\n".join(lines) + "\n"
+
+
+def summary(accuracy: dict[str, Any]) -> str:
+    """Return the README's part on accuracy: a table per section, and how many claims hold."""
+    lines: list[str] = []
+    for section in accuracy["sections"]:
+        if section["summary"]:
+            lines += [f"{section['summary']['caption']}", "", *_table(section["summary"]), ""]
+    claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
+    broken = [claim for claim in claims if claim["holds"] is False]
+    lines += [
+        f"{sum(claim['holds'] is True for claim in claims)} of {len(claims)} measured claims hold"
+        + (". These do not:" if broken else ".")
+    ]
+    if broken:
+        lines += ["", *(f"- {claim['text']} {claim['evidence']}" for claim in broken)]
+    return "\n".join(lines)
+
+
+def speeds(report: dict[str, Any]) -> str:
+    """Return the README's table of speeds."""
+    rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
+    kinds = [(t.kind, t.num_envs) for t in TARGETS]
+    rival = ("gymnasium", "CartPole-v1")
+    ids = list(dict.fromkeys(row["id"] for row in report["rows"] if row["library"] == "lag_envs"))
+
+    def entry(library: str, id: str, kind: str, n: int) -> str:
+        row = rows[library, id, kind, n]
+        text = f"{page.cell(1e9 / row['steps_per_second'][1])} ns"
+        return text if (library, id) == rival else f"{text}, {row['ratio'][1]:.1f}×"
+
+    table = {
+        "columns": ["id", *("`gym.make`" if kind == "made" else f"{n:,} at once" for kind, n in kinds)],
+        "rows": [
+            [id, *(entry(library, id, *kind) for kind in kinds)]
+            for library, id in [*(("lag_envs", id) for id in ids), rival]
+        ],
+    }
+    machine = report["machine"]
+    met = [
+        f"{target.ratio:g} times for {what} by "
+        f"{sum(rows['lag_envs', id, target.kind, target.num_envs]['ratio'][1] >= target.ratio for id in ids)}"
+        f" of {len(ids)}"
+        for target, what in zip(TARGETS, ("one environment", "64 at once", "16,384 at once"), strict=True)
+    ]
+    cold = {name: quartiles(part["seconds"])[1] for name, part in report["cold_start"].items()}
+    lines = [
+        "Time of a step, and speed against Gymnasium's `CartPole-v1` of the same kind and size: medians of"
+        f" {report['settings']['rounds']} rounds on one core of {machine['processor']}"
+        f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['settings']['date']}).",
+        "",
+        *_table(table),
+        "",
+        f"The aim is {', '.join(met)}. At 16,384 both sides are limited by arithmetic, and a series of order"
+        f" 14 to 20 is a lot of it. A whole process (import, make, reset, first step) took "
+        f"{cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s from then on.",
+    ]
+    return "\n".join(lines)
+
+
+def _table(table: dict[str, Any] | Table) -> list[str]:
+    parts = vars(table) if isinstance(table, Table) else table
+    head = parts["columns"]
+    return [_row(head), _row(["---"] * len(head)), *(_row(map(page.cell, row)) for row in parts["rows"])]
+
+
+def _row(cells: Any) -> str:
+    return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

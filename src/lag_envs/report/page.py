@@ -1,0 +1,98 @@
+"""The report as a folder that a browser opens: HTML, figures, and a CSV file per table."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lag_envs.report.content import Content, Picture, Table
+
+VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
+
+
+def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> None:
+    """Write ``index.html``, ``figures/`` and ``tables/``.
+
+    Parameters
+    ----------
+    found : dict
+        What `report.collect` returns: machine, versions, settings, seconds.
+    contents : dict
+        What each section shows, by name.
+    folder : Path
+        The report's folder.
+    """
+    for name in ("figures", "tables"):
+        (folder / name).mkdir(exist_ok=True)
+    for content in contents.values():
+        for table in tables(content, details=True):
+            write_csv(table, folder / "tables" / f"{table.name}.csv")
+        for picture in content.pictures:
+            draw(picture, folder / "figures")
+    environment = Environment(
+        loader=PackageLoader("lag_envs.report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"cell": cell, "is_number": lambda x: isinstance(x, int | float)}
+    text = environment.get_template("page.html").render(
+        found=found, contents=contents, verdicts=VERDICTS, tables=tables, file_of=file_of,
+        problems=[p for part in found["sections"].values() for p in part["problems"]],
+    )  # fmt: skip
+    (folder / "index.html").write_text(text, encoding="utf-8")
+
+
+def tables(content: Content, details: bool = False) -> list[Table]:
+    """Return a section's tables, the summary first."""
+    found = [*([content.summary] if content.summary else []), *content.tables]
+    return [*found, *content.details] if details else found
+
+
+def file_of(picture: Picture) -> str:
+    """Return the name of a figure's file."""
+    return f"{picture.name}.{'png' if picture.raster else 'svg'}"
+
+
+def draw(picture: Picture, folder: Path) -> Path:
+    """Write a figure; the file depends on what is drawn only."""
+    import matplotlib
+
+    path = folder / file_of(picture)
+    with matplotlib.rc_context({"svg.hashsalt": "lag_envs", "svg.fonttype": "none", "font.size": 9}):
+        picture.draw().savefig(
+            path, dpi=120, bbox_inches="tight", facecolor="white",
+            metadata={} if picture.raster else {"Date": None, "Creator": None},
+        )  # fmt: skip
+    return path
+
+
+def write_csv(table: Table, path: Path) -> None:
+    """Write a table with its numbers in full."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(table.columns)
+        writer.writerows(table.rows)
+
+
+def cell(value: Any) -> str:
+    """Return a table's entry as text.
+
+    Examples
+    --------
+    >>> [cell(x) for x in (None, True, 12345, 0.125, 1234.5, 1.5e-13, 0.0, "a")]
+    ['', 'yes', '12,345', '0.125', '1,234', '1.5e-13', '0', 'a']
+    """
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if not isinstance(value, float):
+        return str(value)
+    size = abs(value)
+    if size and (size < 1e-3 or size >= 1e6):
+        return f"{value:.1e}"
+    return f"{value:,.0f}" if size >= 1000 else f"{value:.3g}"

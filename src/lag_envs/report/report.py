@@ -1,0 +1,143 @@
+"""The whole report: settings, jobs of all sections, and what is written; the command ``lag-envs report``."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import lag_envs
+from lag_envs.benchmark import columns, machine
+from lag_envs.report.content import Content
+from lag_envs.report.runner import Result, run_jobs
+
+#: Modules of this package, in the order of the page.
+SECTIONS = ("environments", "work_precision", "bound", "stability", "conservation", "leave_out")
+LIBRARIES = (
+    "gymnasium", "numpy", "numba", "llvmlite", "scipy", "mpmath", "sympy", "matplotlib",
+    "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco",
+)  # fmt: skip
+FILE = "report.json"
+
+
+@dataclass
+class Settings:
+    """What is measured, and where it goes."""
+
+    folder: str = "report"
+    quick: bool = False
+    sections: tuple[str, ...] = SECTIONS
+    processes: int = 2
+    date: str = ""
+
+
+class NotAReport(ValueError):
+    """The folder holds something else."""
+
+
+def make_report(settings: Settings) -> bool:
+    """Measure what the folder does not have yet and write everything; return False where it was broken off.
+
+    Raises
+    ------
+    NotAReport
+        For a folder that holds other things, which stay untouched.
+    OSError
+        For a folder that cannot be written to.
+    """
+    folder = prepare(Path(settings.folder))
+    jobs = [job for name in settings.sections for job in section(name).jobs(settings.quick)]
+    begin = time.monotonic()
+    results, complete = run_jobs(jobs, folder, settings.processes, lambda text: print(text, file=sys.stderr))
+    found = collect(settings, results, complete, time.monotonic() - begin)
+    write_json(folder / FILE, found)
+    from lag_envs.report import page
+
+    contents = content_of(found)
+    page.write(found, contents, folder)
+    print("\n".join(claims(contents)))
+    missing = len(jobs) - len(results)
+    if missing:
+        print(f"\nbroken off, {missing} of {len(jobs)} jobs are missing; the same command goes on")
+    print(f"\nwritten to {folder / 'index.html'}")
+    return complete
+
+
+def section(name: str) -> Any:
+    """Return a section's module."""
+    return import_module(f"lag_envs.report.{name}")
+
+
+def prepare(folder: Path) -> Path:
+    """Return the folder, made or found to be a report's."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = {path.name for path in folder.iterdir()}
+    if names and not names & {FILE, "results.jsonl"}:
+        raise NotAReport(f"{folder} holds other things, such as {min(names)}; name a new or an empty folder")
+    (folder / "results.jsonl").touch()
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} cannot be written to")
+    return folder
+
+
+def collect(settings: Settings, results: Sequence[Result], complete: bool, seconds: float) -> dict[str, Any]:
+    """Return everything that was measured, by section."""
+    return {
+        "complete": complete,
+        "machine": machine(),
+        "versions": versions(),
+        "settings": asdict(settings) | {"sections": list(settings.sections)},
+        "seconds": round(seconds, 1),
+        "job_seconds": round(sum(result.seconds for result in results), 1),
+        "sections": {
+            name: {
+                "rows": [row for r in results if r.section == name for row in r.rows],
+                "problems": [vars(r) | {"rows": []} for r in results if r.section == name and r.problem],
+            }
+            for name in settings.sections
+        },
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what took part."""
+    found = {"lag_envs": lag_envs.__version__}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def content_of(found: dict[str, Any]) -> dict[str, Content]:
+    """Return what each section shows."""
+    return {
+        name: section(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
+        for name, part in found["sections"].items()
+    }
+
+
+def claims(contents: dict[str, Content]) -> list[str]:
+    """Return a line per claim."""
+    words = {True: "holds", False: "DOES NOT HOLD", None: "not measured"}
+    rows = [
+        (words[claim.holds], f"{claim.text} ({claim.evidence})")
+        for content in contents.values()
+        for claim in content.claims
+    ]
+    return columns(rows) if rows else ["nothing was measured"]
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file in one go, so that a kill leaves the old one or the new one."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    part.replace(path)
