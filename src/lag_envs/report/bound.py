@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SECTION = "bound"
 ORDERS = (8, 12, 14, 16, 20)
-DIGITS = 70
+DIGITS = 100
 MOST_SUBSTEPS = 100  # of the steps whose cost is looked at, which run as plain Python
 TOLERANCE = pendulum.TOLERANCE
 
@@ -429,19 +429,16 @@ def _draw_scatter(rows: Sequence[Row]) -> Figure:
     figure = Figure(figsize=(9, 4.6), layout="constrained")
     for axes, (name, sign, unit) in zip(figure.subplots(1, 2), QUANTITIES, strict=True):
         found = [(r[name], r[f"{name}_bound"], r["order"]) for r in rows if r[name]]
-        ends = [min(min(a, b) for a, b, _ in found) / 3, max(b for _, b, _ in found) * 3]
-        axes.plot(ends, ends, color="black", linewidth=1.5)
-        axes.annotate(
-            "bound = truncation", ends[1:] * 2, (-6, -18), textcoords="offset points", ha="right", fontsize=9
-        )
+        ends = [min(min(a, b) for a, b, _ in found) / 10, max(b for _, b, _ in found) * 10]
+        axes.plot(ends, ends, color="black", linewidth=1.5, label="bound = truncation")
         for order in sorted({o for _, _, o in found}):
             mine = [(a, b) for a, b, o in found if o == order]
             x, y = zip(*mine, strict=True)
             axes.scatter(x, y, s=12, color=COLOURS.get(order, "grey"), label=f"order {order}")
-        axes.set(xscale="log", yscale="log", xlim=ends, ylim=ends)
+        axes.set(xscale="log", yscale="log", xlim=ends, ylim=(min(b for _, b, _ in found) / 1e6, ends[1]))
         axes.set(xlabel=f"truncation of {sign} [{unit}]", ylabel=f"bound [{unit}]")
         axes.grid(alpha=0.3)
-    axes.legend(fontsize=9)
+    axes.legend(fontsize=8, loc="upper left")
     return figure
 
 

@@ -75,6 +75,9 @@ EXTREMES = {
     "bar of 1e-8 m": _bar((1.0, 3.0), 1.0, 0.01, com_distance=1e-8),
     "bar of 1e-8 m, 1 s": _bar((1.0, 3.0), 1.0, 1.0, AMPLIFIED, com_distance=1e-8),
     "r near R": _shell((1.0, 0.0, 2.0), 3.0, 1e-3, radius=0.5 - 1e-9),
+    "r near R, 1 s": _shell(
+        (1.0, 3.0), 0.0, 1.0, AMPLIFIED, control="damping", damping=0.0, radius=0.5 * (1.0 - 1e-9)
+    ),
     "r near 0": _shell((1.0, 0.0, 2.0), 3.0, 0.5, radius=1e-9),
     "point mass in the shell": _shell((1.0, -4.0, 6.0), 15.0, 1.0, inertia=0.0),
     "hoop in the shell": _shell((1.0, -4.0, 6.0), 15.0, 0.05, inertia=0.01),

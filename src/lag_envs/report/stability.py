@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,23 +43,62 @@ STARTS: dict[str, tuple[tuple[float, ...], float]] = {
 }
 
 
+class Map(NamedTuple):
+    """A quantity that is varied beside the step."""
+
+    label: str
+    scenes: Sequence[str]
+    exponents: tuple[int, int]  #: of 10, from and to
+    case: Callable[[str, float, float], Case]  #: of scene, value and dt
+
+
+def _damped(name: str, decay: float, dt: float) -> Case:
+    variant = VARIANTS[name]
+    per_drag = variant.scene(damping=1.0).constants()["drag"]
+    return Case(variant.scene(damping=decay / dt / per_drag), *STARTS[name])
+
+
+def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
+    """Return a case whose reference is in closed form, however far it goes: shells have no drive."""
+    state, u = STARTS[name]
+    if speed is not None:
+        state = (state[0], speed, *state[2:])
+    if control is None:
+        control = u if name == "PivotedBar" else 0.0
+    return Case(VARIANTS[name].scene(damping=0.0, **changes), state, control)
+
+
+_PENDULUMS = [name for name in VARIANTS if not name.startswith("Incline")]
+_BAR, _SHELL = ["PivotedBar"], ["CylinderInCylinder, drag"]
+_SHELL_RADIUS = 0.5
+
+MAPS = {
+    "damping": Map("γ dt", list(VARIANTS), (-3, 6), _damped),
+    "speed": Map("θ' [rad/s]", _PENDULUMS, (-2, 4), lambda name, v, dt: _undamped(name, speed=v)),
+    "drive": Map("drive [m/s²]", _BAR, (0, 6), lambda name, u, dt: _undamped(name, control=u)),
+    "gravity": Map("gravity [m/s²]", _BAR, (-3, 3), lambda name, g, dt: _undamped(name, gravity=g)),
+    "length": Map("length [m]", _BAR, (-8, 0), lambda name, length, dt: _undamped(name, com_distance=length)),
+    "arm": Map(
+        "1 - r/R",
+        _SHELL,
+        (-9, -1),
+        lambda name, x, dt: _undamped(name, shell_radius=_SHELL_RADIUS, radius=_SHELL_RADIUS * (1.0 - x)),
+    ),
+}
+
+
 def jobs(quick: bool) -> list[Job]:
     """Return the section's jobs: one for every row of a map, and the named cases."""
-    found = []
-    steps = np.logspace(-6, 0, 5 if quick else 13).tolist()
-    dampings = np.logspace(-3, 6, 7 if quick else 19).tolist()
-    speeds = np.logspace(-2, 4, 5 if quick else 13).tolist()
-    for name in ["PivotedBar"] if quick else VARIANTS:
-        for dt in steps:
-            arguments = {"name": name, "dt": dt}
-            title = f"{name}, step {dt:.2g} s"
-            found.append(
-                Job(SECTION, f"{title}, damping", "stability:damping", {**arguments, "decays": dampings})
-            )
-            if "Incline" not in name and not quick:
-                found.append(
-                    Job(SECTION, f"{title}, speed", "stability:speed", {**arguments, "speeds": speeds})
-                )
+    found: list[Job] = []
+    for title, map in MAPS.items():
+        low, high = map.exponents
+        values = _decades(low, high, 7 if quick else 2 * (high - low) + 1)
+        for name in map.scenes:
+            if quick and (title, name) != ("damping", "PivotedBar"):
+                continue
+            for dt in _decades(-6, 0, 5 if quick else 13):
+                arguments = {"map": title, "name": name, "dt": dt, "values": values}
+                found.append(Job(SECTION, f"{name}, {title}, step {dt:.2g} s", "stability:cells", arguments))
     cases = list(extremes.QUICK if quick else extremes.EXTREMES)
     parts = 2 if quick else 6
     return found + [
@@ -68,35 +107,40 @@ def jobs(quick: bool) -> list[Job]:
     ]
 
 
+def _decades(low: int, high: int, n: int) -> list[float]:
+    return [float(x) for x in np.logspace(low, high, n)]
+
+
 # --- measuring ---
 
 
-def damping(name: str, dt: float, decays: Sequence[float]) -> Iterator[Row]:
-    """Yield the errors of one step of dt for each damping, given as gamma dt."""
-    state, control = STARTS[name]
-    variant = VARIANTS[name]
-    per_drag = variant.scene(damping=1.0).constants()["drag"]
-    found = [Case(variant.scene(damping=z / dt / per_drag), state, control) for z in decays]
-    yield from _cells("damping", name, dt, decays, found)
+def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[Row]:
+    """Yield the errors of one step of dt for each value of what the map varies.
 
-
-def speed(name: str, dt: float, speeds: Sequence[float]) -> Iterator[Row]:
-    """Yield the errors of one step of dt for each initial speed.
-
-    Without damping, and the shells without drive: then the reference is in closed form, however far it goes.
+    Where the error of ours is above what is called exact, the row also has ``roundings``, its error over the
+    effect of one rounding of the start, and ``substeps``.
     """
-    state, control = STARTS[name]
-    scene = VARIANTS[name].scene(damping=0.0)
-    u = control if name == "PivotedBar" else 0.0
-    found = [Case(scene, (state[0], v, *state[2:]), u) for v in speeds]
-    yield from _cells("speed", name, dt, speeds, found)
-
-
-def _cells(map: str, name: str, dt: float, places: Sequence[float], found: Sequence[Case]) -> Iterator[Row]:
+    found = [MAPS[map].case(name, x, dt) for x in values]
     ends = methods(found, dt)
-    for i, (place, case) in enumerate(zip(places, found, strict=True)):
-        row = {"kind": "cell", "map": map, "name": name, "dt": dt, "x": place}
-        yield row | judge(case, dt, {key: end[i] for key, end in ends.items()})
+    for i, (x, case) in enumerate(zip(values, found, strict=True)):
+        row: Row = {"kind": "cell", "map": map, "name": name, "dt": dt, "x": x}
+        row |= judge(case, dt, {key: end[i] for key, end in ends.items()})
+        error = row["errors"][OURS]
+        if error == DIVERGED or (isinstance(error, float) and error > EXACT):
+            row["substeps"] = extremes.substeps(case, dt)
+            try:
+                row["roundings"] = _roundings(case, dt, ends[OURS][i])
+            except ArithmeticError as problem:
+                row["problem"] = describe(problem)
+        yield row
+
+
+def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
+    """Return the largest error of an entry over what one rounding of the start makes of it."""
+    exact = reference.remembered(case.scene, case.state, case.control, dt)
+    errors, gains = reference.errors(end, exact), extremes.amplification(case, dt)
+    shares = [abs(e) / (extremes.EPS * g) for e, g in zip(errors, gains, strict=True) if g]
+    return max(shares, default=None)
 
 
 def cases(names: Sequence[str]) -> Iterator[Row]:
@@ -119,7 +163,7 @@ def judge(case: Case, dt: float, ends: dict[str, Any]) -> Row:
     """Return the largest error of each end relative to the scales; where there is none, why."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)
-    except (reference.Unresolved, ArithmeticError) as error:
+    except ArithmeticError as error:  # such as reference.Unresolved
         kept = {key: end if isinstance(end, str) else NO_REFERENCE for key, end in ends.items()}
         return {"errors": kept, "problem": describe(error)}
     sizes = scales(case, dt)
@@ -221,7 +265,6 @@ def march(
 
 #: Colours of what is not an error; errors go from pale yellow to dark blue.
 SPECIAL = {DIVERGED: "black", REFUSED: "#d55e00", TOO_LONG: "#d0d0d0", NO_REFERENCE: "#8c8c8c"}
-AXES = {"damping": "γ dt", "speed": "θ' [rad/s]"}
 LOWEST, HIGHEST = -17, 2
 
 
@@ -233,6 +276,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     for row in cells:
         maps.setdefault((row["map"], row["name"]), []).append(row)
     verdicts = _verdicts(found)
+    shares = _shares(maps, "stability-maps", "Every map: one step with dt from 1e-6 to 1 s.")
+    damped = {key: rows for key, rows in maps.items() if key[0] == "damping"}
     return Content(
         "Stiff and extreme cases",
         [
@@ -252,11 +297,11 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
             "That effect is measured, by moving every entry of the start by 2^-53 of its size in the "
             "reference. A case is met if it does what was expected, or is more accurate.",
         ],
-        tables=[t for t in (verdicts, _map_table(maps), _problem_table(problems, rows)) if t],
+        tables=[t for t in (verdicts, shares, _amplified(cells), _problem_table(problems, rows)) if t],
         pictures=_pictures(maps, found),
         claims=_claims(cells, found),
-        summary=_summary(maps),
-        details=[_cell_table(cells)] if cells else [],
+        summary=_shares(damped, "stability", "One step with γ dt from 1e-3 to 1e6 and dt from 1e-6 to 1 s."),
+        details=[_map_table(maps), _cell_table(cells)] if cells else [],
     )
 
 
@@ -264,14 +309,18 @@ def _claims(cells: Sequence[Row], found: Sequence[Row]) -> list[Claim]:
     ours = [row["errors"][OURS] for row in cells]
     numbers = [e for e in ours if isinstance(e, float)]
     good = sum(e <= EXACT for e in numbers)
-    unknown = ours.count(NO_REFERENCE)
+    amplified = [row["roundings"] for row in cells if row.get("roundings")]
+    allowed = sum(share <= extremes.ROUNDINGS for share in amplified)
+    unknown, refused = ours.count(NO_REFERENCE), ours.count(REFUSED)
     missed = [row["name"] for row in found if not row.get("met", False)]
     return [
         Claim(
-            f"Our step is accurate to {EXACT:g} of the scale in every cell of the maps.",
-            good == len(ours) - unknown if numbers else None,
-            f"{good} of {len(ours) - unknown} cells; largest error {max(numbers, default=0.0):.1e}; "
-            f"{ours.count(REFUSED)} refused, {unknown} without a reference",
+            f"In every cell of the maps our step is accurate to {EXACT:g} of the scale or to amplified "
+            "rounding, or it is refused with an error.",
+            good + allowed + refused + unknown == len(ours) if numbers else None,
+            f"{len(ours)} cells: {good} accurate, {allowed} to amplified rounding (at most "
+            f"{max(amplified, default=0.0):.1f} roundings), {refused} refused, {unknown} without a "
+            f"reference, {len(ours) - good - allowed - refused - unknown} missed",
         ),
         Claim(
             "Every stiff or extreme case is accurate as expected or refused as expected.",
@@ -324,7 +373,7 @@ def _counts(rows: Sequence[Row], method: str) -> list[Any]:
     return [len(values), max(numbers, default=None), sum(v <= EXACT for v in numbers), *special]
 
 
-def _map_table(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
+def _map_table(maps: dict[tuple[str, str], list[Row]]) -> Table:
     lines = [
         [name, map, method, *_counts(rows, method)]
         for (map, name), rows in maps.items()
@@ -332,26 +381,43 @@ def _map_table(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
     ]
     columns = ["scene", "map", "method", "cells", "largest error", f"cells within {EXACT:g}", *SPECIAL]
     caption = "Cells of every map by method. The largest error is among those that did not diverge."
-    return Table("stability-maps", caption, columns, lines) if lines else None
+    return Table("stability-methods", caption, columns, lines)
 
 
-def _summary(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
-    lines = []
-    for (map, name), rows in maps.items():
-        if map != "damping":
-            continue
-        shares = [_counts(rows, method)[2] / len(rows) for method in (OURS, *PEERS)]
-        lines.append([name, _counts(rows, OURS)[1], *(f"{100 * share:.0f} %" for share in shares)])
-    return (
-        Table(
-            "stability",
-            f"One step with γ dt from 1e-3 to 1e6 and dt from 1e-6 to 1 s: share of cells within {EXACT:g}.",
-            ["scene", "largest error of ours", OURS, *PEERS],
-            lines,
-        )
-        if lines
-        else None
+def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> Table | None:
+    """Return a table with a line for each map: how ours does, and in which share of cells each is exact."""
+    lines: list[list[Any]] = []
+    for (map, scene), rows in maps.items():
+        _, largest, *_ = _counts(rows, OURS)
+        _, single, *_ = _counts(rows, f"{OURS}, float32")
+        shares = [f"{100 * _counts(rows, method)[2] / len(rows):.0f} %" for method in (OURS, *PEERS)]
+        roundings = max((row["roundings"] for row in rows if row.get("roundings")), default=None)
+        refused = _counts(rows, OURS)[3 + list(SPECIAL).index(REFUSED)]
+        lines.append([scene, map, len(rows), *shares, largest, roundings, refused, single])
+    caption += (
+        f" Shares of cells in which one step is accurate to {EXACT:g} of the scale; then the largest error "
+        "of ours, over the effect of a rounding of the start where it is above that, how often ours is "
+        "refused, and the largest error of its formula in float32."
     )
+    columns = ["scene", "map", "cells", OURS, *PEERS]
+    columns += ["largest error of ours", "in roundings", "refused", "largest error, float32"]
+    return Table(name, caption, columns, lines) if lines else None
+
+
+def _amplified(cells: Sequence[Row]) -> Table | None:
+    lines = []
+    for row in cells:
+        if "substeps" in row:
+            roundings = row.get("roundings")
+            met = roundings is not None and roundings <= extremes.ROUNDINGS
+            place = [row["name"], row["map"], row["x"], row["dt"], row["substeps"]]
+            lines.append([*place, row["errors"][OURS], roundings, "met" if met else "missed"])
+    columns = ["scene", "map", "value", "dt [s]", "substeps", "error", "roundings", "verdict"]
+    caption = (
+        f"Cells of the maps in which the error of ours is above {EXACT:g} of the scale: the error, and how "
+        "many times the effect of one rounding of the start it is."
+    )
+    return Table("stability-amplified", caption, columns, lines) if lines else None
 
 
 def _problem_table(problems: Sequence[Result], rows: Sequence[Row]) -> Table | None:
@@ -386,10 +452,10 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
             pictures.append(
                 Picture(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
-                    f"{name}: error of one control step over {AXES[map]} and the step; comparison steppers "
-                    f"{times}. Beside each map the same in float32. Start {STARTS[name][0]}. Reference: 30 "
-                    "digits.",
-                    partial(_draw_map, rows, AXES[map], n),
+                    f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
+                    f"steppers {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
+                    "Reference: 30 digits.",
+                    partial(_draw_map, rows, MAPS[map].label, n),
                     raster=True,
                 )
             )
@@ -439,7 +505,9 @@ def _paint(axes: Any, x: Any, y: Any, values: Sequence[Sequence[Any]]) -> Any:
 def _finish(figure: Figure, mesh: Any, panels: Any) -> None:
     from matplotlib.patches import Patch
 
-    figure.colorbar(mesh, ax=panels, label="log10 of the error relative to its scale", fraction=0.03)
+    ticks = range(LOWEST + 1, HIGHEST + 1, 2)
+    label = "log10 of the error relative to its scale"
+    figure.colorbar(mesh, ax=panels, label=label, fraction=0.03, ticks=ticks)
     patches = [Patch(facecolor=c, edgecolor="black", label=name) for name, c in SPECIAL.items()]
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), fontsize=8)
 
@@ -460,8 +528,12 @@ def _draw_map(rows: Sequence[Row], label: str, n: str) -> Figure:
         axes.set(xscale="log", yscale="log")
         axes.set_title(method, fontsize=9, fontweight="bold" if method == OURS else "normal")
         axes.tick_params(labelsize=8)
-    figure.supxlabel(label, fontsize=10)
-    figure.supylabel("step dt [s]", fontsize=10)
+    for axes in panels[-1]:
+        axes.set_xlabel(label, fontsize=9)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("step dt [s]", fontsize=9)
+    for spine in panels[0, 0].spines.values():
+        spine.set_linewidth(2.5)
     _finish(figure, mesh, panels)
     return figure
 

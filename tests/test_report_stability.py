@@ -1,0 +1,243 @@
+"""A small report of bound and stability, and whether its claims hold."""
+
+import json
+
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+from lag_envs.report import bound, extremes, stability
+from lag_envs.report.cases import Case, ensemble, scales
+from lag_envs.report.runner import Result
+from lag_envs.scenes import PivotedBar
+from lag_envs.stepping import pendulum
+from lag_envs.stepping.pendulum import Drive
+
+PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
+
+
+def draw(content):
+    """Draw every picture and give every cell to JSON, as a report does."""
+    for picture in content.pictures:
+        picture.draw().canvas.draw()
+    for table in (*content.tables, *content.details, *filter(None, [content.summary])):
+        assert {len(row) for row in table.rows} == {len(table.columns)}
+        json.dumps(table.rows, allow_nan=False)
+
+
+# --- bound ---
+
+
+def test_bound_is_never_broken():
+    """30 comparisons of truncation with the bound, of each of θ and θ'; none closer than a factor of 10."""
+    rows = list(bound.points(6, seed=5))
+    assert len(rows) == 30
+    for row in rows:
+        assert 0.0 < 10.0 * row["theta"] < row["theta_bound"]
+        assert 0.0 < 10.0 * row["theta_dot"] < row["theta_dot_bound"]
+    content = bound.content(rows, [])
+    assert content.claims[0].holds
+    assert "60 comparisons" in content.claims[0].evidence
+    draw(content)
+    rows[3]["theta"] = 2.0 * rows[3]["theta_bound"]
+    claim = bound.content(rows, []).claims[0]
+    assert not claim.holds
+    assert claim.evidence.startswith("1 of 60")
+
+
+def test_the_formulas_are_run_without_rounding():
+    """The recurrence for floats, constants as 1.0 / 3 included, against the series multiplied out by hand."""
+    alpha, gamma, theta, omega, h = 3.0, 0.7, 0.4, 1.1, 0.125
+    with mp.workdps(60):
+        angle, speed = bound.series(theta, omega, Drive(alpha, 0.0, gamma, 0.0, 0.0), h, 3)
+        cos, sin = mp.cos_sin(mpf(theta))
+        a, g, w, t = mpf(alpha), mpf(gamma), mpf(omega), mpf(h)
+        first = -a * sin - g * w
+        second = -a * cos * w - g * first
+        third = a * sin * w**2 - a * cos * first - g * second
+        exact = w + first * t + second * t**2 / 2 + third * t**3 / 6
+        assert abs(speed - exact) < mpf(10) ** -55
+        exact = theta + w * t + first * t**2 / 2 + second * t**3 / 6 + third * t**4 / 24
+        assert abs(angle - exact) < mpf(10) ** -55
+
+
+def test_bound_is_that_of_the_product():
+    """With the product's x, the bound that is drawn is the bound that the product reports."""
+    drive, omega, h = Drive(20.0, 3.0, 0.5, 0.0, 0.0), 2.0, 0.01
+    known = pendulum.truncation_bound(omega, drive, h)
+    assert known.substeps == 1
+    x = h * pendulum._rate(omega, *drive, 0.0)
+    assert bound.majorant(x, h, known.order) == pytest.approx((known.theta, known.theta_dot), rel=1e-12)
+    assert pendulum.certified(omega, drive, bound.step_at(omega, drive, 0.3), 0.3001, np)
+
+
+def test_cost_of_the_bound():
+    rows = list(bound.cost(6, seed=3))
+    assert all(1 <= row["needed"] <= row["chosen"] <= bound.MOST_SUBSTEPS for row in rows)
+    content = bound.content(rows, [])
+    assert content.claims[0].holds is None
+    assert content.claims[1].holds
+    draw(content)
+
+
+def test_environments_keep_within_the_bound():
+    *steps, reach = bound.environment("CylinderInCylinderPump-v0", 4)
+    assert all(row["substeps"] == 1 and row["theta_dot"] < row["theta_dot_bound"] < 1.01e-12 for row in steps)
+    assert reach["certified"] == pytest.approx(9.5, abs=0.1)
+    assert reach["actual"] > 2.0 * reach["certified"]
+    draw(bound.content([*steps, reach], []))
+    draw(bound.content([reach], []))
+
+
+@pytest.mark.parametrize("section", [bound, stability])
+def test_sections_without_rows(section):
+    content = section.content([], [PROBLEM])
+    assert [claim.holds for claim in content.claims] == [None, None]
+    assert content.tables[-1].rows == [["lost", "stopped after 1 s"]]
+    draw(content)
+
+
+@pytest.mark.parametrize("section", [bound, stability])
+@pytest.mark.parametrize("quick", [False, True])
+def test_jobs_can_be_sent(section, quick):
+    found = section.jobs(quick)
+    assert len({job.name for job in found}) == len(found)
+    for job in found:
+        module, _, name = job.function.partition(":")
+        assert module == section.SECTION
+        assert hasattr(section, name)
+        json.dumps(job.arguments, allow_nan=False)
+
+
+# --- stiff and extreme cases ---
+
+
+def test_verdicts():
+    """All of the quick report's cases are met: accurate as expected, or refused as expected."""
+    rows = list(stability.cases(extremes.QUICK))
+    content = stability.content(rows, [])
+    verdicts = {row[0]: row[-1] for row in content.tables[0].rows}
+    assert verdicts == dict.fromkeys(extremes.QUICK, "met")
+    assert content.claims[1].holds
+    refused = [row["name"] for row in rows if row["outcome"] == extremes.REFUSED]
+    assert refused == ["1e7 rad/s for a second", "r = R"]
+    draw(content)
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, case in extremes.EXTREMES.items() if case.expected == extremes.REFUSED]
+)
+def test_refused(name):
+    row = extremes.measure(name)
+    assert row["met"]
+    assert row["outcome"] == extremes.REFUSED
+    assert row["message"]
+
+
+def test_missed_and_lost_cases_show(monkeypatch):
+    """A case that is taken where it should be refused is missed; one that cannot be measured says why."""
+    wrong = extremes.EXTREMES["step of 1e-6 s"]._replace(expected=extremes.REFUSED)
+    monkeypatch.setitem(extremes.EXTREMES, "step of 1e-6 s", wrong)
+    monkeypatch.setitem(extremes.EXTREMES, "odd", wrong._replace(scene="Unknown"))
+    rows = list(stability.cases(["step of 1e-6 s", "odd"]))
+    content = stability.content(rows, [])
+    assert not content.claims[1].holds
+    assert "step of 1e-6 s, odd" in content.claims[1].evidence
+    assert [row[-1] for row in content.tables[0].rows] == ["missed", "unknown"]
+    assert "Unknown" in content.tables[-1].rows[0][1]
+    draw(content)
+
+
+def test_amplification_of_an_upright_bar():
+    """A rounding of θ and θ' grows with cosh and sinh of λ dt."""
+    bar = PivotedBar(inertia=0.0, com_distance=0.5, track=None)
+    rate = (9.81 / 0.5) ** 0.5
+    angle, speed = extremes.amplification(Case(bar, (3.0, 0.0), 0.0), 0.001)
+    assert angle == pytest.approx(3.0 + 0.001 * rate, rel=1e-4)
+    assert speed == pytest.approx(rate + 3.0 * rate**2 * 0.001, rel=2e-2)
+
+
+# --- maps ---
+
+
+def test_heavy_damping():
+    """At γ dt = 1e4 explicit Euler and RK4 diverge, ours and the exponential stepper do not."""
+    (row,) = stability.cells("damping", "PivotedBar", 0.02, [1e4])
+    errors = row["errors"]
+    assert errors["explicit Euler"] == errors["RK4, 16"] == stability.DIVERGED
+    assert errors["ours"] < 1e-12
+    assert errors["ours"] < errors["ETD4RK"] < 1e-10
+    assert errors["ours, float32"] == stability.TOO_LONG
+
+
+@pytest.mark.parametrize("name", stability.STARTS)
+def test_ordinary_cells(name):
+    """In float64 ours is exact to rounding; in float32 every method is as exact as float32 can be."""
+    rows = list(stability.cells("damping", name, 0.02, [1e-3, 1e-2]))
+    for row in rows:
+        errors = row["errors"]
+        assert errors["ours"] < 2e-15
+        assert 1e-9 < errors["ours, float32"] < 1e-5
+        assert errors["explicit Euler"] > errors["RK4"]
+        assert errors["RK4, float32"] < 1e-5
+    content = stability.content(rows, [])
+    assert content.claims[0].holds
+    draw(content)
+
+
+def test_float32_of_ordinary_steps():
+    """Errors of single precision, between 1e-8 and 1e-5, over an ensemble."""
+    found = [case._replace(scene=PivotedBar(track=None)) for case in ensemble("PivotedBar", 20, seed=2)]
+    ends = stability.methods(found, 0.02)["ours, float32"]
+    worst = 0.0
+    for case, end in zip(found, ends, strict=True):
+        exact = case.scene.simulate(case.state, [case.control], 0.02)[-1]
+        worst = max(worst, np.max(np.abs(end - exact) / scales(case, 0.02)))
+    assert 1e-8 < worst < 1e-5
+
+
+def test_formulas_on_arrays_are_the_compiled_ones():
+    """The comparison steppers, run as NumPy formulas, give what they give as compiled flows."""
+    from lag_envs.report.steppers import comparison, with_flow
+
+    case = Case(PivotedBar(track=None, damping=0.01), (2.0, 3.0), 3.0)
+    flow = comparison("RK4", case.scene.flow)
+    compiled = with_flow(case.scene, flow).simulate(case.state, [case.control] * 16, 0.1 / 16)[-1]
+    (formula,) = stability.march(flow.fast, [case], 0.1, np.array([16]), np.float64)
+    assert formula == pytest.approx(compiled.tolist(), rel=1e-13)
+
+
+def test_a_cell_without_a_reference_says_so(monkeypatch):
+    def unresolved(*args):
+        raise stability.reference.Unresolved("two precisions differ")
+
+    monkeypatch.setattr(stability.reference, "remembered", unresolved)
+    (row,) = stability.cells("damping", "PivotedBar", 0.02, [1.0])
+    assert set(row["errors"].values()) == {stability.NO_REFERENCE}
+    content = stability.content([row], [])
+    assert "1 without a reference" in content.claims[0].evidence
+    assert "two precisions differ" in content.tables[-1].rows[0][1]
+    draw(content)
+
+
+def test_refused_and_amplified_cells():
+    """A fast start is refused; a drive of 1e6 over a second is accurate to amplified rounding."""
+    (fast,) = stability.cells("speed", "PivotedBar", 1.0, [1e7])
+    (driven,) = stability.cells("drive", "PivotedBar", 1.0, [1e6])
+    assert fast["errors"]["ours"] == stability.REFUSED
+    assert driven["errors"]["ours"] > 1e-12
+    assert driven["roundings"] < extremes.ROUNDINGS
+    content = stability.content([fast, driven], [])
+    assert content.claims[0].holds
+    draw(content)
+    driven["roundings"] = 2.0 * extremes.ROUNDINGS
+    content = stability.content([fast, driven], [])
+    assert not content.claims[0].holds
+    assert content.tables[1].rows[0][-1] == "missed"
+
+
+def test_the_known_miss():
+    """An arm of 5e-10 m over a second, 850,000 substeps: 167 times the effect of one rounding."""
+    row = extremes.measure("r near R, 1 s")
+    assert row["outcome"] in ("less accurate", extremes.AMPLIFIED)
+    assert row["roundings"] < 300.0
