@@ -1,4 +1,4 @@
-"""Work-precision: orders of convergence, accuracy, the batch that is timed, and what a missing peer leaves."""
+"""Work-precision: orders of convergence, accuracy, the batch that is timed, what a missing peer leaves."""
 
 import dataclasses
 import sys
@@ -90,7 +90,7 @@ def test_a_missing_library_is_a_row(monkeypatch):
     rows = list(work_precision.library("PivotedBar", "heyoka", quick=True))
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
     table = next(t for t in work_precision.content(rows, []).tables if t.name.endswith("problems"))
-    assert table.rows == [["PivotedBar", "one step", "heyoka Taylor 0.0001", "heyoka is not installed"]]
+    assert table.rows == [["PivotedBar", "one step", "heyoka Taylor", "0.0001", "heyoka is not installed"]]
 
 
 def test_a_lost_job_is_a_row_and_claims_nothing():
