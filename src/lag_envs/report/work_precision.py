@@ -88,7 +88,7 @@ def jobs(quick: bool) -> list[Job]:
     """Return the jobs: errors per variant and horizon, then times, then libraries."""
     names = QUICK_VARIANTS if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
-    # A quick report has horizons and orders in one job, which compiles once.
+    # A quick report has all that needs no quiet in one job, which compiles once.
     together = [list(horizons)] if quick else [[horizon] for horizon in horizons]
     made = [
         Job(
@@ -96,11 +96,16 @@ def jobs(quick: bool) -> list[Job]:
             f"errors: {name}, {', '.join(part)}",
             f"{SECTION}:errors",
             {"variant": name, "horizons": part, "quick": quick},
+            timeout=300.0,
         )
         for part in together
         for name in names
     ]
     if not quick:
+        made += [
+            Job(SECTION, f"batches: {name}", f"{SECTION}:batches", {"variant": name, "quick": False}, 300.0)
+            for name in names
+        ]
         made.append(Job(SECTION, "orders", f"{SECTION}:orders", {"variant": "PivotedBar", "quick": False}))
     made += [
         Job(SECTION, f"times: {name}", f"{SECTION}:times", {"variant": name, "quick": quick}, alone=True)
@@ -229,10 +234,8 @@ def errors(variant: str, horizons: Sequence[str], quick: bool) -> Iterator[Row]:
         for found in contestants(truths[0].case.scene, quick):
             for row in errors_of(found, truths, plan, dt, steps):
                 yield about | row
-            if horizon == "one step":
-                kernels = Kernels(VARIANTS[variant].scene(), found.flow)
-                yield about | {"kind": "bits", "method": found.method, "equal": same_bits(kernels, variant)}
     if quick:
+        yield from batches(variant, quick)
         yield from orders(variant, quick)
 
 
@@ -300,6 +303,14 @@ def slope(found: Mapping[float, Sequence[float]]) -> float | None:
         if 2 * len(seen) > len(found[h]):
             return median(seen) - 1.0
     return None
+
+
+def batches(variant: str, quick: bool) -> Iterator[Row]:
+    """Yield whether each method's batch has the bits of its single trajectories."""
+    scene = VARIANTS[variant].scene()
+    for found in contestants(scene, quick):
+        equal = same_bits(Kernels(scene, found.flow), variant)
+        yield {"kind": "bits", "variant": variant, "method": found.method, "equal": equal}
 
 
 def same_bits(kernels: Kernels, variant: str, count: int = 96, steps: int = 3) -> bool:
