@@ -147,7 +147,7 @@ def test_episodes_with_cut_speeds_are_passed_over(rows):
 def test_undriven_pendulum(rows):
     angles = {row["case"]: environments._angle(row) for row in rows if row["seed"] is None}
     assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
-    assert angles["PivotedBarFree-v0 as Pendulum-v1, undriven"] < 2e-12
+    assert angles["PivotedBarFree-v0 with Pendulum-v1's equation, undriven"] < 2e-12
     assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
 
 
