@@ -90,6 +90,29 @@ def test_peers_exact_states_agree_with_the_reference_of_ours():
         assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
 
 
+def test_exact_states_of_ours_agree_with_the_solver_for_peers():
+    """The bar's equation typed in again, solved by the other method."""
+    env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
+    env.reset(seed=0)
+    episode = environments.play(env, environments.random_actions(env, 0))
+    path = environments.replay(env.task, 0, episode.states[0], episode.controls, 34)
+    with mp.workdps(60):
+        m, arm, i, b, g = (
+            mpf(getattr(env.scene, n)) for n in ("mass", "com_distance", "inertia", "damping", "gravity")
+        )
+        about = m * arm**2 + i
+
+        def rates(y, u):
+            c, s = environments.cos_sin(y[0])
+            return y[1], -1.0 * ((m * arm * u / about) * c + (m * arm * g / about) * s + (b / about) * y[1])
+
+        y = [environments.fixed(x) for x in episode.states[0]]
+        for u in episode.controls:
+            y = environments.taylor(lambda y, u=u: rates(y, mpf(u)), y, environments.fixed(env.task.dt))
+        for a, x in zip(y, path[-1], strict=True):
+            assert abs(mp.ldexp(a, -environments.BITS) - x) < mpf(10) ** -27
+
+
 @pytest.mark.parametrize("id", TASKS)
 def test_one_second_of_every_environment(id):
     (row,) = environments.ours(id, seed=0, duration=1.0)
