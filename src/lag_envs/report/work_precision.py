@@ -117,7 +117,7 @@ def jobs(quick: bool) -> list[Job]:
             f"{package}: {name}",
             f"{SECTION}:library",
             {"variant": name, "package": package, "quick": quick},
-            timeout=60.0,
+            timeout=120.0,
             alone=True,
         )
         for name in names
