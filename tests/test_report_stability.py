@@ -182,6 +182,7 @@ def test_ordinary_cells(name):
         assert errors["RK4, float32"] < 1e-5
     content = stability.content(rows, [])
     assert content.claims[0].holds
+    assert content.summary.rows[0][:2] == [name, "100 %"]
     draw(content)
 
 

@@ -438,7 +438,7 @@ def _draw_scatter(rows: Sequence[Row]) -> Figure:
         axes.set(xscale="log", yscale="log", xlim=ends, ylim=(min(b for _, b, _ in found) / 1e6, ends[1]))
         axes.set(xlabel=f"truncation of {sign} [{unit}]", ylabel=f"bound [{unit}]")
         axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper left")
+    axes.legend(fontsize=8, loc="lower right")
     return figure
 
 
