@@ -57,18 +57,21 @@ class Program:
         scene = task.scene
         names = constants_of(task)
         self._stepper = Stepper(scene, absent)
-        self.constants = [name for name in names if name not in absent]
-        self.uniform = [name for name in self.constants if name not in varying]
-        self.varying = [name for name in self.constants if name in varying]
         if max(task.draws, len(scene.state_names) + 1) > DRAWS:
             raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={task.draws}")
         self.y, self.z = self._stepper.start, self._stepper.end
         self.o = [f"o{i}" for i in range(len(task.observation))]
         self.g = ["g"] if task.target_range is not None else []
+        self._record(task, {name: 0.0 if name in absent else f"k_{name}" for name in names})
+        lines = [*self.control, *self.fast, *self.judge, *self.last, *self.kick, *self.observe, *self.sample]
+        used = {"k_limit", *self._stepper.constants, *re.findall(r"\bk_\w+", " ".join(lines))}
+        #: Names of the constants that are carried: those that are not zero, and that something uses.
+        self.constants = [name for name in names if f"k_{name}" in used]
+        self.uniform = [name for name in self.constants if name not in varying]
+        self.varying = [name for name in self.constants if name in varying]
         #: Names of the rows that are kept from step to step, and of those that are needed within one.
         self.kept = [*self.y, *self.g, "u", "n", *(f"k_{name}" for name in self.varying)]
         self.scratch = [*self.z, "a", "r", "over", "ordinary", *self.o]
-        self._record(task, {name: 0.0 if name in absent else f"k_{name}" for name in names})
 
     def _record(self, task: Task, constants: dict[str, Any]) -> None:
         scene, width = task.scene, task.scene.width
@@ -114,7 +117,11 @@ class Program:
 
         clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
         self.control = clip + _lines(control, ["a", *self.y, *given], ["u"])
-        self.fast = [f"dt = {constants['dt']}", f"x = {constants['x']}", *self._stepper.fast]
+        self.fast = [f"dt = {constants['dt']}", *self._stepper.fast]
+        #: What closed forms do without.
+        self._x = constants["x"] if scene.order else 0.0
+        if scene.order:
+            self.fast.insert(0, f"x = {self._x}")
         self.judge = _lines(judge, ["u", *g, *self.y, *self.z, *given], ["r", "over"])
         has_last = type(task).last_reward is not Task.last_reward
         self.last = _lines(last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
@@ -223,7 +230,7 @@ class Program:
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
             *self.observe, *_store(_at, [*y, "u", *results]),
         ]  # fmt: skip
-        call = ", ".join([*y, "u", "k_dt", "k_x", *self._stepper.constants])
+        call = ", ".join([*y, "u", "k_dt", str(self._x), *self._stepper.constants])
         redo = [
             f"if {_at('ordinary')} == 0.0:",
             *_indent([

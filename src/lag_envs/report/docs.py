@@ -90,7 +90,7 @@ def compact(found: dict[str, Any]) -> dict[str, Any]:
                 "text": list(content.text),
                 "claims": [vars(claim) for claim in content.claims],
                 "summary": vars(content.summary) if content.summary else None,
-                "tables": [vars(table) for table in content.tables],
+                "tables": [vars(table) for table in page.tables(content)],
                 "pictures": [
                     {"file": page.file_of(picture), "caption": picture.caption}
                     for picture in content.pictures
@@ -128,8 +128,7 @@ def markdown(accuracy: dict[str, Any]) -> str:
             for claim in section["claims"]:
                 cells = claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"]
                 lines += [_row(cells)]
-        tables = [section["summary"], *section["tables"]]
-        for table in filter(None, tables):
+        for table in section["tables"]:
             lines += ["", f"*{table['caption']}*", "", *_table(table)]
         for picture in section["pictures"]:
             alt = picture["caption"].partition(". ")[0]

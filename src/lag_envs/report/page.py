@@ -47,7 +47,8 @@ def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> 
 def tables(content: Content, details: bool = False) -> list[Table]:
     """Return a section's tables, the summary first."""
     found = [*([content.summary] if content.summary else []), *content.tables]
-    return [*found, *content.details] if details else found
+    unique = {table.name: table for table in ([*found, *content.details] if details else found)}
+    return list(unique.values())
 
 
 def file_of(picture: Picture) -> str:

@@ -146,14 +146,17 @@ class _Worker:
         self.result = Result(job.section, job.name, job.key)
         self.start = time.monotonic()
         self.deadline = self.start + job.timeout
-        self.connection.send((job.function, job.arguments))
+        try:
+            self.connection.send((job.function, job.arguments))
+        except OSError:  # it has died; `take` finds out how
+            pass
 
     def take(self) -> bool:
         """Take what the process has sent; return whether the job is finished."""
         assert self.result is not None
         try:
             kind, value = self.connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             self.process.join()
             return self.end(f"the process died, exit status {self.process.exitcode}")
         if kind == "row":

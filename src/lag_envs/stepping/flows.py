@@ -180,6 +180,8 @@ class Stepper:
         #: Ordinary step, without a branch; ``within`` tells whether it was one.
         self.fast = [*prepared, *tested, *moved, *finished]
         present = tuple(not isinstance(v, float) for v in values[flow.size :])
+        #: Names of the flow's coefficients, and whether the code has them.
+        self.terms = dict(zip(flow.coefficients._fields, present, strict=True))
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         self._any = [*prepared, call, *finished]
         self._flow = lambda: flow.compile(present)

@@ -1,0 +1,476 @@
+"""What ought to stay: energy, the balance of power, cos² + sin²; and how errors grow in time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.report import reference
+from lag_envs.report.cases import VARIANTS
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.steppers import METHODS, comparison, with_flow
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping.compiling import compile_function
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SECTION = "conservation"
+OURS = "lag_envs"
+EPS = 2.0**-53
+COLOURS = {
+    OURS: "#000000",
+    "RK4": "#0072b2",
+    "implicit midpoint": "#009e73",
+    "Verlet": "#56b4e9",
+    "semi-implicit Euler": "#e69f00",
+    "explicit Euler": "#d55e00",
+}
+
+
+class Free(NamedTuple):
+    """A scene without drag and drive, and a start."""
+
+    scene: Scene
+    state: tuple[float, ...]
+    #: Control step [s] with 28 bits behind the point, so that 1e7 of them are an exact number too.
+    dt: float = round(0.02 * 2**28) / 2**28
+
+
+_BAR = PivotedBar(track=None)
+_SHELL = CylinderInCylinder(control="damping")
+_TOP = 2.0 * math.sqrt(_BAR.constants()["weight"])  #: speed at the bottom that reaches the top [rad/s]
+
+FREE = {
+    "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),
+    "bar, 2 rad": Free(_BAR, (2.0, 0.0)),
+    "bar, 3.1 rad": Free(_BAR, (3.1, 0.0)),
+    "bar, turning over": Free(_BAR, (0.0, 1.2 * _TOP)),
+    "shell, 1 rad": Free(_SHELL, (1.0, 0.0)),
+    "incline": Free(Incline(tilt=math.pi / 12), (0.0, 1.0)),
+}
+QUICK = ("bar, 2 rad", "bar, turning over")
+#: Seconds over which positions are compared; each is a whole number of steps.
+STEPS, QUICK_STEPS = 10**7, 10**5
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return the jobs: long free runs, and balances of driven, damped ones."""
+    steps = QUICK_STEPS if quick else STEPS
+    names = QUICK if quick else tuple(FREE)
+    made = [
+        Job(SECTION, f"{name}, {method}", f"{SECTION}:free", {"name": name, "method": method, "steps": steps})
+        for name in names
+        for method in (OURS, *(m for m in METHODS if m in COLOURS))
+    ]
+    count = 50 if quick else 500
+    return made + [
+        Job(SECTION, f"balance, {name}", f"{SECTION}:balance", {"variant": name, "steps": count})
+        for name in (list(VARIANTS)[:1] if quick else VARIANTS)
+    ]
+
+
+# --- what is measured ---
+
+
+def marks(steps: int) -> NDArray[np.int64]:
+    """Return the numbers of steps at which a run is looked at: eight per decade.
+
+    Examples
+    --------
+    >>> marks(10).tolist()
+    [1, 2, 3, 4, 6, 7, 10]
+    """
+    count = round(8 * math.log10(steps)) + 1
+    return np.unique(np.round(np.geomspace(1, steps, count)).astype(np.int64))
+
+
+def march(scene: Scene) -> Callable:
+    """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
+
+    Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
+    rows that were filled.
+    """
+    code = scene.stepper()
+    width = len(code.start)
+    lines = [
+        f"def march(out, marks, dt, x{''.join(f', {name}' for name in code.constants)}):",
+        f"{', '.join(code.start)}, = {', '.join(f'out[-1, {i}]' for i in range(width))},",
+        "u = 0.0",
+        "done = 0",
+        "for j in range(marks.shape[0]):",
+        "    for i in range(marks[j] - done):",
+        f"        {', '.join(code.start)}, status = advance({code.arguments})",
+        "        if status < 0:",
+        "            return j",
+        "    done = marks[j]",
+        *(f"    out[j, {i}] = {name}" for i, name in enumerate(code.start)),
+        "return marks.shape[0]",
+    ]
+    return compile_function("march", "\n    ".join(lines) + "\n", code.compile())
+
+
+def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the lifted states after these numbers of steps; fewer rows where a step was refused."""
+    scene = problem.scene
+    stepped = scene if method == OURS else with_flow(scene, comparison(method, scene.flow))
+    out = np.empty((len(at) + 1, scene.width))
+    out[-1] = scene.lift(np.array(problem.state))
+    present = [float(v) for v in scene.constants().values() if v != 0.0]
+    filled = march(stepped)(out, at, problem.dt, scene.largest_x(problem.dt), *present)
+    return out[:filled]
+
+
+def free(name: str, method: str, steps: int) -> Iterator[Row]:
+    """Yield drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
+    problem = FREE[name]
+    scene, angle = problem.scene, problem.scene.angle
+    at = marks(steps)
+    states = run(problem, method, at)
+    at = at[: len(states)]
+    row: Row = {"kind": "drift", "name": name, "method": method, "steps": at.tolist(), "dt": problem.dt}
+    start = scene.energy(problem.state, 0.0)
+    where = states[:, : len(scene.state_names)].copy()
+    if angle is not None:
+        c, s = states[:, -2], states[:, -1]
+        row["length"] = finite(c * c + s * s - 1.0)
+        # The angle itself is rounded the more, the larger it is; cosine and sine are what is stepped.
+        where[:, angle] = np.arctan2(s, c)
+        turns = states[:, angle] - where[:, angle]
+        row["pair"] = finite(turns - 2.0 * math.pi * np.round(turns / (2.0 * math.pi)))
+    energy = scene.energy(where, np.zeros(len(where)))
+    size = np.maximum(abs(start["kinetic"]) + abs(start["potential"]), np.abs(energy["kinetic"]))
+    row["energy"] = finite((energy["total"] - start["total"]) / size)
+    yield row
+    if method == OURS:
+        yield growth(name, at.tolist(), states)
+
+
+def finite(values: NDArray[np.float64]) -> list[float | None]:
+    """Return numbers that JSON can hold."""
+    return [float(v) if math.isfinite(v) else None for v in values]
+
+
+def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
+    """Return the error of the first coordinate, and what the scene makes of one rounding of the start."""
+    from mpmath import mp, mpf
+
+    scene, start, dt = FREE[name]
+    errors, amplified = [], []
+    for n, state in zip(at, states, strict=True):
+        exact = reference.remembered(scene, start, 0.0, float(n) * dt)
+        errors.append(abs(reference.errors(state[:1], exact[:1])[0]))
+        with mp.workdps(60):
+            total = mpf(0)
+            for j, value in enumerate(start):
+                moved = [mpf(x) for x in start]
+                moved[j] += EPS * mpf(max(abs(value), 1.0))
+                total += abs(reference.flow(scene, moved, 0.0, float(n) * dt)[0] - exact[0])
+        amplified.append(float(total))
+    return {
+        "kind": "growth", "name": name, "seconds": [float(n) * dt for n in at],
+        "error": errors, "amplified": amplified,
+    }  # fmt: skip
+
+
+def balance(variant: str, steps: int) -> Iterator[Row]:
+    """Yield how far energy, work and loss are from adding up, over a run with random controls."""
+    about = VARIANTS[variant]
+    scene = about.scene()
+    rng = np.random.default_rng(1)
+    state = np.array([0.5 * s for s in about.spread])
+    total, absolute, largest, size, turnover = 0.0, 0.0, 0.0, 0.0, 0.0
+    for control in rng.uniform(*about.controls, steps):
+        found = scene.energy_balance(state, float(control), about.dt)
+        energy = scene.energy(state, float(control))
+        size = max(size, abs(energy["kinetic"]) + abs(energy["potential"]))
+        total += found["residual"]
+        absolute += abs(found["residual"])
+        largest = max(largest, abs(found["residual"]))
+        turnover += abs(found["work"]) + found["loss"]
+        state = scene.simulate(state, [control], about.dt)[1]
+    yield {
+        "kind": "balance", "name": variant, "steps": steps, "sum": total, "largest": largest,
+        "mean": absolute / steps, "turnover": turnover, "energy": float(size),
+    }  # fmt: skip
+
+
+# --- what is shown ---
+
+
+def exponent(steps: Sequence[float], values: Sequence[float | None]) -> float | None:
+    """Return the exponent of growth over the last two decades, of the largest value so far.
+
+    Examples
+    --------
+    >>> round(exponent([1, 10, 100, 1000], [1.0, 10.0, 100.0, 1000.0]), 2)
+    1.0
+    """
+    sizes = np.maximum.accumulate([abs(v) if v is not None else 0.0 for v in values])
+    keep = [(n, v) for n, v in zip(steps, sizes, strict=True) if n >= 0.01 * steps[-1] and v > 0.0]
+    if len(keep) < 3:
+        return None
+    n, v = np.log(np.array(keep)).T
+    return float(np.polyfit(n, v, 1)[0])
+
+
+def worst(values: Sequence[float | None]) -> float | None:
+    """Return the largest size, or None where one is not finite."""
+    return None if None in values or not values else max(abs(v) for v in values if v is not None)
+
+
+TEXT = (
+    "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is taken from the cosine and"
+    " sine that are stepped; its drift is relative to kinetic plus potential energy at the start, or to the"
+    " kinetic energy where that has grown beyond. The comparison steppers take one step per control step.",
+    "The growth of our error is held against the closed form, Jacobi's elliptic functions or a parabola, in 30"
+    " digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53 of"
+    " its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n such"
+    " roundings at random add up to some √n of one: so the error is compared with √n amplified roundings.",
+    "Two things are larger than that. Where energy drifts steadily (growth 1), because the rounded constants"
+    " of the series favour one side, the error grows with the square of the time. On the incline place and"
+    " speed grow without end, and equal increments round to the same side for long stretches: after the whole"
+    " run, 36 million km down the slope, the place is off by a few parts in 1e11.",
+    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which the"
+    " cosine and sine that are stepped do not share.",
+    "With drag and random controls the change of energy is compared with the work of the drive less the loss"
+    " to drag, both by Gauss quadrature with 16 nodes within each step.",
+)
+DRIFT = (
+    "Largest relative drift of energy, of c² + s² from 1, and of θ from the angle of (c, s) [rad]. Growth:"
+    " the exponent of the largest energy drift so far over the last two decades; 0.5 is a random walk, 1 is"
+    " steady. An empty cell: not finite, refused, or not there."
+)
+GROWTH = (
+    "Error of θ or x at the end of a run, what the scene amplifies one rounding to, the largest ratio of the"
+    " error to √n amplified roundings, and the exponents of growth."
+)
+BALANCE = (
+    "Change of energy less work plus loss [J]: largest of a step, and summed over the run; beside it the"
+    " largest energy and all work and loss that went through."
+)
+
+
+def content(rows: list[Row], problems: list[Result]) -> Content:
+    """Return what the section shows."""
+    drifts, grown, balances = (
+        [row for row in rows if row["kind"] == kind] for kind in ("drift", "growth", "balance")
+    )
+    steps = max((row["steps"][-1] for row in drifts if row["steps"]), default=0)
+    return Content(
+        title="What is conserved",
+        text=[TEXT[0].format(steps=steps), *TEXT[1:]],
+        tables=_tables(drifts, grown, balances),
+        pictures=list(_pictures(drifts, grown)),
+        claims=_claims([row for row in drifts if row["method"] == OURS], grown, balances, steps),
+        summary=_summary(drifts, steps),
+        details=[_all(drifts)],
+    )
+
+
+def _tables(drifts: list[Row], grown: list[Row], balances: list[Row]) -> list[Table]:
+    drift = [
+        (
+            row["name"],
+            row["method"],
+            row["steps"][-1] if row["steps"] else 0,
+            worst(row["energy"]),
+            exponent(row["steps"], row["energy"]) if row["steps"] else None,
+            worst(row.get("length", [])),
+            worst(row.get("pair", [])),
+        )
+        for row in drifts
+    ]
+    growth = [
+        (
+            row["name"],
+            row["seconds"][-1],
+            row["error"][-1],
+            row["amplified"][-1],
+            max(_ratios(row)),
+            exponent(row["seconds"], row["error"]),
+            exponent(row["seconds"], row["amplified"]),
+        )
+        for row in grown
+    ]
+    names = ("name", "steps", "largest", "sum", "energy", "turnover")
+    balance = [tuple(row[name] for name in names) for row in balances]
+    head = ("start", "method", "steps", "energy", "growth", "c² + s² - 1", "θ - angle of (c, s)")
+    units = ("largest of a step [J]", "sum [J]", "energy [J]", "work and loss [J]")
+    end = ("error", "amplified rounding", "largest ratio", "growth of error", "growth of rounding")
+    return [
+        Table("conservation-drift", DRIFT, head, drift),
+        Table("conservation-growth", GROWTH, ("start", "time [s]", *end), growth),
+        Table("conservation-balance", BALANCE, ("scene", "steps", *units), balance),
+    ]
+
+
+def _all(drifts: list[Row]) -> Table:
+    rows = [
+        (row["name"], row["method"], n, energy, length)
+        for row in drifts
+        for n, energy, length in zip(
+            row["steps"], row["energy"], row.get("length", [None] * len(row["steps"])), strict=True
+        )
+    ]
+    return Table(
+        "conservation-runs", "All drifts", ("start", "method", "steps", "energy", "c² + s² - 1"), rows
+    )
+
+
+def _ratios(row: Row) -> list[float]:
+    """Return the errors in units of √n amplified roundings, n being the number of steps so far."""
+    steps = np.array(row["seconds"]) / row["seconds"][0]
+    return (np.array(row["error"]) / (np.sqrt(steps) * np.array(row["amplified"]))).tolist()
+
+
+def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) -> list[Claim]:
+    def claim(text: str, found: list[tuple[float | None, str]], limit: float) -> Claim:
+        if not found:
+            return Claim(text, None, "")
+        value, name = max(found, key=lambda pair: math.inf if pair[0] is None else pair[0])
+        holds = value is not None and value < limit
+        return Claim(
+            text, holds, f"at most {value:.1e}, {name}" if value is not None else f"not finite, {name}"
+        )
+
+    return [
+        claim(
+            f"On bar and shell energy drifts by less than {1e-17 * steps:.0e} of its size in {steps:,} steps,"
+            " less than a tenth of a rounding per step.",
+            [(worst(row["energy"]), row["name"]) for row in ours if "length" in row],
+            1e-17 * steps,
+        ),
+        claim(
+            f"On the incline it drifts by less than {1e-16 * steps:.0e}, a rounding per step.",
+            [(worst(row["energy"]), row["name"]) for row in ours if "length" not in row],
+            1e-16 * steps,
+        ),
+        claim(
+            "c² + s² stays within 1e-15 of 1.",
+            [(worst(row["length"]), row["name"]) for row in ours if "length" in row],
+            1e-15,
+        ),
+        claim(
+            "On bar and shell the error stays below 100 √n times what the scene itself makes of one rounding.",
+            [(max(_ratios(row)), row["name"]) for row in grown if row["name"] != "incline"],
+            100.0,
+        ),
+        claim(
+            "With drag and drive, energy, work and loss add up in every step to 1e-13 of what is there.",
+            [
+                (row["largest"] / max(row["energy"], row["turnover"] / row["steps"]), row["name"])
+                for row in balances
+            ],
+            1e-13,
+        ),
+    ]
+
+
+def _summary(drifts: list[Row], steps: int) -> Table | None:
+    names = [name for name in FREE if any(row["name"] == name for row in drifts)]
+    methods = [m for m in COLOURS if any(row["method"] == m for row in drifts)]
+    found = {(row["name"], row["method"]): worst(row["energy"]) for row in drifts}
+    if not found:
+        return None
+    rows = [
+        (name, *("diverged" if found.get((name, m)) is None else found[name, m] for m in methods))
+        for name in names
+    ]
+    caption = f"Largest drift of energy in {steps:,} steps of 0.02 s without drag and drive, relative:"
+    return Table("conservation", caption, ("start", *methods), rows)
+
+
+def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[Picture]:
+    if drifts:
+        yield Picture(
+            "conservation-energy",
+            "Relative drift of energy over the number of control steps, the largest so far, without drag"
+            " and drive.",
+            lambda: _curves(drifts, "steps", "energy", "control steps", "relative drift of energy"),
+        )
+    if any("length" in row for row in drifts):
+        yield Picture(
+            "conservation-length",
+            "c² + s² - 1 of the cosine and sine that ours carries along, at the marks of each run.",
+            lambda: _lengths([row for row in drifts if row["method"] == OURS and "length" in row]),
+        )
+    if grown:
+        yield Picture(
+            "conservation-growth",
+            "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: what that"
+            " closed form makes of one rounding of the start, times the root of the number of steps.",
+            lambda: _growths(grown),
+        )
+
+
+def _panels(names: Sequence[str]) -> tuple[Figure, dict[str, Any]]:
+    from matplotlib.figure import Figure
+
+    columns = min(3, len(names))
+    lines = -(-len(names) // columns)
+    figure = Figure(figsize=(3.2 * columns, 2.6 * lines + 0.4), layout="constrained")
+    axes = figure.subplots(lines, columns, squeeze=False, sharex=True).ravel()
+    for axis in axes[len(names) :]:
+        axis.remove()
+    return figure, dict(zip(names, axes, strict=False))
+
+
+def _curves(rows: list[Row], x: str, y: str, xlabel: str, ylabel: str) -> Figure:
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    figure, axes = _panels(names)
+    for row in sorted(rows, key=lambda row: row["method"] == OURS):
+        axis = axes[row["name"]]
+        values = np.array([np.nan if v is None else abs(v) for v in row[y]])
+        values = np.fmax.accumulate(np.maximum(values, 1e-17)) if len(values) else values
+        ours = row["method"] == OURS
+        axis.loglog(
+            row[x], values, color=COLOURS[row["method"]], lw=2.2 if ours else 1.1, label=row["method"],
+            zorder=3 if ours else 2,
+        )  # fmt: skip
+        axis.set_title(row["name"], fontsize=9)
+        axis.set_ylim(1e-17, 1e3)
+        axis.grid(alpha=0.3)
+    figure.supxlabel(xlabel, fontsize=9)
+    figure.supylabel(ylabel, fontsize=9)
+    handles, labels = axes[names[0]].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=8)
+    return figure
+
+
+def _lengths(rows: list[Row]) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 2.8), layout="constrained")
+    axis = figure.subplots()
+    for row, marker in zip(rows, "osD^vP", strict=False):
+        axis.semilogx(row["steps"], row["length"], marker, ms=4, label=row["name"])
+    axis.set(xlabel="control steps", ylabel="c² + s² - 1", ylim=(-1e-15, 1e-15))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, ncols=2)
+    return figure
+
+
+def _growths(rows: list[Row]) -> Figure:
+    figure, axes = _panels([row["name"] for row in rows])
+    for row in rows:
+        axis = axes[row["name"]]
+        axis.loglog(
+            row["seconds"], np.maximum(row["error"], 1e-18), color="black", lw=1.8, label="error of ours"
+        )
+        axis.loglog(
+            row["seconds"], row["amplified"], ":", color="#d55e00", lw=1.8, label="amplified rounding"
+        )
+        axis.set_title(row["name"], fontsize=9)
+        axis.grid(alpha=0.3)
+    figure.supxlabel("time [s]", fontsize=9)
+    figure.supylabel("error [rad or m]", fontsize=9)
+    handles, labels = axes[rows[0]["name"]].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=8)
+    return figure

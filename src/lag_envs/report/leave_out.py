@@ -1,0 +1,317 @@
+"""What each environment carries from step to step, what it leaves out, and what leaving that out saves."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lag_envs import TASKS
+from lag_envs.envs.program import Program, constants_of
+from lag_envs.report.cases import Case
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.runner import Job, Result, Row
+from lag_envs.report.steppers import plain_series, with_flow
+from lag_envs.report.timing import Kernels, at_once, interleaved
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.flows import pendulum_flow
+from lag_envs.tasks import load_task
+from lag_envs.tasks.base import Task
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SECTION = "leave_out"
+BATCH = 1024
+
+
+class Pair(NamedTuple):
+    """A scene without something, and the same one with it; a control step of both, on the same state."""
+
+    left_out: str
+    without: Scene
+    having: Scene
+    dt: float = 0.02
+
+
+_FREE = PivotedBar(track=None, damping=0.001)
+PAIRS = (
+    Pair("drag of the bar", PivotedBar(track=None), _FREE),
+    Pair("support in the bar's state (track=None)", _FREE, PivotedBar(damping=0.001)),
+    Pair("gravity of the bar", PivotedBar(track=None, damping=0.001, gravity=0.0), _FREE),
+    Pair("orders 15 to 20 of the bar's series", _FREE, with_flow(_FREE, pendulum_flow(20))),
+    Pair("test of the certificate (never left out)", with_flow(_FREE, plain_series(14)), _FREE),
+    Pair("drag in a turning shell", CylinderInCylinder(), CylinderInCylinder(damping=0.024), 0.05),
+    Pair(
+        "turning of the shell", CylinderInCylinder(control="damping"), CylinderInCylinder(damping=0.024), 0.05
+    ),
+    Pair("drag on a slope", Incline(control="tilt"), Incline(control="tilt", damping=0.03), 0.05),
+    Pair(
+        "drag on a moving slope",
+        Incline(control="tilt_rate"),
+        Incline(control="tilt_rate", damping=0.03),
+        0.05,
+    ),
+    Pair(
+        "motion of the slope: closed form for a series",
+        Incline(damping=0.03, tilt=0.1),
+        Incline(control="tilt_rate", damping=0.03),
+        0.05,
+    ),
+)
+QUICK_PAIRS = 2
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return the jobs: one that looks at the compiled code of every id, one that takes times."""
+    count = QUICK_PAIRS if quick else len(PAIRS)
+    return [
+        Job(SECTION, "terms", f"{SECTION}:terms"),
+        Job(
+            SECTION,
+            "savings",
+            f"{SECTION}:savings",
+            {"count": count, "rounds": 5 if quick else 15},
+            alone=True,
+        ),
+    ]
+
+
+# --- what is measured ---
+
+
+def terms() -> Iterator[Row]:
+    """Yield what the compiled step of every environment carries."""
+    for id, (place, fixed) in TASKS.items():
+        yield {"kind": "terms", "id": id} | carried(load_task(place)(**fixed))
+
+
+def carried(task: Task) -> Row:
+    """Return state, terms, stages and constants of a task's compiled step, and which of them nothing uses."""
+    scene = task.scene
+    numbers = constants_of(task)
+    absent = frozenset(name for name, value in numbers.items() if value == 0.0)
+    program = Program(task, absent)
+    code = scene.stepper()
+    lines = [*program.control, *program.fast, *program.judge, *program.last, *program.kick, *program.move]
+    lines += program.observe
+    ends = [*program.moved, "r", "over", "within", *program.o]
+    needed = live(lines, ends) | live(program.sample, [f"s{i}" for i in range(program.n_state)])
+    given = [*program.y, *program.g, "a", *(f"k_{name}" for name in program.constants if name != "limit")]
+    return {
+        "scene": type(scene).__name__,
+        "state": list(scene.state_names) + (["cos", "sin"] if scene.angle is not None else []),
+        "terms": [name for name, there in code.terms.items() if there],
+        "left_out": [name for name, there in code.terms.items() if not there],
+        "stages": stages(scene),
+        "constants": program.constants,
+        "zero": sorted(absent),
+        "operations": code.operations,
+        "unused": [name.removeprefix("k_") for name in given if name not in needed],
+        "idle": [name for line in lines for name in made(line) if name not in needed],
+    }
+
+
+def stages(scene: Scene) -> str:
+    """Say how a step is taken."""
+    kind = scene.flow.coefficients
+    if kind is pendulum.Drive:
+        return f"one Taylor series of order {scene.order}, no trigonometry"
+    return "closed form" if kind is slope.Pull else f"series of order {slope.TURN_ORDER}, summed to rounding"
+
+
+def made(line: str) -> list[str]:
+    """Return the names that a line of code assigns.
+
+    Examples
+    --------
+    >>> made("a, b = block_1(c)"), made("y0 += dt")
+    (['a', 'b'], ['y0'])
+    """
+    head = re.match(r"([\w, ]+?) *[-+*/]?= ", line)
+    return re.findall(r"[A-Za-z_]\w*", head.group(1)) if head else []
+
+
+def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
+    """Return the names on which the results depend, in straight-line code.
+
+    Within a recorded block every input is used by construction, so the calls are all there is to look at.
+
+    Examples
+    --------
+    >>> sorted(live(["a = f(x)", "b = g(y)", "c = h(a)"], ["c"]))
+    ['a', 'c', 'f', 'h', 'x']
+    """
+    needed = set(results)
+    for line in reversed(lines):
+        if needed & set(made(line)) or not made(line):
+            needed |= set(re.findall(r"[A-Za-z_]\w*", line.partition("=")[2] if made(line) else line))
+    return needed
+
+
+def savings(count: int, rounds: int) -> Iterator[Row]:
+    """Yield operations and times of a step without something and with it, in a batch, in turn."""
+    samples = {}
+    for pair in PAIRS[:count]:
+        for name, scene in (("without", pair.without), ("having", pair.having)):
+            state = tuple(0.1 * (i + 1) for i in range(len(scene.state_names)))
+            cases = [Case(scene, state, 0.1)] * BATCH
+            samples[f"{pair.left_out}, {name}"] = at_once(Kernels(scene, scene.flow), cases, 8, pair.dt)
+    times = interleaved(samples, rounds)
+    for pair in PAIRS[:count]:
+        yield {
+            "kind": "savings", "left_out": pair.left_out,
+            "operations": [pair.without.stepper().operations, pair.having.stepper().operations],
+            "ns": [times[f"{pair.left_out}, {name}"] for name in ("without", "having")],
+        }  # fmt: skip
+
+
+# --- what is shown ---
+
+TEXT = (
+    "A constant that is zero leaves no operation behind, and state entries that an environment does not need"
+    " are not there. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of"
+    " x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
+    "Unused is what the compiled step of an id takes and no result depends on: its lines are followed"
+    " backwards from the next state, reward, ending and observation to constants, state, target and action."
+    " Idle is what it computes for nothing.",
+    "Savings: a control step of 1,024 states at once, dynamics only, compiled without something and with it;"
+    " both in turn, medians.",
+)
+
+
+def content(rows: list[Row], problems: list[Result]) -> Content:
+    """Return what the section shows."""
+    found = [row for row in rows if row["kind"] == "terms"]
+    saved = [row for row in rows if row["kind"] == "savings"]
+    return Content(
+        title="What each environment leaves out",
+        text=TEXT,
+        tables=[_terms(found), _savings(saved)],
+        pictures=[
+            Picture(
+                "leave-out",
+                "Time of a control step without something, and what having it would add. Batches of 1,024.",
+                lambda: _bars(saved),
+            )
+        ]
+        if saved
+        else [],
+        claims=_claims(found, saved),
+        summary=_summary(found),
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"
+
+
+def _terms(rows: list[Row]) -> Table:
+    head = (
+        "id",
+        "state",
+        "terms",
+        "left out",
+        "a step is",
+        "constants",
+        "zero",
+        "operations",
+        "unused",
+        "idle",
+    )
+    lists = ("state", "terms", "left_out"), ("constants", "zero"), ("unused", "idle")
+    return Table(
+        "leave-out-terms",
+        "What each id carries and leaves out; operations are those of one step of the dynamics.",
+        head,
+        [
+            (
+                row["id"],
+                *(_listed(row[name]) for name in lists[0]),
+                row["stages"],
+                *(_listed(row[name]) for name in lists[1]),
+                row["operations"],
+                *(_listed(row[name]) for name in lists[2]),
+            )
+            for row in rows
+        ],
+    )
+
+
+def _savings(rows: list[Row]) -> Table:
+    head = ("left out", "operations without", "with", "ns without", "ns with", "saved [ns]", "saved [%]")
+    return Table(
+        "leave-out-savings",
+        "What leaving something out saves.",
+        head,
+        [
+            (
+                row["left_out"],
+                *row["operations"],
+                *row["ns"],
+                row["ns"][1] - row["ns"][0],
+                100.0 * (1.0 - row["ns"][0] / row["ns"][1]),
+            )
+            for row in rows
+        ],
+    )
+
+
+def _summary(rows: list[Row]) -> Table | None:
+    if not rows:
+        return None
+    return Table(
+        "leave_out",
+        "What a step of each environment consists of:",
+        ("id", "state", "terms", "left out", "operations", "unused"),
+        [
+            (
+                row["id"],
+                _listed(row["state"]),
+                _listed(row["terms"]),
+                _listed(row["left_out"]),
+                row["operations"],
+                _listed(row["unused"]),
+            )
+            for row in rows
+        ],
+    )
+
+
+def _claims(rows: list[Row], saved: list[Row]) -> list[Claim]:
+    unused = [
+        f"{row['id']}: {_listed(row['unused'] + row['idle'])}" for row in rows if row["unused"] + row["idle"]
+    ]
+    more = [row["left_out"] for row in saved if row["operations"][0] >= row["operations"][1]]
+    return [
+        Claim(
+            "Nothing that a step carries or computes is unused.",
+            not unused if rows else None,
+            "; ".join(unused) or f"{len(rows)} environments",
+        ),
+        Claim(
+            "What is left out leaves no operation behind.",
+            not more if saved else None,
+            "; ".join(more) or f"{len(saved)} pairs",
+        ),
+    ]
+
+
+def _bars(rows: list[Row]) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 0.6 + 0.34 * len(rows)), layout="constrained")
+    axis = figure.subplots()
+    place = np.arange(len(rows))[::-1]
+    without, having = np.array([row["ns"] for row in rows]).T
+    axis.barh(place, without, color="#0072b2", label="without")
+    axis.barh(place, np.maximum(having - without, 0.0), left=without, color="#e69f00", label="having it adds")
+    axis.set_yticks(place, [row["left_out"] for row in rows])
+    axis.set_xlabel("ns per control step")
+    axis.grid(axis="x", alpha=0.3)
+    axis.legend(fontsize=8)
+    return figure
