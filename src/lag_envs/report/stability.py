@@ -68,13 +68,12 @@ def _undamped(name: str, *, speed: float | None = None, control: float | None = 
     return Case(VARIANTS[name].scene(damping=0.0, **changes), state, control)
 
 
-_PENDULUMS = [name for name in VARIANTS if not name.startswith("Incline")]
 _BAR, _SHELL = ["PivotedBar"], ["CylinderInCylinder, drag"]
 _SHELL_RADIUS = 0.5
 
 MAPS = {
     "damping": Map("γ dt", list(VARIANTS), (-3, 6), _damped),
-    "speed": Map("θ' [rad/s]", _PENDULUMS, (-2, 7), lambda name, v, dt: _undamped(name, speed=v)),
+    "speed": Map("θ' [rad/s]", _BAR + _SHELL, (-2, 7), lambda name, v, dt: _undamped(name, speed=v)),
     "drive": Map("drive [m/s²]", _BAR, (0, 6), lambda name, u, dt: _undamped(name, control=u)),
     "gravity": Map("gravity [m/s²]", _BAR, (-3, 3), lambda name, g, dt: _undamped(name, gravity=g)),
     "length": Map("length [m]", _BAR, (-8, 0), lambda name, length, dt: _undamped(name, com_distance=length)),
@@ -480,7 +479,7 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
     if measured:
         pictures.append(
             Picture(
-                "extreme-cases",
+                "extreme-cases-map",
                 "The named cases: log10 of the error of one control step, ours beside the comparison "
                 "steppers in one step and in 16. Cases that are to be refused are in the table only.",
                 lambda: _draw_cases(measured),
