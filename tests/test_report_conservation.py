@@ -1,0 +1,104 @@
+"""What is conserved, what is left out: small regenerations of both sections and of their claims."""
+
+import numpy as np
+import pytest
+
+from lag_envs.envs.program import Program
+from lag_envs.report import conservation, leave_out
+from lag_envs.tasks import TASKS, load_task
+
+
+def claims(content):
+    return {claim.text: claim.holds for claim in content.claims}
+
+
+def task(id, **keywords):
+    place, fixed = TASKS[id]
+    return load_task(place)(**fixed, **keywords)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rows = []
+    for name in conservation.FREE:
+        rows += conservation.free(name, conservation.OURS, 10_000)
+    for method in ("RK4", "Verlet"):
+        rows += conservation.free("bar, 2 rad", method, 10_000)
+    return [*rows, *conservation.balance("CylinderInCylinder, tilt", 20)]
+
+
+def test_claims_hold(runs):
+    content = conservation.content(runs, [])
+    assert set(claims(content).values()) == {True}, content.claims
+    assert [len(row) for table in content.tables for row in table.rows] == [
+        len(table.columns) for table in content.tables for row in table.rows
+    ]
+    for picture in content.pictures:
+        assert picture.draw().axes
+
+
+def test_energy_of_ours_and_of_others(runs):
+    """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as theory has it."""
+    drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}
+    for name in conservation.FREE:
+        assert conservation.worst(drift[name, "lag_envs"]["energy"]) < 2e-13
+    verlet, rk4 = (drift["bar, 2 rad", method] for method in ("Verlet", "RK4"))
+    assert 1e-4 < conservation.worst(verlet["energy"]) < 1e-2
+    assert abs(conservation.exponent(verlet["steps"], verlet["energy"])) < 0.1
+    assert conservation.exponent(rk4["steps"], rk4["energy"]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_march_is_simulate():
+    """The loop of the long runs gives the bits of `Scene.simulate`."""
+    problem = conservation.FREE["bar, turning over"]
+    end = conservation.run(problem, conservation.OURS, np.array([7, 1000]))
+    path = problem.scene.simulate(problem.state, np.zeros(1000), problem.dt)
+    np.testing.assert_array_equal(end[:, :2], path[[7, 1000]])
+
+
+def test_marks_are_exact_times():
+    from fractions import Fraction
+
+    dt = conservation.FREE["bar, 2 rad"].dt
+    for n in conservation.marks(conservation.STEPS).tolist():
+        assert Fraction(float(n) * dt) == n * Fraction(dt)
+
+
+def test_a_broken_balance_is_seen(runs):
+    (row,) = [r for r in runs if r["kind"] == "balance"]
+    assert row["largest"] < 1e-13 * row["energy"]
+    content = conservation.content([row | {"largest": 1e-9}], [])
+    assert False in claims(content).values()
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_nothing_is_carried_for_nothing(id):
+    row = leave_out.carried(task(id))
+    assert (row["unused"], row["idle"]) == ([], [])
+    assert row["operations"] > 0 and row["stages"]
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_every_constant_matters(id):
+    """The same by trial: a constant that is changed changes some result of some step."""
+    made = Program(task(id), frozenset())
+    code = "\n".join(
+        [*made.control, *made.fast, *made.judge, *made.last, *made.kick, *made.observe, *made.sample]
+    )
+    for name in made.constants:
+        assert name == "limit" or f"k_{name}" in code
+
+
+def test_unused_things_are_found():
+    needed = leave_out.live(["a = f(k_one)", "b = g(k_two, a)", "z = h(a)"], ["z"])
+    assert "k_one" in needed and "k_two" not in needed and "b" not in needed
+
+
+def test_what_is_left_out_saves_operations():
+    rows = list(leave_out.savings(len(leave_out.PAIRS), 1))
+    assert all(row["operations"][0] < row["operations"][1] for row in rows)
+    assert all(ns > 0 for row in rows for ns in row["ns"])
+    content = leave_out.content([*rows, *leave_out.terms()], [])
+    assert set(claims(content).values()) == {True}
+    assert len(content.summary.rows) == len(TASKS)
+    assert content.pictures[0].draw().axes
