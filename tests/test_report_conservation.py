@@ -41,7 +41,8 @@ def test_energy_of_ours_and_of_others(runs):
     """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as theory has it."""
     drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}
     for name in conservation.FREE:
-        assert conservation.worst(drift[name, "lag_envs"]["energy"]) < 2e-13
+        limit = 1e-12 if name == "incline" else 1e-13
+        assert conservation.worst(drift[name, "lag_envs"]["energy"]) < limit
     verlet, rk4 = (drift["bar, 2 rad", method] for method in ("Verlet", "RK4"))
     assert 1e-4 < conservation.worst(verlet["energy"]) < 1e-2
     assert abs(conservation.exponent(verlet["steps"], verlet["energy"])) < 0.1

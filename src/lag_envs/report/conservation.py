@@ -229,16 +229,15 @@ TEXT = (
     "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is taken from the cosine and"
     " sine that are stepped; its drift is relative to kinetic plus potential energy at the start, or to the"
     " kinetic energy where that has grown beyond. The comparison steppers take one step per control step.",
-    "The growth of our error is held against the closed form, Jacobi's elliptic functions or a parabola, in 30"
-    " digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53 of"
-    " its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n such"
-    " roundings at random add up to some √n of one: so the error is compared with √n amplified roundings.",
+    "The growth of our error is held against the closed form, Jacobi's elliptic functions or a parabola, in"
+    " 30 digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53"
+    " of its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n"
+    " such roundings at random add up to some √n of one: the error is compared with √n amplified roundings.",
     "Two things are larger than that. Where energy drifts steadily (growth 1), because the rounded constants"
     " of the series favour one side, the error grows with the square of the time. On the incline place and"
-    " speed grow without end, and equal increments round to the same side for long stretches: after the whole"
-    " run, 36 million km down the slope, the place is off by a few parts in 1e11.",
-    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which the"
-    " cosine and sine that are stepped do not share.",
+    " speed grow without end, and equal increments round to the same side for long stretches.",
+    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which"
+    " the cosine and sine that are stepped do not share.",
     "With drag and random controls the change of energy is compared with the work of the drive less the loss"
     " to drag, both by Gauss quadrature with 16 nodes within each step.",
 )
@@ -358,7 +357,7 @@ def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) 
             1e-15,
         ),
         claim(
-            "On bar and shell the error stays below 100 √n times what the scene itself makes of one rounding.",
+            "On bar and shell the error stays below 100 √n times what the scene makes of one rounding.",
             [(max(_ratios(row)), row["name"]) for row in grown if row["name"] != "incline"],
             100.0,
         ),

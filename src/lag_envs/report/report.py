@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import lag_envs
 from lag_envs.benchmark import columns, machine
 from lag_envs.report.content import Content
-from lag_envs.report.runner import Result, run_jobs
+from lag_envs.report.runner import Result, module, run_jobs
 
 #: Modules of this package, in the order of the page.
 SECTIONS = ("environments", "work_precision", "bound", "stability", "conservation", "leave_out")
@@ -53,7 +52,7 @@ def make_report(settings: Settings) -> bool:
         For a folder that cannot be written to.
     """
     folder = prepare(Path(settings.folder))
-    jobs = [job for name in settings.sections for job in section(name).jobs(settings.quick)]
+    jobs = [job for name in settings.sections for job in module(name).jobs(settings.quick)]
     begin = time.monotonic()
     results, complete = run_jobs(jobs, folder, settings.processes, lambda text: print(text, file=sys.stderr))
     found = collect(settings, results, complete, time.monotonic() - begin)
@@ -68,11 +67,6 @@ def make_report(settings: Settings) -> bool:
         print(f"\nbroken off, {missing} of {len(jobs)} jobs are missing; the same command goes on")
     print(f"\nwritten to {folder / 'index.html'}")
     return complete
-
-
-def section(name: str) -> Any:
-    """Return a section's module."""
-    return import_module(f"lag_envs.report.{name}")
 
 
 def prepare(folder: Path) -> Path:
@@ -120,7 +114,7 @@ def versions() -> dict[str, str]:
 def content_of(found: dict[str, Any]) -> dict[str, Content]:
     """Return what each section shows."""
     return {
-        name: section(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
+        name: module(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
         for name, part in found["sections"].items()
     }
 

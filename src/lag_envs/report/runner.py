@@ -31,8 +31,8 @@ Row = dict[str, Any]
 class Job:
     """A piece of work, of some seconds.
 
-    ``function``, as "module:name" within this package, is called with the arguments and yields rows that JSON
-    can hold. It may raise: the rows before that are kept and the problem is noted.
+    ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
+    and yields rows that JSON can hold. It may raise: the rows before that are kept and the problem is noted.
     """
 
     section: str
@@ -230,11 +230,16 @@ def _work(connection: Connection, folder: str) -> None:
         problem = None
         try:
             place, _, name = function.partition(":")
-            for row in getattr(import_module(f"lag_envs.report.{place}"), name)(**arguments):
+            for row in getattr(module(place), name)(**arguments):
                 connection.send(("row", row))
         except Exception as error:
             problem = describe(error)
         connection.send(("end", problem))
+
+
+def module(name: str) -> Any:
+    """Return a module of this package, or, where the name has a dot, another one."""
+    return import_module(name if "." in name else f"lag_envs.report.{name}")
 
 
 def describe(error: BaseException) -> str:

@@ -1,0 +1,240 @@
+"""The report's plumbing: jobs, resuming, the page and its compact form; sections have their own tests."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from lag_envs.cli import main
+from lag_envs.report import docs, page
+from lag_envs.report.report import SECTIONS, NotAReport, Settings, content_of, make_report, prepare
+from lag_envs.report.runner import load, module, run_jobs
+from tests import dummy_section
+from tests.dummy_section import job
+
+PROJECT = Path(__file__).parents[1]
+
+
+def settings(folder, **changes):
+    return Settings(str(folder), sections=(dummy_section.SECTION,), processes=2, **changes)
+
+
+# --- jobs ---
+
+
+def test_rows_in_the_order_of_the_jobs(tmp_path):
+    results, complete = run_jobs(dummy_section.jobs(True), tmp_path, 2)
+    assert complete
+    assert [(r.name, [row["number"] for row in r.rows]) for r in results] == [
+        ("two", [0, 1]),
+        ("three", [0, 1, 2]),
+    ]
+    assert all(r.problem is None for r in results)
+
+
+def test_what_goes_wrong_costs_its_own_rows_only(tmp_path):
+    told = []
+    jobs = [
+        job("fails", "fails"), job("hangs", "hangs", timeout=3.0), job("crashes", "crashes"),
+        job("misses", "misses"), job("works", count=1), job("unknown", "no_such_function"),
+    ]  # fmt: skip
+    results, complete = run_jobs(jobs, tmp_path, 2, told.append)
+    found = {r.name: r for r in results}
+    assert complete and len(found) == 6
+    assert found["fails"].problem == "ValueError: no such thing"
+    assert found["hangs"].problem == "stopped after 3 s"
+    assert "exit status 7" in found["crashes"].problem
+    assert found["misses"].problem == "a_package_that_is_missing is not installed"
+    assert found["unknown"].problem.startswith("AttributeError")
+    assert found["works"].problem is None
+    assert [len(found[name].rows) for name in ("fails", "hangs", "crashes", "works")] == [1, 1, 1, 1]
+    assert len(told) == 5 and any("hangs: stopped" in line for line in told)
+
+
+def test_finished_jobs_are_kept_and_failed_ones_tried_again(tmp_path):
+    log = tmp_path / "log"
+    jobs = [job("works", count=1, log=str(log)), job("fails", "fails")]
+    run_jobs(jobs, tmp_path, 1)
+    run_jobs(jobs, tmp_path, 1)
+    assert log.read_text() == "x"
+    assert [r.name for r in load(tmp_path / "results.jsonl")] == ["works", "fails", "fails"]
+    run_jobs([replace(jobs[0], arguments={"count": 2, "log": str(log)})], tmp_path, 1)
+    assert log.read_text() == "xx"  # other arguments, another job
+
+
+def test_a_line_that_was_cut_off(tmp_path):
+    jobs = [job("works", count=1), job("two", count=2)]
+    run_jobs(jobs, tmp_path, 1)
+    file = tmp_path / "results.jsonl"
+    file.write_text(file.read_text()[:-30])
+    results, _ = run_jobs(jobs, tmp_path, 1)
+    assert [len(r.rows) for r in results] == [1, 2]
+    assert [r.name for r in load(file)] == ["works", "two"]
+
+
+def test_timings_run_alone(tmp_path):
+    alone = [replace(job(f"alone {i}", "waits", seconds=0.2), alone=True) for i in range(2)]
+    begin = time.monotonic()
+    results, _ = run_jobs([*alone, job("first", count=1)], tmp_path, 4)
+    assert time.monotonic() - begin > 0.4
+    assert load(tmp_path / "results.jsonl")[0].name == "first"
+    assert len(results) == 3
+
+
+def test_interrupt_keeps_what_is_finished(tmp_path):
+    code = (
+        "from tests.dummy_section import job\n"
+        "from lag_envs.report.runner import run_jobs\n"
+        "from pathlib import Path\n"
+        "if __name__ == '__main__':\n"
+        "    jobs = [job('works', count=1), job('hangs', 'hangs', timeout=100.0)]\n"
+        f"    results, complete = run_jobs(jobs, Path({str(tmp_path)!r}), 2)\n"
+        "    print(len(results), complete)\n"
+    )
+    script = tmp_path / "script.py"
+    script.write_text(code)
+    path = os.pathsep.join([str(PROJECT), str(PROJECT / "tests"), os.environ.get("PYTHONPATH", "")])
+    child = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    file = tmp_path / "results.jsonl"
+    end = time.monotonic() + 60
+    while time.monotonic() < end and not (file.exists() and load(file)):
+        time.sleep(0.1)
+    child.send_signal(signal.SIGINT)
+    assert child.communicate(timeout=30)[0].split() == ["1", "False"]
+    assert [r.name for r in load(file)] == ["works"]
+
+
+# --- folder, page, tables ---
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    assert make_report(settings(folder, date="2026-01-02"))
+    return folder
+
+
+def test_everything_is_written(written, capsys):
+    found = json.loads((written / "report.json").read_text(encoding="utf-8"))
+    assert found["complete"] and found["settings"]["date"] == "2026-01-02"
+    assert len(found["sections"][dummy_section.SECTION]["rows"]) == 5
+    assert {"processor", "cores"} <= set(found["machine"]) and "numpy" in found["versions"]
+    assert (written / "figures" / "dummy.svg").read_text().startswith("<?xml")
+    assert (written / "figures" / "dots.png").read_bytes().startswith(b"\x89PNG")
+    with (written / "tables" / "dummies.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["number", "of", "small"] and [float(row[2]) for row in rows] == [1e-16] * 5
+    assert (written / "tables" / "all-dummies.csv").exists()
+
+
+def test_page(written):
+    text = (written / "index.html").read_text(encoding="utf-8")
+    for part in ("Dummies &amp; more", "What &lt;b&gt;is&lt;/b&gt; said.", "There are five.", "5 found",
+                 "A line. It goes up.", "figures/dummy.svg", "figures/dots.png", "Numbers &lt;of&gt; all",
+                 "tables/dummies.csv", "tables/all-dummies.csv", "How many:", "2026-01-02"):  # fmt: skip
+        assert part in text, part
+    assert re.findall(r'class="(holds|fails|unknown)"', text) == ["holds", "unknown"]
+    assert not re.findall(r"(?:src|href)=\"(?:https?:)?//", text)
+    assert all(alt for alt in re.findall(r'<img [^>]*alt="([^"]*)"', text))
+    assert '<html lang="en">' in text and "viewport" in text
+
+
+def test_page_tells_problems(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(dummy_section, "jobs", lambda quick: [job("fails", "fails")])
+    assert make_report(settings(tmp_path))
+    assert "fails: ValueError: no such thing" in (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "DOES NOT HOLD" in capsys.readouterr().out
+
+
+def test_foreign_folder_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(NotAReport, match=r"thesis\.txt"):
+        prepare(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_command_line_errors(tmp_path, capsys):
+    (tmp_path / "thesis.txt").write_text("mine")
+    for arguments, message in (
+        (["report", str(tmp_path)], "holds other things"),
+        (["report", str(tmp_path / "thesis.txt")], "thesis.txt"),
+        (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
+    ):
+        assert main(arguments) == 2
+        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["report", "--processes", "0"])
+
+
+def test_missing_package(monkeypatch, capsys):
+    monkeypatch.setattr("lag_envs.cli.find_spec", lambda name: None if name == "mpmath" else 1)
+    assert main(["report"]) == 2
+    assert 'mpmath is missing: pip install "lag-envs[report]"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_sections_stand_without_rows(name):
+    """A report that was broken off early still makes a page, and claims nothing."""
+    content = module(name).content([], [])
+    assert content.title and content.text
+    assert [claim.text for claim in content.claims if claim.holds is not None] == []
+    jobs = module(name).jobs(True) + module(name).jobs(False)
+    assert all(j.section == name for j in jobs)
+    for some in (module(name).jobs(True), module(name).jobs(False)):
+        assert len({j.name for j in some}) == len(some) > 0
+
+
+# --- the compact form ---
+
+
+def test_compact_form(written, tmp_path, monkeypatch):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "speed.json").write_text(
+        (PROJECT / "docs" / "speed.json").read_text(encoding="utf-8")
+    )
+    marks = "a <!-- accuracy:begin --><!-- accuracy:end --> b <!-- bench:begin --> <!-- bench:end --> c"
+    (tmp_path / "README.md").write_text(marks)
+    assert docs.main([str(written), str(tmp_path)]) == 0
+    text = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    assert "| There are five. | **holds** | 5 found |" in text
+    assert "![A line](images/accuracy/dummy.svg)" in text
+    assert (tmp_path / "docs" / "images" / "accuracy" / "dots.png").exists()
+    readme = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert "How many:" in readme and "1 of 2 measured claims hold" in readme and "`gym.make`" in readme
+    assert readme.startswith("a ") and readme.endswith(" c")
+
+
+def test_broken_off_report_is_not_taken_over(written, tmp_path, capsys):
+    found = json.loads((written / "report.json").read_text(encoding="utf-8")) | {"complete": False}
+    (tmp_path / "report.json").write_text(json.dumps(found))
+    assert docs.main([str(tmp_path), str(tmp_path)]) == 2
+    assert "not complete" in capsys.readouterr().err
+
+
+# --- all of it ---
+
+
+@pytest.mark.slow
+def test_quick_report(tmp_path):
+    """Every claim holds in a quick report."""
+    command = [sys.executable, "-m", "lag_envs.cli", "report", "--quick", str(tmp_path / "quick")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "quick" / "report.json").read_text(encoding="utf-8"))
+    assert [p for part in found["sections"].values() for p in part["problems"]] == []
+    claims = [claim for content in content_of(found).values() for claim in content.claims]
+    assert [claim for claim in claims if claim.holds is False] == []
+    assert page.VERDICTS[True] in (tmp_path / "quick" / "index.html").read_text(encoding="utf-8")
