@@ -1,5 +1,8 @@
 """What is conserved, what is left out: small regenerations of both sections and of their claims."""
 
+import math
+
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -103,3 +106,57 @@ def test_what_is_left_out_saves_operations():
     assert set(claims(content).values()) == {True}
     assert len(content.summary.rows) == len(TASKS)
     assert content.pictures[0].draw().axes
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, problem in conservation.FREE.items() if problem.scene.angle is not None]
+)
+def test_cosine_and_sine_stay_a_pair(name):
+    """c² + s² does not grow; θ leaves the pair's angle by no more than its own roundings add up to."""
+    at = conservation.marks(100_000)
+    theta, _, c, s = conservation.run(conservation.FREE[name], conservation.OURS, at).T
+    assert np.abs(c * c + s * s - 1.0).max() < 1e-15
+    turns = (theta - np.arctan2(s, c)) / (2.0 * math.pi)
+    apart = 2.0 * math.pi * np.abs(turns - np.round(turns))
+    assert (apart <= 4.0 * conservation.EPS * at * np.maximum(1.0, np.abs(theta))).all()
+
+
+#: Constants that act at random or at a limit only are moved by more, so that few steps show it.
+MOVED = {"chance": 1.0, "limit": 0.5, "x": 0.01}
+
+
+@pytest.mark.parametrize("id", TASKS)
+def test_every_constant_changes_something(id):
+    """Move each constant, 1e-3 where not said otherwise: a compiled start or step comes out differently."""
+    env = gym.make(id).unwrapped
+    env.reset(seed=1)
+    program, rows, angle = env._program, env._rows.copy(), env.task.scene.angle
+    first, n = len(program.kept + program.scratch), len(program.y)
+    rng = np.random.default_rng(2)
+    starts = []
+    for i in range(6000):
+        start = rows.copy()
+        start[:n] = rng.uniform(-8.0, 8.0, n) * (0.1 if i % 2 else 1.0)
+        if angle is not None:
+            if i % 2:
+                start[angle + 1] = 0.005 * i  # passes the certified speed
+            start[n - 2 : n] = math.cos(start[angle]), math.sin(start[angle])
+        start[program.kept.index("n")] = i % 500
+        starts.append((start, float(rng.uniform(-1, 1)), i))
+
+    def outcomes(j, factor):
+        obs = np.zeros(len(program.o), dtype=np.float32)
+        for start, action, i in starts:
+            row = start.copy()
+            row[first + j] *= factor
+            result = env._step(row, obs, action, np.array([1, i, i], dtype=np.uint64))
+            yield (*row[: len(program.kept)], *result, *obs)
+        begun = rows.copy()
+        begun[first + j] *= factor
+        program.start_one(begun, obs, np.array([1, 0, 0], dtype=np.uint64), False, False)
+        yield (*begun[: len(program.kept)], *obs)
+
+    for j, name in enumerate(program.uniform):
+        pairs = zip(outcomes(j, 1.0), outcomes(j, 1.0 + MOVED.get(name, 1e-3)), strict=True)
+        # Not a number would differ from itself.
+        assert any(not np.array_equal(a, b, equal_nan=True) for a, b in pairs), f"{name} changes nothing"

@@ -404,7 +404,7 @@ def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[Picture]:
         yield Picture(
             "conservation-growth",
             "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: what that"
-            " closed form makes of one rounding of the start, times the root of the number of steps.",
+            " closed form makes of one rounding of the start.",
             lambda: _growths(grown),
         )
 
