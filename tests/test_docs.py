@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import itertools
+import json
 import math
 import re
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from reference import flow, scales
 from rollouts import IDS, actions, make
 
+from lag_envs.report.docs import generated
+from lag_envs.report.report import SECTIONS
 from lag_envs.tasks import TASKS, load_task
 
 ROOT = Path(__file__).parents[1]
@@ -320,3 +323,23 @@ def test_make_targets(file):
         re.findall(r"^make ([a-z-]+)", text, re.MULTILINE)
     )
     assert named and named <= targets
+
+
+def test_generated_parts_are_as_generated():
+    """README's tables and docs/accuracy.md follow from the JSON files beside them."""
+    for path, text in generated(ROOT).items():
+        assert path.read_text(encoding="utf-8") == text, f"{path.name}: make report-docs writes it anew"
+
+
+def test_figures_of_the_report_are_there():
+    text = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"\]\((images/accuracy/[^)]+)\)", text))
+    kept = {f"images/accuracy/{path.name}" for path in (ROOT / "docs" / "images" / "accuracy").iterdir()}
+    assert shown == kept and shown
+
+
+def test_committed_report_is_a_full_one():
+    accuracy = json.loads((ROOT / "docs" / "accuracy.json").read_text(encoding="utf-8"))
+    assert not accuracy["settings"]["quick"]
+    assert [section["name"] for section in accuracy["sections"]] == list(SECTIONS)
+    assert [section["problems"] for section in accuracy["sections"] if section["problems"]] == []

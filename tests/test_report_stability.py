@@ -238,7 +238,7 @@ def test_refused_and_amplified_cells():
 
 
 def test_the_known_miss():
-    """An arm of 5e-10 m over a second, 850,000 substeps: 167 times the effect of one rounding."""
-    row = extremes.measure("r near R, 1 s")
+    """A bar of 1e-8 m over a second, 500,000 substeps: 133 times the effect of one rounding."""
+    row = extremes.measure("bar of 1e-8 m, 1 s")
     assert row["outcome"] in ("less accurate", extremes.AMPLIFIED)
     assert row["roundings"] < 300.0

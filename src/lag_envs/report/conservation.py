@@ -49,6 +49,7 @@ _TOP = 2.0 * math.sqrt(_BAR.constants()["weight"])  #: speed at the bottom that 
 
 FREE = {
     "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),
+    "bar, 1.6 rad": Free(_BAR, (1.6, 0.0)),
     "bar, 2 rad": Free(_BAR, (2.0, 0.0)),
     "bar, 3.1 rad": Free(_BAR, (3.1, 0.0)),
     "bar, turning over": Free(_BAR, (0.0, 1.2 * _TOP)),
@@ -233,8 +234,8 @@ TEXT = (
     " 30 digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53"
     " of its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n"
     " such roundings at random add up to some √n of one: the error is compared with √n amplified roundings.",
-    "Two things are larger than that. Where energy drifts steadily (growth 1), because the rounded constants"
-    " of the series favour one side, the error grows with the square of the time. On the incline place and"
+    "Two things are larger than that. Where energy drifts steadily (growth 1), because the same roundings come"
+    " again in every period, the error grows with the square of the time. On the incline place and"
     " speed grow without end, and equal increments round to the same side for long stretches.",
     "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which"
     " the cosine and sine that are stepped do not share.",

@@ -11,15 +11,17 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lag_envs.benchmark import TARGETS, quartiles
 from lag_envs.report import page
-from lag_envs.report.content import Table
+from lag_envs.report.content import Picture, Table
 from lag_envs.report.report import FILE, content_of, write_json
 
 FIGURES = "images/accuracy"
+LARGEST_SVG = 200_000  #: bytes
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,14 +35,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{args.report} is not complete; `lag-envs report {args.report}` goes on", file=sys.stderr)
         return 2
     docs = args.project / "docs"
-    write_json(docs / "accuracy.json", compact(found))
     figures = docs / FIGURES
     figures.mkdir(parents=True, exist_ok=True)
     for old in figures.iterdir():
         old.unlink()
-    for content in content_of(found).values():
-        for picture in content.pictures:
-            page.draw(picture, figures)
+    contents = content_of(found)
+    files = {p.name: drawn(p, figures).name for content in contents.values() for p in content.pictures}
+    write_json(docs / "accuracy.json", compact(found, files))
     update(args.project)
     return 0
 
@@ -79,7 +80,16 @@ def replaced(text: str, name: str, block: str) -> str:
     return f"{before}{begin}\n{block}\n{end}{after}"
 
 
-def compact(found: dict[str, Any]) -> dict[str, Any]:
+def drawn(picture: Picture, folder: Path) -> Path:
+    """Draw a figure; one that is large as SVG becomes PNG."""
+    path = page.draw(picture, folder)
+    if picture.raster or path.stat().st_size <= LARGEST_SVG:
+        return path
+    path.unlink()
+    return page.draw(replace(picture, raster=True), folder)
+
+
+def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
     """Return what the texts need of a report."""
     sections = []
     for name, content in content_of(found).items():
@@ -92,8 +102,7 @@ def compact(found: dict[str, Any]) -> dict[str, Any]:
                 "summary": vars(content.summary) if content.summary else None,
                 "tables": [vars(table) for table in page.tables(content)],
                 "pictures": [
-                    {"file": page.file_of(picture), "caption": picture.caption}
-                    for picture in content.pictures
+                    {"file": files[picture.name], "caption": picture.caption} for picture in content.pictures
                 ],
                 "problems": [f"{p['name']}: {p['problem']}" for p in found["sections"][name]["problems"]],
             }

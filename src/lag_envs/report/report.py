@@ -8,21 +8,15 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import lag_envs
 from lag_envs.benchmark import columns, machine
 from lag_envs.report.content import Content
-from lag_envs.report.runner import Result, module, run_jobs
+from lag_envs.report.runner import Result, module, run_jobs, versions
 
 #: Modules of this package, in the order of the page.
 SECTIONS = ("environments", "work_precision", "bound", "stability", "conservation", "leave_out")
-LIBRARIES = (
-    "gymnasium", "numpy", "numba", "llvmlite", "scipy", "mpmath", "sympy", "matplotlib",
-    "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco",
-)  # fmt: skip
 FILE = "report.json"
 
 
@@ -73,7 +67,7 @@ def prepare(folder: Path) -> Path:
     """Return the folder, made or found to be a report's."""
     folder.mkdir(parents=True, exist_ok=True)
     names = {path.name for path in folder.iterdir()}
-    if names and not names & {FILE, "results.jsonl"}:
+    if names and "results.jsonl" not in names:
         raise NotAReport(f"{folder} holds other things, such as {min(names)}; name a new or an empty folder")
     (folder / "results.jsonl").touch()
     if not os.access(folder, os.W_OK):
@@ -98,17 +92,6 @@ def collect(settings: Settings, results: Sequence[Result], complete: bool, secon
             for name in settings.sections
         },
     }
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what took part."""
-    found = {"lag_envs": lag_envs.__version__}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def content_of(found: dict[str, Any]) -> dict[str, Content]:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,11 @@ import lag_envs
 from lag_envs.benchmark import ONE_THREAD, machine, progress
 
 Row = dict[str, Any]
+#: Whose versions matter.
+LIBRARIES = (
+    "gymnasium", "numpy", "numba", "llvmlite", "scipy", "mpmath", "sympy", "matplotlib",
+    "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,11 +69,22 @@ class Result:
 
 @cache
 def fingerprint() -> str:
-    """Return a digest of this package's code and of the machine: rows of another one are not taken over."""
-    digest = hashlib.sha256(json.dumps(machine(), sort_keys=True).encode())
+    """Return a digest of code, libraries and machine: rows of others are not taken over."""
+    digest = hashlib.sha256(json.dumps([machine(), versions()], sort_keys=True).encode())
     for path in sorted(Path(lag_envs.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what took part."""
+    found = {"lag_envs": lag_envs.__version__}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
 
 
 def run_jobs(
@@ -96,6 +113,8 @@ def run_jobs(
     file = folder / "results.jsonl"
     known = {result.key: result for result in load(file) if result.problem is None}
     todo = [job for job in jobs if job.key not in known]
+    if len(todo) < len(jobs):
+        tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are taken over from before")
     complete = True
     with progress(len(todo)) as advance, file.open("a", encoding="utf-8") as out:
         if out.tell() and not file.read_bytes().endswith(b"\n"):
@@ -231,6 +250,7 @@ def _work(connection: Connection, folder: str) -> None:
         try:
             place, _, name = function.partition(":")
             for row in getattr(module(place), name)(**arguments):
+                json.dumps(row, allow_nan=False)  # what could not be written costs this job only
                 connection.send(("row", row))
         except Exception as error:
             problem = describe(error)

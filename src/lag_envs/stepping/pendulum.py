@@ -95,12 +95,10 @@ def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
     """Turn the pair (cos, sin) by an angle of at most 0.6 rad and restore its length to rounding."""
     z = angle * angle
     sine = angle * polynomial(_SIN, z)
-    cosine = polynomial(_COS, z)
-    c1 = c * cosine - s * sine
-    s1 = s * cosine + c * sine
-    # One Newton step towards c² + s² = 1.
-    r = 1.5 - 0.5 * (c1 * c1 + s1 * s1)
-    return c1 * r, s1 * r
+    # One Newton step towards c² + s² = 1 goes into the same sum, so that what is added to c and s is small
+    # and is rounded once, to either side. Scaling afterwards favours one side, and energy drifts.
+    less = z * polynomial(_COS[1:], z) - 0.5 * ((c * c - 1.0) + s * s)
+    return c + (c * less - s * sine), s + (s * less + c * sine)
 
 
 def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
@@ -264,17 +262,12 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     h = layer / n
     # What rounding takes from the two sums is handed on (Kahan): equal terms would all round to one side.
     turned = lost_angle = lost_speed = 0.0
-    c0, s0 = c, s
     for i in range(int(n)):
         angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)
         angle, speed = angle - lost_angle, change / h - lost_speed
         turned_end, omega_end = turned + angle, omega + speed
         lost_angle, lost_speed = (turned_end - turned) - angle, (omega_end - omega) - speed
         turned, omega = turned_end, omega_end
-        if i % 8 == 7:  # turned anew from the start, before the roundings of many small turns add up
-            p, q = math.cos(turned), math.sin(turned)
-            p, q = p + lost_angle * q, q - lost_angle * p
-            c, s = c0 * p - s0 * q, s0 * p + c0 * q
     theta += turned
     if slow:
         h = (dt - layer) / m
