@@ -234,8 +234,8 @@ TEXT = (
     " 30 digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53"
     " of its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n"
     " such roundings at random add up to some √n of one: the error is compared with √n amplified roundings.",
-    "Two things are larger than that. Where energy drifts steadily (growth 1), because the same roundings come"
-    " again in every period, the error grows with the square of the time. On the incline place and"
+    "Two things are larger than that. Where energy drifts steadily (growth 1), because the same roundings"
+    " come again in every period, the error grows with the square of the time. On the incline place and"
     " speed grow without end, and equal increments round to the same side for long stretches.",
     "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which"
     " the cosine and sine that are stepped do not share.",
