@@ -9,7 +9,7 @@ Examples
 >>> from lag_envs.scenes import PivotedBar
 >>> bar = with_flow(PivotedBar(track=None), comparison("RK4", PivotedBar(track=None).flow))
 >>> bar.simulate([2.0, 0.0], [0.0] * 4, 0.005)[-1].round(6).tolist()
-[1.995543, -0.445823]
+[1.995538, -0.446313]
 """
 
 from __future__ import annotations
