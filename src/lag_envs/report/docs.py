@@ -200,9 +200,9 @@ def speeds(report: dict[str, Any]) -> str:
         "",
         *_table(table),
         "",
-        f"The aims are reached: {', '.join(met)}. At 16,384 both sides are limited by arithmetic, and a series of"
-        f" order 14 to 20 is a lot of it. A whole process (import, make, reset, first step) took "
-        f"{cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s from then on.",
+        f"Aims, and how many environments reach them: {', '.join(met)}. At 16,384 both sides are limited by"
+        " arithmetic, and a series of order 14 to 20 is a lot of it. A whole process (import, make, reset,"
+        f" first step) took {cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s from then on.",
     ]
     return "\n".join(lines)
 
