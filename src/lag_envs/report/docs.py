@@ -202,7 +202,8 @@ def speeds(report: dict[str, Any]) -> str:
         "",
         f"Aims, and how many environments reach them: {', '.join(met)}. At 16,384 both sides are limited by"
         " arithmetic, and a series of order 14 to 20 is a lot of it. A whole process (import, make, reset,"
-        f" first step) took {cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s from then on.",
+        f" first step) took {cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s with a full"
+        " one.",
     ]
     return "\n".join(lines)
 
