@@ -178,6 +178,34 @@ class Program:
         """Names of the constants that `advance` takes after ``y..., u, dt, x``."""
         return [name.removeprefix("k_") for name in self._stepper.constants]
 
+    @cached_property
+    def model(self) -> Callable:
+        """``model(states, actions, targets, par, ends, rewards, ended)``: a step from each state, no kick.
+
+        Returns 0, or i + 1 where the step of row i was refused.
+        """
+        n = self.n_state
+        call = ", ".join([*self.y, "u", "k_dt", str(self._x), *self._stepper.constants])
+        row = [
+            *(f"y{j} = states[i, {j}]" for j in range(n)), *self.lift,
+            "a = actions[i]", *(["g = targets[i]"] if self.g else []),
+            *self.control, *self.fast,
+            "if not within:",
+            *_indent([
+                f"{', '.join(self.z)}, status = advance({call})",
+                "if status < 0:", "    return i + 1",
+            ]),
+            *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            *(f"ends[i, {j}] = z{j}" for j in range(n)),
+            "rewards[i] = r", "ended[i] = over > 0.0",
+        ]  # fmt: skip
+        body = [
+            *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            "for i in range(states.shape[0]):", *_indent(row),
+            "return 0",
+        ]  # fmt: skip
+        return _function("model", "states, actions, targets, par, ends, rewards, ended", body, self.advance)
+
     def _at_one(self, row: str) -> str:
         return f"f[{(self.kept + self.scratch).index(row)}]"
 

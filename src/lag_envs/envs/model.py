@@ -1,0 +1,127 @@
+"""A task's step as a function, for those who plan: any state, any action, no random kick, no time limit."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.envs.program import Program, constants_of
+from lag_envs.envs.single import absent
+from lag_envs.scenes.base import real_array
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+
+class Model:
+    """What one step does: control, motion, reward and ending, from the formulas that the environments step.
+
+    It agrees with the environment's step to rounding, not bit for bit: from step to step an environment
+    carries cosθ and sinθ along, the model takes them from θ. Random kicks are left to `kicked`.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``.
+
+    Examples
+    --------
+    >>> import gymnasium as gym, lag_envs
+    >>> from lag_envs.envs.model import Model
+    >>> model = Model(gym.make("PivotedBarFree-v0").unwrapped.task)
+    >>> states, rewards, ended = model([[0.0, 0.0], [3.0, 0.1]], [1.0, 0.0])
+    >>> states.shape, ended
+    ((2, 2), array([False, False]))
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        constants = constants_of(task)
+        program = Program(task, absent=absent([constants]))
+        self._constants = SimpleNamespace(**constants)
+        self._numbers = np.array([constants[name] for name in program.uniform])
+        self._step = program.model
+        self._n_state = program.n_state
+
+    def __call__(
+        self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Take one step from each state.
+
+        Parameters
+        ----------
+        states : array_like, shape (n, n_state)
+            States in the order of ``task.scene.state_names``; whether an episode would have ended there does
+            not matter.
+        actions : array_like, shape (n,)
+            Actions; finite values outside [-1, 1] are clipped.
+        targets : array_like, shape (n,) or (), optional
+            Targets, for a task that has them and does not fix one.
+
+        Returns
+        -------
+        states : ndarray, shape (n, n_state)
+            The states at the step's end.
+        rewards : ndarray, shape (n,)
+            The rewards.
+        ended : ndarray of bool, shape (n,)
+            Whether the episode terminates.
+
+        Raises
+        ------
+        ValueError
+            For values that are not finite or of another shape, and for a target that is missing or too much.
+        StepRefused
+            Where a step cannot be taken to full accuracy.
+        """
+        states = np.ascontiguousarray(real_array("states", states))
+        n = len(states) if states.ndim else 0
+        if states.shape != (n, self._n_state):
+            raise ValueError(f"states must have shape (n, {self._n_state}), got {states.shape}")
+        targets = self._targets(targets, n)
+        actions = np.ascontiguousarray(real_array("actions", actions))
+        if actions.shape != (n,):
+            raise ValueError(f"actions must have shape ({n},), got {actions.shape}")
+        for name, values in (("states", states), ("actions", actions), ("targets", targets)):
+            if not np.isfinite(values).all():
+                row = int(np.argwhere(~np.isfinite(values))[0, 0])
+                raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
+        ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
+        refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
+        if refused:
+            state, action = states[refused - 1], float(actions[refused - 1])
+            raise self.task.scene.refusal(state, action, self.task.dt, None, f"the step of row {refused - 1}")
+        return ends, rewards, ended
+
+    def kicked(self, states: ArrayLike, draws: ArrayLike) -> Array:
+        """Return the states after the task's random kick.
+
+        Parameters
+        ----------
+        states : array_like, shape (n, n_state)
+            States at a step's end.
+        draws : array_like, shape (task.draws, n)
+            The random numbers in [0, 1) on which the kick depends.
+        """
+        array = real_array("states", states)
+        rows = list(array.T)
+        angle = self.task.scene.angle
+        if angle is not None:
+            rows += [np.cos(rows[angle]), np.sin(rows[angle])]
+        kicked = self.task.kick(rows, list(real_array("draws", draws)), self._constants, np)
+        return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)
+
+    def _targets(self, targets: ArrayLike | None, n: int) -> Array:
+        wants = self.task.target_range is not None
+        if targets is None:
+            if wants and self.task.target is None:
+                raise ValueError("the task's target is random: targets must be given")
+            targets = self.task.target if wants else 0.0
+        elif not wants:
+            raise ValueError("this task has no target, got targets")
+        array = real_array("targets", targets)
+        if array.shape not in ((), (n,)):
+            raise ValueError(f"targets must have shape ({n},) or (), got {array.shape}")
+        return np.ascontiguousarray(np.broadcast_to(array, n))

@@ -1,0 +1,66 @@
+"""The model: one step as a function, held against the environments themselves."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rollouts import IDS, actions, make
+
+from lag_envs.envs.model import Model
+from lag_envs.scenes import StepRefused
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_steps_as_the_environment_does(env_id):
+    n = 64
+    envs = gym.make_vec(env_id, n, autoreset_mode="SameStep", duration=100.0)
+    model = Model(envs.unwrapped.task)
+    envs.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for action in actions(60, n, 1, seed=2):
+        before, target = envs.unwrapped.state, envs.unwrapped.target
+        states, rewards, ended = model(before, action[:, 0], target)
+        _, reward, terminated, _, _ = envs.step(action)
+        assert (ended == terminated).all()
+        np.testing.assert_allclose(rewards, reward, rtol=1e-12, atol=1e-12)
+        # A kick that does not happen is none; where one did, the state is another.
+        idle = np.ones((model.task.draws, n)) * 0.999
+        np.testing.assert_array_equal(model.kicked(states, idle), states)
+        same = np.isclose(envs.unwrapped.state, states, rtol=1e-12, atol=1e-12).all(axis=1)
+        assert (same | terminated).mean() > (0.8 if model.task.draws else 0.99)
+        if model.task.draws:
+            kicked = model.kicked(states, np.stack([np.zeros(n), rng.uniform(size=n)]))
+            assert (np.abs(kicked - states).max(axis=1) > 0.0).all()
+
+
+def test_far_from_ordinary_steps_are_taken_too():
+    task = make("PivotedBarFree-v0").task
+    ends, _, _ = Model(task)([[0.3, 90.0]], [0.5])
+    exact = task.scene.simulate([0.3, 90.0], [2.5], 0.02)[1]
+    np.testing.assert_allclose(ends[0], exact, rtol=1e-14)
+
+
+def test_bad_input_is_named():
+    model = Model(make("InclineTilt-v0").task)
+    state = np.zeros((2, 3))
+    for arguments, message in (
+        ((np.zeros((2, 2)), [0, 0], 0.1), r"states must have shape \(n, 3\)"),
+        ((state, [0.0], 0.1), r"actions must have shape \(2,\)"),
+        ((state, [0.0, np.nan], 0.1), "actions must be finite, got nan in row 1"),
+        ((state, [0.0, 0.0]), "targets must be given"),
+        ((state, [0.0, 0.0], [0.1]), "targets must have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            model(*arguments)
+    with pytest.raises(ValueError, match="has no target"):
+        Model(make("PivotedBar-v0").task)(np.zeros((1, 4)), [0.0], 0.1)
+    with pytest.raises(StepRefused, match="row 1"):
+        Model(make("PivotedBarFree-v0", dt=1.0).task)([[0.0, 0.0], [0.0, 1e12]], [0.0, 0.0])
+
+
+def test_a_fixed_target_is_taken():
+    model = Model(make("InclineTilt-v0", target=0.2).task)
+    states = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    _, rewards, _ = model(states, [0.0, 0.0])
+    assert rewards[0] > 0.99 > 0.1 > rewards[1]
