@@ -199,3 +199,36 @@ class ScaledReward(VecEnvWrapper):
         """Step all environments."""
         observations, rewards, done, infos = self.venv.step_wait()
         return observations, rewards * self.factor, done, infos
+
+
+class DiscreteActions(VecEnvWrapper):
+    """Numbered actions in place of numbers in [-1, 1], as Gymnasium's ``DiscretizeAction`` has them.
+
+    Parameters
+    ----------
+    venv : VecEnv
+        The environments.
+    bins : int
+        Number of actions.
+    """
+
+    def __init__(self, venv: VecEnv, bins: int) -> None:
+        super().__init__(venv, action_space=gym.spaces.Discrete(bins))
+        self._centres = bin_centres(bins)
+
+    def reset(self) -> Any:
+        """Begin an episode in every environment."""
+        return self.venv.reset()
+
+    def step_async(self, actions: NDArray[np.integer]) -> None:
+        """Take the numbers of the actions for the next step."""
+        self.venv.step_async(self._centres[actions][:, None])
+
+    def step_wait(self) -> Any:
+        """Step all environments."""
+        return self.venv.step_wait()
+
+
+def bin_centres(bins: int) -> NDArray[np.float32]:
+    """Return the middles of equal parts of [-1, 1]."""
+    return ((2.0 * np.arange(bins) + 1.0) / bins - 1.0).astype(np.float32)

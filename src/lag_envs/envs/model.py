@@ -121,7 +121,7 @@ class Model:
             targets = self.task.target if wants else 0.0
         elif not wants:
             raise ValueError("this task has no target, got targets")
-        array = real_array("targets", targets)
+        array = np.asarray(targets, np.float64)
         if array.shape not in ((), (n,)):
             raise ValueError(f"targets must have shape ({n},) or (), got {array.shape}")
         return np.ascontiguousarray(np.broadcast_to(array, n))

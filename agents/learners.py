@@ -1,0 +1,380 @@
+"""Learners of Stable-Baselines3: hyperparameters, environments, training that can be broken off, policies."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import platform
+import random
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluate import KNOWN_RETURNS, evaluate_batch, score
+from agents.run import (
+    CHECKPOINT,
+    FIRST_FRESH_SEED,
+    FIRST_TEST_SEED,
+    MODEL,
+    NORMALISATION,
+    RESULT,
+    Run,
+    UserError,
+    check_name,
+    read_result,
+    write,
+)
+from lag_envs import TASKS, __version__
+from lag_envs.tasks import load_task
+
+#: Where each learner's class is.
+ALGORITHMS = {
+    "ppo": ("stable_baselines3", "PPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "td3": ("stable_baselines3", "TD3"),
+    "dqn": ("stable_baselines3", "DQN"),
+    "tqc": ("sb3_contrib", "TQC"),
+}
+HYPERPARAMS = Path(__file__).parent / "hyperparams"
+#: Episodes of a test while training, and of the evaluation at the end.
+TEST_EPISODES, EPISODES = 20, 100
+#: Tests, and so points of the learning curve and checkpoints, of one run.
+TESTS = 16
+TIME_LIMIT, DISCRETISE = "gymnasium.wrappers.TimeLimit", "gymnasium.wrappers.DiscretizeAction"
+#: Libraries whose versions a result tells.
+PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
+
+
+def learner(algo: str) -> type:
+    """Return a learner's class."""
+    from importlib import import_module
+
+    module, name = ALGORITHMS[check_name("algorithm", algo, ALGORITHMS)]
+    return getattr(import_module(module), name)
+
+
+def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[str, Any]:
+    """Return what the RL Zoo would read for an algorithm and environment.
+
+    Parameters
+    ----------
+    algo, env_id : str
+        Name of the algorithm and id of the environment.
+    file : Path, optional
+        A YAML file in the Zoo's form in place of our own.
+
+    Raises
+    ------
+    UserError
+        For an unknown algorithm, or a file without readable entry for the environment.
+    """
+    import yaml
+
+    check_name("algorithm", algo, ALGORITHMS)
+    file = file or HYPERPARAMS / f"{algo}.yml"
+    try:
+        entries = yaml.safe_load(file.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{file} cannot be read: {error}") from error
+    if not isinstance(entries, dict) or not isinstance(entries.get(env_id), dict):
+        raise UserError(f"{file} has no entry for {env_id}; add one in the form of the others")
+    entry = entries[env_id]
+    if "n_timesteps" not in entry:
+        raise UserError(f"{file}: the entry for {env_id} lacks n_timesteps")
+    return entry
+
+
+# --- environments and learner -------------------------------------------------------------------------------
+
+
+def make_envs(run: Run) -> Any:
+    """Return the native vector environment with the wrappers that the hyperparameters ask for."""
+    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+    from agents.sb3_vec_env import DiscreteActions, make_sb3_vec_env
+
+    hyper = run.hyperparameters
+    options = dict(hyper.get("env_kwargs", {}))
+    place, fixed = TASKS[run.env]
+    steps = load_task(place)(**(fixed | options)).limit
+    bins = None
+    for wrapper in hyper.get("env_wrapper", []):
+        (name, arguments), *_ = wrapper.items()
+        if name == TIME_LIMIT:
+            options["max_episode_steps"] = arguments["max_episode_steps"]
+            steps = min(steps, options["max_episode_steps"])
+        elif name == DISCRETISE:
+            bins = arguments["bins"]
+        else:
+            raise UserError(f"env_wrapper {name} is not supported here; {TIME_LIMIT} and {DISCRETISE} are")
+    envs = make_sb3_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
+    envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
+    normalise = hyper.get("normalize")
+    if normalise:
+        which = normalise if isinstance(normalise, dict) else {}
+        envs = VecNormalize(envs, gamma=float(hyper.get("gamma", 0.99)), **which)
+    return envs
+
+
+def make_model(run: Run, envs: Any) -> Any:
+    """Return a new learner."""
+    import torch
+    from stable_baselines3.common.noise import NormalActionNoise
+    from stable_baselines3.common.utils import LinearSchedule
+
+    # The networks are too small to share out: a second thread costs more than it brings.
+    torch.set_num_threads(1)
+    own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "env_kwargs", "noise_type", "noise_std")
+    arguments = {k: v for k, v in run.hyperparameters.items() if k not in own}
+    for name in ("learning_rate", "clip_range"):
+        if isinstance(arguments.get(name), str):  # "lin_3e-4" falls to zero in the course of the training
+            arguments[name] = LinearSchedule(float(arguments[name].removeprefix("lin_")), 0.0, 1.0)
+    if run.hyperparameters.get("noise_type") == "normal":
+        sigma = np.full(envs.action_space.shape, float(run.hyperparameters["noise_std"]))
+        arguments["action_noise"] = NormalActionNoise(np.zeros_like(sigma), sigma)
+    try:
+        return learner(run.algo)(
+            env=envs, seed=run.seed, device="cpu", tensorboard_log=str(run.path("tensorboard")), **arguments
+        )
+    except (TypeError, ValueError, AssertionError) as error:
+        raise UserError(f"{run.algo} does not take the hyperparameters of {run.env}: {error}") from error
+
+
+# --- checkpoints --------------------------------------------------------------------------------------------
+
+
+def freeze(model: Any) -> dict[str, Any]:
+    """Return all that decides how training goes on: learner, environments, memory, random numbers."""
+    import torch
+
+    file = io.BytesIO()
+    model.save(file)
+    return {
+        "model": file.getvalue(),
+        "envs": pickle.dumps([_own(layer) for layer in _layers(model.get_env())]),
+        "buffer": pickle.dumps(getattr(model, "replay_buffer", None)),
+        "noise": [(d.exploration_mat, d.exploration_matrices) for d in _explorers(model.policy)],
+        "random": (random.getstate(), np.random.get_state(), torch.get_rng_state()),  # noqa: NPY002
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def thaw(run: Run, content: dict[str, Any]) -> Any:
+    """Return the learner of a checkpoint; `restore` puts back what the beginning of training changes."""
+    import torch
+
+    torch.set_num_threads(1)
+    envs = make_envs(run)
+    try:
+        for layer, state in zip(_layers(envs), pickle.loads(content["envs"]), strict=True):
+            vars(layer).update(state)
+        log = str(run.path("tensorboard"))
+        model = learner(run.algo).load(
+            io.BytesIO(content["model"]), env=envs, device="cpu", force_reset=False, tensorboard_log=log
+        )
+        buffer = pickle.loads(content["buffer"])
+    except Exception as error:  # whatever a damaged file leads to
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"{run.path(CHECKPOINT)} cannot be read ({reason}); --new starts anew") from error
+    if buffer is not None:
+        model.replay_buffer = buffer
+    return model
+
+
+def restore(model: Any, content: dict[str, Any]) -> None:
+    """Put the random numbers back to where they were, as the last thing before training goes on."""
+    import torch
+
+    for d, (one, many) in zip(_explorers(model.policy), content["noise"], strict=True):
+        d.exploration_mat, d.exploration_matrices = one, many
+    ours, numpys, torchs = content["random"]
+    random.setstate(ours)
+    np.random.set_state(numpys)  # noqa: NPY002
+    torch.set_rng_state(torchs)
+    model.action_space.np_random.bit_generator.state = content["actions"]
+
+
+def _layers(envs: Any) -> list[Any]:
+    """Return the vector environment and its wrappers, the outermost first."""
+    layers = [envs]
+    while hasattr(layers[-1], "venv"):
+        layers.append(layers[-1].venv)
+    return layers
+
+
+def _own(layer: Any) -> dict[str, Any]:
+    """Return a wrapper's own attributes, without the class's that Stable-Baselines3 keeps there too."""
+    return {k: v for k, v in vars(layer).items() if k not in ("venv", "class_attributes")}
+
+
+def _explorers(policy: Any) -> list[Any]:
+    """Return the distributions whose exploration noise is kept for some steps (gSDE)."""
+    owners = (policy, getattr(policy, "actor", None))
+    found = [getattr(owner, "action_dist", None) for owner in owners]
+    return [d for d in found if hasattr(d, "exploration_mat")]
+
+
+# --- training -----------------------------------------------------------------------------------------------
+
+
+def train(
+    run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None], stop: Callable[[], bool]
+) -> bool:
+    """Train a run as far as it has not been trained; return whether it is finished.
+
+    Parameters
+    ----------
+    run : Run
+        The run; it goes on from its checkpoint, where there is one.
+    show : callable
+        Called often, with the run.
+    tested : callable
+        Called when the policy was tested and a checkpoint written.
+    stop : callable
+        Tells whether to write a checkpoint and end.
+    """
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    content = run.load_checkpoint()
+    if content is None:
+        model = make_model(run, make_envs(run))
+        model.get_env().reset()  # compiles
+        # Another seed has other episodes from the first to the last.
+        model.get_env().seed(1_000_000 * run.seed % FIRST_FRESH_SEED)
+    else:
+        model = thaw(run, content)
+    started, before = time.perf_counter(), run.seconds
+    every = run.steps / TESTS
+
+    class Watch(BaseCallback):
+        """Test and save now and then, and end the training when asked to."""
+
+        frozen = content
+        last = run.trained
+
+        def _on_step(self) -> bool:
+            run.trained = self.num_timesteps
+            run.seconds = before + time.perf_counter() - started
+            show(run)
+            return not stop()
+
+        def _on_rollout_start(self) -> None:
+            # Here the roll-out before has been learnt from.
+            if self.frozen is not None:
+                restore(self.model, self.frozen)
+                self.frozen = None
+            elif not run.curve or self.num_timesteps - self.last >= every:
+                self.keep()
+
+        def keep(self) -> None:
+            """Test the policy as it is, and save all."""
+            content = freeze(self.model)
+            mean = evaluate_batch(run.env, Policy(self.model), FIRST_TEST_SEED, TEST_EPISODES).mean()
+            run.trained = self.last = self.num_timesteps
+            run.seconds = before + time.perf_counter() - started
+            run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
+            run.save_checkpoint(content)
+            self.logger.record("test/mean_return", mean)
+            tested(run)
+
+    watch = Watch()
+    if run.trained < run.steps:
+        # The learner adds what it has done before to the number of steps it is given.
+        model.learn(
+            run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
+        )
+        if stop() and run.trained < run.steps:
+            return False  # what was learnt since the last checkpoint is learnt again
+        watch.keep()
+    finish(run, model)
+    return True
+
+
+def finish(run: Run, model: Any) -> None:
+    """Write the policy, evaluate it on fresh episodes, and write the result."""
+    normalise = model.get_vec_normalize_env()
+    file = io.BytesIO()
+    model.save(file)
+    write(run.path(MODEL), file.getvalue())
+    if normalise is not None and normalise.norm_obs:
+        write(run.path(NORMALISATION), pickle.dumps(normalise))
+    started = time.perf_counter()
+    returns = evaluate_batch(run.env, Policy(model), FIRST_FRESH_SEED, EPISODES)
+    known = KNOWN_RETURNS.get(run.env)
+    result = {
+        **run.settings,
+        "trained": run.trained,
+        "wall_seconds": round(run.seconds, 2),
+        "evaluation_seconds": round(time.perf_counter() - started, 2),
+        "mean_return": float(returns.mean()),
+        "score": score(run.env, float(returns.mean())),
+        "known_returns": dict(zip(("random", "best"), known, strict=True)) if known else None,
+        "curve": run.curve,
+        "evaluation": {"first_seed": FIRST_FRESH_SEED, "episodes": EPISODES, "returns": returns.tolist()},
+        "versions": {"python": platform.python_version(), "lag-envs": __version__}
+        | {name: version(name) for name in PACKAGES},
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+    }
+    write(run.path(RESULT), json.dumps(result, indent=1) + "\n")
+    run.path(CHECKPOINT).unlink(missing_ok=True)
+
+
+# --- policies -----------------------------------------------------------------------------------------------
+
+
+class Policy:
+    """A learner's policy as it acts in the environments themselves: observations in, actions in [-1, 1] out.
+
+    Parameters
+    ----------
+    model : BaseAlgorithm
+        A learner; where its environments normalise observations, so does the policy.
+    normalise : VecNormalize, optional
+        The normalisation, for a learner that was loaded without environments.
+    """
+
+    def __init__(self, model: Any, normalise: Any = None) -> None:
+        self.model = model
+        if normalise is None and model.get_env() is not None:
+            normalise = model.get_vec_normalize_env()
+        self.normalise = normalise if normalise is not None and normalise.norm_obs else None
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return the action, for each observation."""
+        if self.normalise is not None:
+            observation = self.normalise.normalize_obs(observation)
+        action, state = self.model.predict(observation, state, episode_start, deterministic)
+        bins = getattr(self.model.action_space, "n", None)
+        if bins is not None:
+            from agents.sb3_vec_env import bin_centres
+
+            action = bin_centres(int(bins))[np.asarray(action)][..., None]
+        return action, state
+
+
+def load_policy(folder: Path) -> Policy:
+    """Return the policy of a finished run.
+
+    Raises
+    ------
+    UserError
+        Where the folder holds no finished run, or a damaged one.
+    """
+    result = read_result(folder / RESULT)
+    try:
+        model = learner(result["algo"]).load(folder / MODEL, device="cpu")
+        file = folder / NORMALISATION
+        normalise = pickle.loads(file.read_bytes()) if file.exists() else None
+    except Exception as error:  # whatever a damaged file leads to
+        reason = f"{type(error).__name__}: {error}"
+        raise UserError(f"the policy in {folder} cannot be read ({reason}); train it anew") from error
+    return Policy(model, normalise)

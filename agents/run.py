@@ -1,0 +1,179 @@
+"""One training run in its folder: settings, progress, checkpoint and result.
+
+A folder holds ``checkpoint.pkl`` while the run is not finished (everything that is needed to go on),
+then ``model.zip`` and ``result.json``. Files are replaced whole, so a kill at any moment leaves a readable
+folder.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import pickle
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lag_envs import TASKS
+
+SCHEMA = 1
+#: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
+#: trained. Training never comes near them.
+FIRST_FRESH_SEED = 1_000_000_000
+FIRST_TEST_SEED = 2_000_000_000
+CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
+
+
+class UserError(Exception):
+    """A mistake of the user's; its text is shown, without a traceback."""
+
+
+@dataclass
+class Run:
+    """A run's settings and how far it has come.
+
+    Parameters
+    ----------
+    folder : Path
+        Where everything of the run lies.
+    env, algo, seed, steps : str, str, int, int
+        Id of the environment, name of the learner, seed, steps to train for.
+    hyperparameters : dict
+        As in the files of `agents/hyperparams`.
+    """
+
+    folder: Path
+    env: str
+    algo: str
+    seed: int
+    steps: int
+    hyperparameters: dict[str, Any]
+    trained: int = 0
+    seconds: float = 0.0
+    #: Steps so far, seconds so far, mean return of the policy then.
+    curve: list[tuple[int, float, float]] = field(default_factory=list)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What a checkpoint must have been made with."""
+        names = ("env", "algo", "seed", "steps", "hyperparameters")
+        return {"schema": SCHEMA} | {name: getattr(self, name) for name in names}
+
+    @property
+    def name(self) -> str:
+        """How messages call the run."""
+        return f"{self.env} {self.algo} seed {self.seed}"
+
+    def path(self, name: str) -> Path:
+        """Return the path of one of the run's files."""
+        return self.folder / name
+
+    # --- files ----------------------------------------------------------------------------------------------
+
+    def save_checkpoint(self, content: dict[str, Any]) -> None:
+        """Write everything that is needed to go on."""
+        progress = {"trained": self.trained, "seconds": self.seconds, "curve": self.curve}
+        data = pickle.dumps({"settings": self.settings, "progress": progress, **content})
+        write(self.path(CHECKPOINT), data)
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """Return the checkpoint and take its progress over, or return None where there is none.
+
+        Raises
+        ------
+        UserError
+            For a file that cannot be read or that another run left.
+        """
+        file = self.path(CHECKPOINT)
+        if not file.exists():
+            return None
+        try:
+            content = pickle.loads(file.read_bytes())
+            settings, progress = content["settings"], content["progress"]
+            self.trained, self.seconds = progress["trained"], progress["seconds"]
+            self.curve = list(progress["curve"])
+        except Exception as error:  # whatever a damaged pickle leads to
+            reason = f"{type(error).__name__}: {error}"
+            raise UserError(f"{file} cannot be read ({reason}); --new starts anew") from error
+        self.check_settings(settings, file)
+        return content
+
+    def load_result(self) -> dict[str, Any] | None:
+        """Return the result of a run that is finished, else None; raises as `load_checkpoint` does."""
+        file = self.path(RESULT)
+        if not file.exists():
+            return None
+        content = read_result(file)
+        self.check_settings(content, file)
+        return content
+
+    def check_settings(self, found: dict[str, Any], file: Path) -> None:
+        """Raise UserError where a file belongs to a run with other settings."""
+        for name, value in self.settings.items():
+            if found.get(name) != value:
+                what = f"{name} {found.get(name)!r}, not {value!r}"
+                if name == "hyperparameters":
+                    both = {**value, **(found.get(name) or {})}
+                    other = [k for k in both if value.get(k) != (found.get(name) or {}).get(k)]
+                    what = f"other hyperparameters ({', '.join(map(str, other))})"
+                raise UserError(f"{file} is of a run with {what}; --new starts anew, --output goes elsewhere")
+
+    def foreign(self) -> bool:
+        """Tell whether the folder holds files that are not the run's."""
+        ours = ("tensorboard", CHECKPOINT + ".part")
+        return self.folder.exists() and any(f.name not in ours for f in self.folder.iterdir())
+
+    def remove(self) -> None:
+        """Remove the run's files, and no others."""
+        for name in (CHECKPOINT, MODEL, NORMALISATION, RESULT):
+            self.path(name).unlink(missing_ok=True)
+        for file in self.folder.glob("tensorboard/*/events.out.tfevents.*"):
+            file.unlink()
+
+
+def read_result(file: Path) -> dict[str, Any]:
+    """Return what a run's ``result.json`` holds.
+
+    Raises
+    ------
+    UserError
+        Where it cannot be read.
+    """
+    try:
+        content = json.loads(file.read_text())
+        if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+            raise ValueError("it was not written by this version")
+        if not isinstance(content["evaluation"]["returns"], list):
+            raise ValueError("its returns are no list")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{file} cannot be read ({error}); remove it, or start anew with --new") from error
+    return content
+
+
+def write(file: Path, data: bytes | str) -> None:
+    """Write a file whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(file.name + ".part")
+    try:
+        part.write_bytes(data.encode() if isinstance(data, str) else data)
+        os.replace(part, file)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def check_env(env_id: str) -> str:
+    """Return the id of an environment, or raise a UserError that knows what was meant."""
+    return check_name("environment", env_id, TASKS)
+
+
+def check_name(kind: str, name: str, known: Iterable[str]) -> str:
+    """Return a name that is known, or raise a UserError with those that are close."""
+    names = {n.lower(): n for n in known}
+    if name in names.values():
+        return name
+    close = [names[c] for c in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(names.values())}"
+    raise UserError(f"there is no {kind} {name!r}; {hint}")
