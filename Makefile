@@ -12,7 +12,7 @@ OLDEST_GYMNASIUM := 1.2.2
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-oldest lint types check bench report report-docs format clean
+.PHONY: help setup demo baselines test test-slow test-oldest lint types check bench report report-docs format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -23,6 +23,11 @@ setup:  ## make or update .venv (all others do this first); PYTHON=... chooses a
 
 demo: setup  ## train and evaluate an agent on PivotedBar-v0
 	$(BIN)/python -m agents.demo $(ARGS)
+
+baselines: setup  ## compute, train and measure all agents (hours; may be broken off), write docs/agents.md
+	$(BIN)/python -m agents.optimum
+	$(BIN)/python -m agents.train all --seeds 5
+	$(BIN)/python -m agents.results $(ARGS)
 
 test: setup  ## run the tests and doctests, all but the slow ones
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)

@@ -18,10 +18,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluate import KNOWN_RETURNS, evaluate, score
+from agents.evaluate import evaluate
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
 from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_env, check_name, write
 from agents.train import command, follow, processes
+from lag_envs.scores import KNOWN_RETURNS, score
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
@@ -139,8 +140,8 @@ def report(run: Run, video: bool) -> None:
     print(f"{'':22}{'mean':>9}{'lowest':>9}{'highest':>9}{'score':>8}")
     for name, r in sorted(returns.items(), key=lambda item: -item[1].mean()):
         print(f"{name:22}{r.mean():9.2f}{r.min():9.2f}{r.max():9.2f}{score(run.env, r.mean()):8.3f}")
-    low, high = KNOWN_RETURNS[run.env]
-    print(f"The score is 0 for the random policy ({low:g}) and 1 for the best return known ({high:g}).")
+    known = KNOWN_RETURNS[run.env]
+    print(f"The score is 0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g}).")
     print(
         f"\n{result['trained']:,} steps in {result['wall_seconds']:.1f} s of training, "
         f"{seconds:.1f} s of evaluation."
@@ -161,7 +162,7 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     others = sorted((r.mean(), name) for name, r in returns.items() if name != learner)
     for (mean, name), color in zip(reversed(others), ("tab:green", "tab:olive", "tab:brown"), strict=False):
         axes.axhline(mean, color=color, linestyle=":", label=f"{name} ({mean:.1f})")
-    best = KNOWN_RETURNS[run.env][1]
+    best = KNOWN_RETURNS[run.env].best
     axes.axhline(best, color="black", linestyle="--", linewidth=1.0, label=f"best known ({best:g})")
     axes.set(xlabel="environment steps", ylabel="return of an episode", xlim=(0, trained), title=run.env)
     axes.xaxis.set_major_formatter("{x:,.0f}")

@@ -1,22 +1,13 @@
-"""Returns and scores of agents over fresh episodes."""
+"""Returns of agents over fresh episodes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
-
-#: Mean returns of the random policy (4,096 episodes; `tests/test_docs.py` measures them again) and of the
-#: best one known: the optimum as estimated by value iteration, or a feedback law's return where that is more.
-KNOWN_RETURNS = {
-    "PivotedBar-v0": (-0.78, 421.0),
-    "PivotedBarFree-v0": (-2.43, 421.0),
-    "InclineBrake-v0": (-4.32, -1.72),
-    "CylinderInCylinderDamping-v0": (294.3, 363.8),
-}
+from numpy.typing import ArrayLike, NDArray
 
 
 def evaluate(env: gym.Env, agent: Any, seeds: Iterable[int]) -> NDArray[np.float64]:
@@ -45,7 +36,15 @@ def evaluate(env: gym.Env, agent: Any, seeds: Iterable[int]) -> NDArray[np.float
     return np.array(returns)
 
 
-def evaluate_batch(env_id: str, agent: Any, seed: int, episodes: int, **options: Any) -> NDArray[np.float64]:
+def evaluate_batch(
+    env_id: str,
+    agent: Any,
+    seed: int,
+    episodes: int,
+    *,
+    observe: Callable[[NDArray, NDArray[np.bool_]], NDArray] | None = None,
+    **options: Any,
+) -> NDArray[np.float64]:
     """Return an agent's returns in episodes that are stepped together, which is a good deal quicker.
 
     Parameters
@@ -58,6 +57,9 @@ def evaluate_batch(env_id: str, agent: Any, seed: int, episodes: int, **options:
         Seed of the first episode; the others' follow it.
     episodes : int
         Number of episodes.
+    observe : callable, optional
+        Stands between environments and agent, see `Sensor`. Given the observations (episodes, n) and which
+        of them begin an episode (episodes,), it returns what the agent gets to see.
     **options
         Parameters of the environment.
     """
@@ -66,7 +68,8 @@ def evaluate_batch(env_id: str, agent: Any, seed: int, episodes: int, **options:
     state, returns, running = None, np.zeros(episodes), np.ones(episodes, np.bool_)
     start = running.copy()
     while running.any():
-        action, state = agent.predict(observation, state, start, deterministic=True)
+        seen = observation if observe is None else observe(observation, start)
+        action, state = agent.predict(seen, state, start, deterministic=True)
         observation, reward, terminated, truncated, _ = envs.step(action)
         returns += np.where(running, reward, 0.0)
         start = terminated | truncated
@@ -75,9 +78,56 @@ def evaluate_batch(env_id: str, agent: Any, seed: int, episodes: int, **options:
     return returns
 
 
-def score(env_id: str, mean_return: float) -> float | None:
-    """Return how far a mean return lies on the way from the random policy (0) to the best known one (1)."""
-    if env_id not in KNOWN_RETURNS:
-        return None
-    random, best = KNOWN_RETURNS[env_id]
-    return (mean_return - random) / (best - random)
+class Sensor:
+    """What an agent gets to see of a batch: with noise, or late. An `observe` of `evaluate_batch`.
+
+    Parameters
+    ----------
+    noise : array_like, shape (n_observation,)
+        Standard deviation of Gaussian noise, drawn anew for each entry at each step.
+    late : bool
+        Whether the agent sees the observation before; at an episode's start there is only the first.
+    seed : int
+        Seed of the noise.
+    """
+
+    def __init__(self, noise: ArrayLike = 0.0, late: bool = False, seed: int = 0) -> None:
+        self.noise, self.late = np.asarray(noise, np.float64), late
+        self.rng = np.random.default_rng(seed)
+        self.before: NDArray | None = None
+
+    def __call__(self, observation: NDArray, start: NDArray[np.bool_]) -> NDArray:
+        """Return what is seen of observations (episodes, n), some of which begin an episode (episodes,)."""
+        seen = observation
+        if self.late:
+            if self.before is not None:
+                seen = np.where(start[:, None], observation, self.before)
+            self.before = observation.copy()
+        if self.noise.any():
+            seen = seen + self.noise * self.rng.standard_normal(seen.shape)
+        return seen.astype(observation.dtype)
+
+
+def observation_spread(env_id: str, seed: int, episodes: int = 100) -> NDArray[np.float64]:
+    """Return each observation entry's standard deviation under random actions, shape (n_observation,).
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment.
+    seed : int
+        Seed of the first episode; the others' follow it.
+    episodes : int
+        Number of episodes; their first ones count, to their end.
+    """
+    envs = gym.make_vec(env_id, episodes, autoreset_mode="SameStep")
+    rng = np.random.default_rng(seed)
+    observation, _ = envs.reset(seed=seed)
+    running, seen = np.ones(episodes, np.bool_), []
+    while running.any():
+        seen.append(observation[running])
+        action = rng.uniform(-1.0, 1.0, (episodes, 1)).astype(np.float32)
+        observation, _, terminated, truncated, _ = envs.step(action)
+        running &= ~(terminated | truncated)
+    envs.close()
+    return np.concatenate(seen).std(axis=0, dtype=np.float64)

@@ -10,6 +10,7 @@ import platform
 import random
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluate import KNOWN_RETURNS, evaluate_batch, score
+from agents.evaluate import evaluate_batch
 from agents.run import (
     CHECKPOINT,
     FIRST_FRESH_SEED,
@@ -32,6 +33,7 @@ from agents.run import (
     write,
 )
 from lag_envs import TASKS, __version__
+from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import load_task
 
 #: Where each learner's class is.
@@ -48,6 +50,7 @@ TEST_EPISODES, EPISODES = 20, 100
 #: Tests, and so points of the learning curve and checkpoints, of one run.
 TESTS = 16
 TIME_LIMIT, DISCRETISE = "gymnasium.wrappers.TimeLimit", "gymnasium.wrappers.DiscretizeAction"
+SCALE = "agents.sb3_vec_env.ScaledReward"
 #: Libraries whose versions a result tells.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
@@ -98,24 +101,27 @@ def make_envs(run: Run) -> Any:
     """Return the native vector environment with the wrappers that the hyperparameters ask for."""
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-    from agents.sb3_vec_env import DiscreteActions, make_sb3_vec_env
+    from agents.sb3_vec_env import DiscreteActions, ScaledReward, make_sb3_vec_env
 
     hyper = run.hyperparameters
     options = dict(hyper.get("env_kwargs", {}))
     place, fixed = TASKS[run.env]
     steps = load_task(place)(**(fixed | options)).limit
-    bins = None
-    for wrapper in hyper.get("env_wrapper", []):
+    bins = factor = None
+    for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
         (name, arguments), *_ = wrapper.items()
         if name == TIME_LIMIT:
             options["max_episode_steps"] = arguments["max_episode_steps"]
             steps = min(steps, options["max_episode_steps"])
         elif name == DISCRETISE:
             bins = arguments["bins"]
+        elif name == SCALE:
+            factor = arguments["factor"]
         else:
-            raise UserError(f"env_wrapper {name} is not supported here; {TIME_LIMIT} and {DISCRETISE} are")
+            raise UserError(f"wrapper {name} is not known here; {TIME_LIMIT}, {DISCRETISE} and {SCALE} are")
     envs = make_sb3_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
+    envs = envs if factor is None else ScaledReward(envs, factor)
     normalise = hyper.get("normalize")
     if normalise:
         which = normalise if isinstance(normalise, dict) else {}
@@ -131,8 +137,10 @@ def make_model(run: Run, envs: Any) -> Any:
 
     # The networks are too small to share out: a second thread costs more than it brings.
     torch.set_num_threads(1)
-    own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "env_kwargs", "noise_type", "noise_std")
-    arguments = {k: v for k, v in run.hyperparameters.items() if k not in own}
+    own = ("n_envs", "n_timesteps", "normalize", "env_wrapper", "vec_env_wrapper", "env_kwargs")
+    own += ("noise_type", "noise_std")
+    # A copy, for learners write into what they are given.
+    arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in own})
     for name in ("learning_rate", "clip_range"):
         if isinstance(arguments.get(name), str):  # "lin_3e-4" falls to zero in the course of the training
             arguments[name] = LinearSchedule(float(arguments[name].removeprefix("lin_")), 0.0, 1.0)
@@ -315,7 +323,7 @@ def finish(run: Run, model: Any) -> None:
         "evaluation_seconds": round(time.perf_counter() - started, 2),
         "mean_return": float(returns.mean()),
         "score": score(run.env, float(returns.mean())),
-        "known_returns": dict(zip(("random", "best"), known, strict=True)) if known else None,
+        "known_returns": {"random": known.random, "best": known.best} if known else None,
         "curve": run.curve,
         "evaluation": {"first_seed": FIRST_FRESH_SEED, "episodes": EPISODES, "returns": returns.tolist()},
         "versions": {"python": platform.python_version(), "lag-envs": __version__}

@@ -1,4 +1,4 @@
-"""Train a learner on an environment, several seeds side by side, here or on a Ray cluster.
+"""Train learners on environments, several seeds side by side, here or on a Ray cluster.
 
 ``python -m agents.train --help`` tells more.
 """
@@ -11,6 +11,7 @@ import os
 import queue
 import shlex
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -19,11 +20,13 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
-from agents.learners import ALGORITHMS, TESTS, hyperparameters, train
+from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
 from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_env, check_name, write
+from lag_envs import TASKS
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -40,7 +43,8 @@ Hyperparameters are in agents/hyperparams, in the form of the RL Zoo, which take
 examples:
   python -m agents.train PivotedBar-v0                          one seed of PPO, in less than a minute
   python -m agents.train PivotedBar-v0 --seeds 10               ten seeds, as many at once as there are cores
-  python -m agents.train InclineTilt-v0 --algo sac --seeds 5
+  python -m agents.train InclineTilt-v0 --algo sac td3 --seeds 5
+  python -m agents.train all --seeds 5                          what docs/agents.md is made from
   python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   the same, spread over a Ray cluster
 """
 
@@ -53,8 +57,10 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("env", metavar="ENV", help="id of the environment, such as PivotedBar-v0")
-    p.add_argument("--algo", default="ppo", help=f"{', '.join(ALGORITHMS)} (default %(default)s)")
+    p.add_argument("env", nargs="+", metavar="ENV", help="ids of environments, or all")
+    p.add_argument(
+        "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default ppo)"
+    )
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds (default %(default)s)")
     p.add_argument(
         "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
@@ -100,21 +106,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def plan(args: argparse.Namespace) -> list[Run]:
     """Return the runs that are asked for, or raise a UserError."""
-    check_env(args.env)
-    check_name("algorithm", args.algo, ALGORITHMS)
+    envs = list(TASKS) if args.env == ["all"] else [check_env(name) for name in dict.fromkeys(args.env)]
+    algos = [check_name("algorithm", name, ALGORITHMS) for name in dict.fromkeys(args.algo)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
         value = getattr(args, name)
         if value is not None and not least <= value < 2**31:
             option = "--" + name.replace("_", "-")
             raise UserError(f"{option} must lie between {least} and 2147483647, got {value}")
-    hyper = hyperparameters(args.algo, args.env, args.config)
-    steps = args.steps or int(hyper["n_timesteps"])
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
-    runs = [
-        Run(args.output / args.env / args.algo / f"seed{seed}", args.env, args.algo, seed, steps, hyper)
-        for seed in range(args.first_seed, args.first_seed + args.seeds)
-    ]
+    runs = []
+    for env, algo in product(envs, algos):
+        hyper = hyperparameters(algo, env, args.config)
+        steps = args.steps or int(hyper["n_timesteps"])
+        for seed in range(args.first_seed, args.first_seed + args.seeds):
+            runs.append(Run(args.output / env / algo / f"seed{seed}", env, algo, seed, steps, hyper))
     for run in runs:
         if args.new:
             run.remove()
@@ -236,6 +242,7 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callab
     root = Path(__file__).parents[1]
     modules = [str(root / "agents"), str(root / "src" / "lag_envs")]
     options: dict[str, Any] = {"runtime_env": {"py_modules": modules}, "log_to_driver": False}
+    _check_address(address)
     try:
         ray.init(None if address == "local" else address, logging_level="error", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -275,6 +282,16 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callab
         yield poll, stopped.set
     finally:
         ray.shutdown()
+
+
+def _check_address(address: str) -> None:
+    """Raise UserError where nobody listens: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host:
+        try:
+            socket.create_connection((host, int(port)), timeout=10.0).close()
+        except (OSError, ValueError, OverflowError) as error:
+            raise UserError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 def _packed(run: Run) -> tuple[dict[str, Any], bytes | None]:
@@ -336,7 +353,7 @@ def follow(runs: Sequence[Run], spread: Callable) -> tuple[dict[str, str], bool]
             elif kind == "tested":
                 run.curve = what
                 trained, seconds, mean = what[-1]
-                _say(bar, f"seed {run.seed}: {trained:>9,} steps, {seconds:4.0f} s, return {mean:.2f}")
+                _say(bar, f"{run.name}: {trained:>9,} steps, {seconds:4.0f} s, return {mean:.2f}")
             else:
                 del left[name]
                 if what and what != "stopped":
@@ -345,7 +362,7 @@ def follow(runs: Sequence[Run], spread: Callable) -> tuple[dict[str, str], bool]
                     steps[name] = run.steps
                     result = run.load_result() or {}
                     tail = "" if result.get("score") is None else f", score {result['score']:.3f}"
-                    _say(bar, f"seed {run.seed}: finished, return {result['mean_return']:.2f}{tail}")
+                    _say(bar, f"{run.name}: finished, return {result['mean_return']:.2f}{tail}")
     return failed, bool(interrupted)
 
 
@@ -357,16 +374,17 @@ def _say(bar: Any, line: str) -> None:
 
 def summarise(runs: Sequence[Run]) -> None:
     """Print the runs' returns."""
-    results = [(run, result) for run in runs if (result := run.load_result()) is not None]
-    if not results:
-        return
-    print(f"\n{results[0][0].env}, {results[0][0].algo}, 100 fresh episodes each")
-    print(f"{'seed':>6}{'steps':>12}{'seconds':>9}{'return':>10}{'score':>8}")
-    for run, result in results:
-        tail = "" if result["score"] is None else f"{result['score']:8.3f}"
-        row = f"{run.seed:6}{result['trained']:12,}{result['wall_seconds']:9.1f}{result['mean_return']:10.2f}"
-        print(row + tail)
-    print(f"Written to {results[0][0].folder.parent}/")
+    for (env, algo), some in groupby(runs, key=lambda run: (run.env, run.algo)):
+        results = [(run, result) for run in some if (result := run.load_result()) is not None]
+        if not results:
+            continue
+        print(f"\n{env}, {algo}, {EPISODES} fresh episodes each")
+        print(f"{'seed':>6}{'steps':>12}{'seconds':>9}{'return':>10}{'score':>8}")
+        for run, result in results:
+            tail = "" if result["score"] is None else f"{result['score']:8.3f}"
+            trained, seconds, mean = result["trained"], result["wall_seconds"], result["mean_return"]
+            print(f"{run.seed:6}{trained:12,}{seconds:9.1f}{mean:10.2f}{tail}")
+        print(f"Written to {results[0][0].folder.parent}/")
 
 
 def command(module: str, arguments: Sequence[str] | None) -> str:

@@ -1,7 +1,5 @@
 import json
 import os
-import re
-import signal
 import subprocess
 import sys
 import time
@@ -16,8 +14,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from agents import demo
 from agents.controllers import Constant, EnergyShapingLQR, Random, do_nothing, linearised
-from agents.evaluate import KNOWN_RETURNS, evaluate, evaluate_batch, score
+from agents.evaluate import evaluate, evaluate_batch
 from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
+from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
@@ -96,13 +95,15 @@ def test_agents_without_knowledge():
     first, second = (Random(1).predict(np.zeros((3, 5)))[0] for _ in range(2))
     assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
     assert evaluate_batch(ENV, Constant(0.0), 0, 20).mean() == pytest.approx(0.0, abs=0.1)
-    assert evaluate_batch(ENV, Random(0), 0, 100).mean() == pytest.approx(KNOWN_RETURNS[ENV][0], abs=3.0)
+    assert evaluate_batch(ENV, Random(0), 0, 100).mean() == pytest.approx(KNOWN_RETURNS[ENV].random, abs=3.0)
 
 
 def test_score():
-    assert score(ENV, 421.0) == 1.0
-    assert score(ENV, -0.78) == 0.0
-    assert score("PivotedBarBalance-v0", 400.0) is None
+    assert set(KNOWN_RETURNS) == set(TASKS)
+    for env_id, known in KNOWN_RETURNS.items():
+        assert score(env_id, known.best) == 1.0 and score(env_id, known.random) == 0.0
+        assert known.random < known.best
+    assert score("Elsewhere-v0", 1.0) is None
 
 
 # --- the adapter ---
@@ -213,113 +214,58 @@ def test_sb3_wrappers_and_learner_work_on_the_adapter():
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def demonstrate(monkeypatch, capsys, tmp_path):
     """Return a function that runs the demo here; it returns the status and what was printed."""
     monkeypatch.setattr(demo, "EPISODES", 2)
 
-    def run(*arguments, folder):
-        status = demo.main([*arguments, "--output", str(folder)])
+    def demonstrate(*arguments):
+        status = demo.main([*arguments, "--output", str(tmp_path / "run")])
         return status, "".join(capsys.readouterr())
 
-    return run
+    return demonstrate
 
 
-def start(*arguments, folder):
-    """Start the demo as a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "agents.demo", "--output", str(folder), *arguments],
-        cwd=ROOT,
-        env=os.environ
-        | {"PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))},
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
-
-
-def test_demo_can_be_interrupted_resumed_and_evaluated(run, tmp_path):
+def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     folder = tmp_path / "run"
-    first = start("--steps", "100000", folder=folder)
-    for line in first.stdout:
-        if re.match(r" *8,192 steps", line):
-            break
-    first.send_signal(signal.SIGINT)
-    output = first.communicate(timeout=120)[0]
-    assert first.returncode == 128 + signal.SIGINT, output
-    assert "Stopped after" in output and f"--resume --output {folder}" in output
-    saved = json.loads((folder / "run.json").read_text())
-    assert 8192 <= saved["trained"] < 100_000
-    assert PPO.load(folder / "model.zip").num_timesteps == saved["trained"]
-
-    status, output = run(folder=folder)
-    assert status == 2 and "unfinished" in output and "--resume" in output and "--new" in output
-
-    goal = saved["trained"] + 1000
-    status, output = run("--resume", "--steps", str(goal), "--no-video", folder=folder)
+    status, output = demonstrate("--steps", "5000", "--env", "InclineBrake-v0")
     assert status == 0, output
-    assert "energy shaping + LQR" in output
-    results = json.loads((folder / "results.json").read_text())
-    assert goal <= results["steps"] < 100_000
-    assert set(results["agents"]) == {"PPO", "random", "do nothing", "energy shaping + LQR"}
-    assert results["agents"]["energy shaping + LQR"]["mean_return"] > 417.0
-    assert len(results["agents"]["PPO"]["returns"]) == len(set(results["evaluation_seeds"])) == 2
-    assert results["versions"]["torch"]
+    assert "switching line" in output and "best known" in output
+    comparison = json.loads((folder / "comparison.json").read_text())
+    assert {"PPO", "random", "zero", "full damping", "switching line"} <= set(comparison["agents"])
+    assert len(comparison["agents"]["PPO"]["returns"]) == len(set(comparison["evaluation_seeds"])) == 2
     assert (folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
-    assert not (folder / "episode.mp4").exists()
-    assert list((folder / "tensorboard").glob("*/events*"))
-    curve = json.loads((folder / "run.json").read_text())["curve"]
-    assert curve[: len(saved["curve"])] == saved["curve"] and curve[-1][0] == results["steps"]
-
-    status, output = run(folder=folder)
-    assert status == 2 and "evaluated" in output
-
-    (folder / "model.zip").write_bytes(b"not a model")
-    status, output = run("--resume", folder=folder)
-    assert status == 2 and "model.zip cannot be read" in output
-
-
-def test_demo_trains_other_environments_and_starts_anew(run, tmp_path):
-    for more in ([], ["--new", "--no-video"]):
-        status, output = run(*more, "--env", "InclineBrake-v0", "--steps", "1", folder=tmp_path)
-        assert status == 0, output
-        assert (tmp_path / "episode.mp4").exists() is (not more)
-    assert len(json.loads((tmp_path / "run.json").read_text())["curve"]) == 2
-    status, output = run("--resume", "--seed", "5", folder=tmp_path)
-    assert status == 2 and "has seed 0" in output
+    assert (folder / "episode.mp4").stat().st_size > 1000
+    assert json.loads((folder / "result.json").read_text())["trained"] >= 5000
+    # The same command evaluates it again; other settings need --new.
+    (folder / "episode.mp4").unlink()
+    before = (folder / "model.zip").stat().st_mtime_ns
+    status, output = demonstrate("--steps", "5000", "--env", "InclineBrake-v0", "--no-video")
+    assert status == 0 and "switching line" in output and not (folder / "episode.mp4").exists()
+    assert (folder / "model.zip").stat().st_mtime_ns == before
+    status, output = demonstrate("--env", "InclineBrake-v0", "--seed", "5", "--steps", "5000")
+    assert status == 2 and "is of a run with seed 0, not 5; --new starts anew" in output
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--env", "PivotedBr-v0"], "did you mean PivotedBar-v0"),
+        (["--algo", "pppo"], "did you mean ppo"),
         (["--steps", "0"], "--steps must be at least 1"),
         (["--seed", "-1"], "--seed must lie between"),
-        (["--resume"], "there is no run in"),
     ],
 )
-def test_demo_says_what_is_wrong(arguments, message, run, tmp_path):
-    status, output = run(*arguments, folder=tmp_path / "run")
+def test_demo_says_what_is_wrong(arguments, message, demonstrate):
+    status, output = demonstrate(*arguments)
     assert status == 2 and message in output and output.startswith("agents.demo: error:")
 
 
-@pytest.mark.parametrize(
-    "content", ["{", "[]", '{"env": "PivotedBar-v0"}', '{"env": "x", "seed": 0, "steps": 5}']
-)
-def test_demo_with_a_damaged_run_file(content, run, tmp_path):
-    (tmp_path / "run.json").write_text(content)
-    status, output = run("--resume", folder=tmp_path)
-    assert status == 2 and "run.json cannot be read" in output
-
-
-def test_demo_leaves_folders_of_others_alone(run, tmp_path):
-    (tmp_path / "model.zip").write_text("somebody's")
-    status, output = run(folder=tmp_path)
+def test_demo_leaves_folders_of_others_alone(demonstrate, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "model.zip").write_text("somebody's")
+    status, output = demonstrate()
     assert status == 2 and "holds files but no run" in output
-    assert (tmp_path / "model.zip").read_text() == "somebody's"
-
-
-def test_recipes_are_for_environments_that_exist():
-    assert set(demo.RECIPES) | set(KNOWN_RETURNS) <= set(TASKS)
+    assert (tmp_path / "run" / "model.zip").read_text() == "somebody's"
 
 
 def test_demo_help_is_quick():
@@ -328,5 +274,5 @@ def test_demo_help_is_quick():
         [sys.executable, "-m", "agents.demo", "--help"], cwd=ROOT, capture_output=True, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
     )  # fmt: skip
-    assert done.returncode == 0 and "--resume" in done.stdout and "model.zip" in done.stdout
+    assert done.returncode == 0 and "--new" in done.stdout and "model.zip" in done.stdout
     assert time.perf_counter() - started < 20.0

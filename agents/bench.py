@@ -1,0 +1,134 @@
+"""What the adapter gains over Stable-Baselines3's own `DummyVecEnv`: stepping alone, and in training.
+
+``python -m agents.bench`` measures both in turn, on one core, and prints medians and ratios.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lag_envs.benchmark import (
+    ONE_THREAD,
+    Contestant,
+    Run,
+    batch,
+    columns,
+    machine,
+    measure,
+    quartiles,
+    random_actions,
+    ratios,
+    short,
+)
+
+ENV = "PivotedBar-v0"
+SIZES = (1, 16, 64, 256)
+TRAINED = 64  #: environments of the learner
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    p = argparse.ArgumentParser(
+        prog="python -m agents.bench",
+        description=f"Compare our vector environment for Stable-Baselines3 with DummyVecEnv, on {ENV}.",
+    )
+    p.add_argument("--rounds", type=int, default=15, help="samples of each (default %(default)s)")
+    p.add_argument("--output", type=Path, metavar="FILE", help="keep all samples as JSON")
+    return p
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command."""
+    args = parser().parse_args(arguments)
+    if args.rounds < 1:
+        print(f"agents.bench: error: --rounds must be at least 1, got {args.rounds}", file=sys.stderr)
+        return 2
+    os.environ.update(ONE_THREAD)
+    kinds = {"adapter": adapter, "DummyVecEnv": dummy}
+    steps = [Contestant(k, ENV, "step", n, partial(stepping, f, n)) for n in SIZES for k, f in kinds.items()]
+    learn = [Contestant(k, ENV, "PPO", TRAINED, partial(training, f)) for k, f in kinds.items()]
+    # A sample of training is a roll-out and what is learnt from it, however short it is asked to be.
+    complete = measure(steps, args.rounds, 0.1) and measure(learn, args.rounds, 0.1)
+    rows = [summary(ours, theirs) for ours, theirs in zip(*[iter(steps + learn)] * 2, strict=True)]
+    print("\n".join(table(rows)))
+    if args.output:
+        about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
+        args.output.write_text(json.dumps(about | {"env": ENV, "rows": rows}, indent=1) + "\n")
+    return 0 if complete and not any(row["problem"] for row in rows) else 1
+
+
+def adapter(n: int) -> Any:
+    """Make our vector environment."""
+    from agents.sb3_vec_env import make_sb3_vec_env
+
+    return make_sb3_vec_env(ENV, n)
+
+
+def dummy(n: int) -> Any:
+    """Make Stable-Baselines3's over single environments."""
+    import gymnasium as gym
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    import lag_envs  # noqa: F401  (registers the environments)
+
+    return DummyVecEnv([lambda: gym.make(ENV)] * n)
+
+
+def stepping(make: Any, n: int) -> Run:
+    """Prepare steps with actions made beforehand."""
+    envs = make(n)
+    envs.reset()
+    return batch(envs.step, random_actions(n))
+
+
+def training(make: Any) -> Run:
+    """Prepare PPO with the hyperparameters that `agents.train` uses."""
+    from agents.learners import hyperparameters, make_model
+    from agents.run import Run as TrainingRun
+
+    hyper = hyperparameters("ppo", ENV)
+    folder = Path(tempfile.gettempdir())
+    model = make_model(TrainingRun(folder, ENV, "ppo", 0, 1, hyper), make(TRAINED))
+    model.tensorboard_log = None
+
+    def run(steps: int) -> int:
+        rollouts = -(-steps // model.n_steps)
+        model.learn(rollouts * model.n_steps * TRAINED, reset_num_timesteps=False)
+        return rollouts * model.n_steps
+
+    return run
+
+
+def summary(ours: Contestant, theirs: Contestant) -> dict[str, Any]:
+    """Return both rates [steps/s] and their ratio: lower quartile, median and upper quartile."""
+    row: dict[str, Any] = {
+        "kind": ours.kind, "num_envs": ours.num_envs, "problem": ours.problem or theirs.problem,
+        "adapter": ours.rates, "dummy": theirs.rates,
+    }  # fmt: skip
+    pairs = ratios(ours.rates, theirs.rates)
+    return row | ({"ratio": quartiles(pairs)} if pairs else {})
+
+
+def table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table."""
+    cells = [("", "environments", "adapter", "DummyVecEnv", "ratio")]
+    for row in rows:
+        if row["problem"]:
+            cells.append((row["kind"], str(row["num_envs"]), row["problem"]))
+            continue
+        both = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
+        cells.append((row["kind"], str(row["num_envs"]), *both, f"{row['ratio'][1]:.1f}"))
+    return columns(cells)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

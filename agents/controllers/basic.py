@@ -1,0 +1,132 @@
+"""What controllers share, and three that know nothing of the motion."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+
+class Constant:
+    """Always the same action.
+
+    Parameters
+    ----------
+    action : float
+        The action in [-1, 1].
+    """
+
+    def __init__(self, action: float) -> None:
+        self.action = action
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return the action, for each observation."""
+        return np.full((*np.shape(observation)[:-1], 1), self.action, np.float32), state
+
+
+def do_nothing(of: gym.Env | Task) -> Constant:
+    """Return the agent of zero control: where the control is a damping, its action is -1."""
+    task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
+    return Constant(to_action(task, 0.0))
+
+
+class Random:
+    """Uniformly random actions.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the actions.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return an action for each observation."""
+        return self.rng.uniform(-1.0, 1.0, (*np.shape(observation)[:-1], 1)).astype(np.float32), state
+
+
+class Law:
+    """Base of the controllers without memory: a control for each state.
+
+    A subclass defines `control`. Controls beyond the task's limit are clipped.
+
+    Parameters
+    ----------
+    task : Task
+        The task with its parameters, ``env.unwrapped.task``.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        self.read = Reader(task)
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the control [SI unit] for states (..., n_state) and targets (...)."""
+        raise NotImplementedError
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return the action for each observation."""
+        return as_actions(to_action(self.task, self.control(*self.read(observation)))), state
+
+
+def to_action(task: Task, control: Any) -> Any:
+    """Return the action that asks for a control; a damping goes from 0 to its limit, others to both sides."""
+    share = control / task.limit_control
+    return 2.0 * share - 1.0 if getattr(task.scene, "control", None) == "damping" else share
+
+
+def as_actions(values: Array) -> NDArray[np.float32]:
+    """Return numbers (...) as actions (..., 1) in [-1, 1]."""
+    return np.clip(values, -1.0, 1.0)[..., None].astype(np.float32)
+
+
+class Reader:
+    """Reads states and targets from observations.
+
+    What a task observes is linear in the lifted state and the target; so it is inverted from the values at
+    zero and at the unit vectors.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    """
+
+    def __init__(self, task: Task) -> None:
+        scene, k = task.scene, SimpleNamespace(**task.constants())
+        self.task, self._n, self._width = task, len(scene.state_names), scene.width
+        rows = np.vstack([np.zeros(self._width + 1), np.eye(self._width + 1)])
+        seen = np.array([task.observe(list(row[:-1]), row[-1], k) for row in rows], np.float64)
+        self._zero, slopes = seen[0], seen[1:] - seen[0]
+        self._inverse = np.linalg.pinv(slopes)
+        #: Index of an angle that is seen by its cosine and sine only, and so lies in [-π, π]; or None.
+        self.wrapped = None if scene.angle is None or slopes[scene.angle].any() else scene.angle
+
+    def __call__(self, observation: NDArray) -> tuple[Array, Array]:
+        """Return states (..., n_state) and targets (...) for observations (..., n)."""
+        values = np.asarray(observation, np.float64)
+        if values.shape[-1:] != self._zero.shape:
+            raise ValueError(
+                f"observations of {type(self.task).__name__} must have shape (..., {len(self._zero)}) for "
+                f"{', '.join(self.task.observation)}; got {values.shape}"
+            )
+        lifted = (values - self._zero) @ self._inverse
+        state = lifted[..., : self._n].copy()
+        if self.wrapped is not None:
+            state[..., self.wrapped] = np.arctan2(lifted[..., self._n + 1], lifted[..., self._n])
+        return state, lifted[..., self._width]

@@ -1,0 +1,134 @@
+"""Controllers of the cylinder that rolls inside a shell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import sympy
+
+from agents.controllers.basic import Array, Law
+from agents.controllers.ilqr import ILQR, Opening
+from agents.controllers.linear import equations, linearise, regulator
+from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
+
+
+class TiltLQR(Law):
+    """Hold a cylinder at an angle by a linear-quadratic regulator about the shell's rate that holds it there.
+
+    That rate follows from the equation of motion at rest.
+
+    Parameters
+    ----------
+    task : Tilt
+        The task, ``env.unwrapped.task``; its medium must drag, else no rate holds the cylinder.
+    effort : float
+        Weight of (u/U)² that is added to the reward's 0.02.
+    """
+
+    def __init__(self, task: Tilt, *, effort: float = 0.034) -> None:
+        super().__init__(task)
+        if task.scene.damping == 0.0:
+            raise ValueError("without drag no rate of the shell holds the cylinder, got damping=0 N m s")
+        self.gain, _ = regulator(task, [0.0, 0.0, 0.0], extra={"u": effort / task.limit_control**2})
+        (theta, theta_dot, psi_dot), u, rates = equations(task.scene)
+        (rate,) = sympy.solve(rates[1].subs({theta_dot: 0, u: 0}), psi_dot)
+        self.holding_rate = sympy.lambdify(theta, rate, "numpy")
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the shell's acceleration."""
+        wanted = np.stack([target, np.zeros_like(target), self.holding_rate(target)], axis=-1)
+        return (wanted - state) @ self.gain
+
+
+class EnergyPump(Law):
+    """Pump the swing to the wanted energy, and make good what the drag takes.
+
+    Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes by θ' (push u - drag (θ' - ψ')); so there
+    is a control that keeps it, and one in the direction of θ' raises it. The shell is drawn back to rest.
+
+    Parameters
+    ----------
+    task : Pump
+        The task, ``env.unwrapped.task``.
+    pump : float
+        Acceleration of the shell per missing share of the energy and per highest rate of the cylinder, over
+        the largest acceleration.
+    centring : float
+        Rate at which the shell is drawn back to rest [1/s].
+    """
+
+    def __init__(self, task: Pump, *, pump: float = 29.0, centring: float = 2.0) -> None:
+        super().__init__(task)
+        if task.scene.inertia == 0.0:
+            raise ValueError(
+                "turning the shell does not push a cylinder without inertia, got inertia=0 kg m²"
+            )
+        self.pump, self.centring = pump, centring
+        k = task.constants()
+        self.weight, self.drag, self.push, self.wanted = (
+            k[n] for n in ("weight", "drag", "push", "wanted_energy")
+        )
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the shell's acceleration."""
+        theta, theta_dot, psi_dot = np.moveaxis(state, -1, 0)
+        energy = 0.5 * theta_dot**2 + self.weight * (1.0 - np.cos(theta))
+        missing = 1.0 - energy / self.wanted
+        keeping = self.drag / self.push * (theta_dot - psi_dot)
+        pumping = self.pump * self.task.limit_control * missing * theta_dot / np.sqrt(2.0 * self.wanted)
+        return keeping + pumping - self.centring * psi_dot
+
+
+def plan_pumping(task: Pump, *, opening: float = 0.25) -> ILQR:
+    """Return an iLQR that plans the pumping from two sides.
+
+    It starts from a softer pump, from which it gets further.
+
+    Parameters
+    ----------
+    task : Pump
+        The task, ``env.unwrapped.task``.
+    opening : float
+        For how many periods of a small swing the shell is first pushed to one side or the other.
+    """
+    follow = EnergyPump(task, pump=5.0, centring=0.3)
+    steps = round(opening * 2.0 * math.pi / math.sqrt(follow.weight) / task.dt)
+    return ILQR(task, [Opening(side, max(steps, 1), follow) for side in (-1.0, 1.0)])
+
+
+class BrakingLine(Law):
+    """Brake hard away from the bottom, roll freely towards it, and brake along a line into it.
+
+    Under full brake the cylinder is overdamped: near the bottom it creeps along the slow direction of its
+    linearised motion, or rushes along the fast one, θ' = -s θ. So it is let go until it is nearly as fast
+    as that, and then braked such that it gets onto the line and keeps to it.
+
+    Parameters
+    ----------
+    task : Damping
+        The task, ``env.unwrapped.task``.
+    steepness : float
+        Slope of the line over that of the fast direction.
+    sharpness : float
+        Change of the brake, over its largest, per share by which the speed differs from the line's.
+    """
+
+    def __init__(self, task: Damping, *, steepness: float = 1.0, sharpness: float = 5.5) -> None:
+        super().__init__(task)
+        # Near the bottom θ'' = a θ + b θ', with b in proportion to the brake.
+        (free, full) = (linearise(task.scene, [0.0, 0.0], c)[0] for c in (0.0, task.limit_control))
+        # Where even the full brake leaves the cylinder swinging, the real part is the rate of its decay.
+        self.slope = steepness * np.abs(np.linalg.eigvals(full).real).max()
+        # θ' = -s θ is a solution for b = a/s - s.
+        wanted = full[1, 0] / self.slope - self.slope
+        self.keeping = (wanted - free[1, 1]) / (full[1, 1] - free[1, 1])
+        self.sharpness = sharpness
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the brake's drag coefficient."""
+        theta, theta_dot = np.moveaxis(state, -1, 0)
+        speed = np.maximum(np.abs(theta_dot), 1e-9)
+        share = self.keeping + self.sharpness * (1.0 - self.slope * np.abs(theta) / speed)
+        share = np.where(theta * theta_dot < 0.0, np.clip(share, 0.0, 1.0), 1.0)
+        return self.task.limit_control * share

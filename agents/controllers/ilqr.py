@@ -1,0 +1,338 @@
+"""Trajectory optimisation on the exact model: the iterative linear-quadratic regulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.controllers.basic import Array, Reader, as_actions
+from lag_envs.envs.model import Model
+from lag_envs.tasks.base import Task
+
+#: Shares of the full change of the controls that are tried side by side.
+SHARES = 0.5 ** np.arange(0, 10, 1.5)
+#: Steps of the differences that derivatives are taken by.
+WIDTH = 5e-3
+#: Least curvature over an action that is believed [reward/action²], in a step of the task's own interval.
+FLAT = 1e-4
+
+
+class Plan(NamedTuple):
+    """What is played: for each episode its step, and for each of its steps state, action and gain."""
+
+    step: NDArray[np.intp]  # (n,)
+    states: Array  # (n, steps, n_state)
+    actions: Array  # (n, steps)
+    gains: Array  # (n, steps, n_state)
+    memory: Any  # that of the controller which goes on where the plan ends
+
+
+class ILQR:
+    """Plan each episode at its start with the exact model, and follow the plan by time-varying feedback.
+
+    Starts from what another controller would do. Each iteration expands the model along the trajectory,
+    dynamics to first order and reward to second, and solves the linear-quadratic problem within the bounds of
+    the action [1]_; the best of several shares of the change is kept. So a plan is never worse than what it
+    starts from.
+
+    Parameters
+    ----------
+    task : Task
+        The task with its parameters, ``env.unwrapped.task``; one without random kicks.
+    guesses : sequence of controllers
+        What to start from; each is improved, and the best plan is played.
+    after : controller, optional
+        Who goes on where the plan ends before the episode; by default the first guess.
+    tail : callable, optional
+        From states (n, n_state) at the plan's end to what is lost from then on (n,).
+    steps : int, optional
+        Steps to plan ahead; by default the whole episode, but at most 1000.
+    iterations : int
+        At most so many improvements.
+    tolerance : float
+        Improvement of the return that ends the iteration.
+
+    References
+    ----------
+    .. [1] Y. Tassa, N. Mansard and E. Todorov, "Control-limited differential dynamic programming", ICRA 2014,
+       1168-1175.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        guesses: Sequence[Any],
+        *,
+        after: Any = None,
+        tail: Callable[[Array], Array] | None = None,
+        steps: int | None = None,
+        iterations: int = 100,
+        tolerance: float = 1e-3,
+    ) -> None:
+        if task.draws:
+            raise ValueError(f"{type(task).__name__} has random kicks, which a plan does not foresee")
+        self.task, self.guesses, self.tail = task, guesses, tail
+        self.after = guesses[0] if after is None else after
+        self.steps = int(min(task.limit, 1000 if steps is None else steps))
+        self.iterations, self.tolerance = iterations, tolerance
+        self.flat = FLAT * task.dt / task.interval
+        self.model, self.read = Model(task), Reader(task)
+        self._k = SimpleNamespace(**task.constants())
+
+    def predict(
+        self,
+        observation: NDArray,
+        state: Plan | None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Plan]:
+        """Return the action for each observation; the state holds the plans."""
+        values = np.asarray(observation)
+        x, target = (v.reshape(-1, *v.shape[values.ndim - 1 :]) for v in self.read(values))
+        n = len(x)
+        fresh = np.ones(n, np.bool_)
+        if state is not None:
+            fresh = np.zeros(n, np.bool_)
+            if episode_start is not None:
+                fresh |= np.asarray(episode_start, np.bool_).reshape(n)
+        plan = self._blank(n) if state is None else state
+        if fresh.any():
+            new = self.plan(x[fresh], target[fresh])
+            plan = plan._replace(**{name: getattr(plan, name).copy() for name in plan._fields[:4]})
+            for name in ("states", "actions", "gains"):
+                getattr(plan, name)[fresh] = getattr(new, name)
+            plan.step[fresh] = 0
+        rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
+        off = x - plan.states[rows, now]
+        if self.read.wrapped is not None:  # a plan goes on beyond ±π
+            angle = off[:, self.read.wrapped]
+            off[:, self.read.wrapped] = angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
+        action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
+        memory = plan.memory
+        if (plan.step >= self.steps).any():
+            beyond, memory = self.after.predict(values.reshape(n, -1), memory, plan.step <= self.steps)
+            action = np.where(plan.step >= self.steps, beyond[:, 0], action)
+        plan = plan._replace(step=plan.step + 1, memory=memory)
+        return as_actions(action.reshape(values.shape[:-1])), plan
+
+    def _blank(self, n: int) -> Plan:
+        shape = n, self.steps, len(self.task.scene.state_names)
+        return Plan(np.zeros(n, np.intp), np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape), None)
+
+    # --- planning ------------------------------------------------------------------------------------------
+
+    def plan(self, starts: Array, targets: Array) -> Plan:
+        """Return the best plan for each start (n, n_state) and target (n,)."""
+        best: Plan | None = None
+        most = np.full(len(starts), -math.inf)
+        for guess in self.guesses:
+            actions = self._guess(guess, starts, targets)
+            plan, returns = self._improve(starts, targets, actions)
+            if best is None:
+                best, most = plan, returns
+                continue
+            better = returns > most
+            for name in ("states", "actions", "gains"):
+                getattr(best, name)[better] = getattr(plan, name)[better]
+            most = np.maximum(most, returns)
+        assert best is not None
+        return best
+
+    def _step(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Step the model for arrays of any leading shape."""
+        shape = actions.shape
+        goals = None
+        if self.task.target_range is not None:
+            goals = np.broadcast_to(targets, shape).ravel()
+        z, reward, ended = self.model(x.reshape(-1, x.shape[-1]), actions.ravel(), goals)
+        return z.reshape(x.shape), reward.reshape(shape), ended.reshape(shape)
+
+    def _guess(self, guess: Any, starts: Array, targets: Array) -> Array:
+        """Return the actions (n, steps) of a controller."""
+        x, memory, actions = starts, None, np.empty((len(starts), self.steps))
+        for t in range(self.steps):
+            seen = self.task.observe(self.task.scene.lift(x), targets, self._k)
+            observation = np.stack(np.broadcast_arrays(*seen), axis=-1)
+            action, memory = guess.predict(observation, memory)
+            actions[:, t] = action[:, 0]
+            x = self._step(x, actions[:, t], targets)[0]
+        return actions
+
+    def _improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
+        """Return plans improved from actions (n, steps), and their returns (n,)."""
+        n = len(starts)
+        plan = self._blank(n)
+        states, actions, returns = self._play(
+            starts, targets, np.zeros((n, self.steps, starts.shape[1])), actions, plan.gains, plan.actions,
+            np.zeros(1),
+        )  # fmt: skip
+        plan = plan._replace(states=states, actions=actions)
+        damping = np.full(n, 10.0 * self.flat)
+        going = np.arange(n)
+        for iteration in range(self.iterations + 1):
+            slopes = self._expand(plan.states[going], plan.actions[going], targets[going])
+            change, gains = self._solve(plan.actions[going], damping[going], *slopes)
+            plan.gains[going] = gains
+            if iteration == self.iterations:
+                break
+            states, actions, tried = self._play(
+                starts[going], targets[going], plan.states[going], plan.actions[going], gains, change, SHARES
+            )
+            gain = tried - returns[going]
+            better = gain > 0.0
+            won = going[better]
+            plan.states[won], plan.actions[won], returns[won] = states[better], actions[better], tried[better]
+            damping[going] = np.clip(damping[going] * np.where(better, 0.3, 10.0), 1e-6, 1e3)
+            # An episode is done when it hardly gains, or when even the shortest steps gain nothing.
+            done = np.where(better, gain < self.tolerance, damping[going] >= 1e3)
+            going = going[~done]
+            if not len(going):
+                break
+        return plan, returns
+
+    def _play(
+        self, starts: Array, targets: Array, states: Array, actions: Array, gains: Array, change: Array,
+        shares: Array,
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """Return states, actions and returns of the plans changed by the best of several shares."""
+        n, lines = len(starts), len(shares)
+        x = np.repeat(starts[:, None], lines, axis=1)
+        goals = targets[:, None]
+        xs = np.empty((n, lines, self.steps, x.shape[-1]))
+        us = np.empty((n, lines, self.steps))
+        total, alive = np.zeros((n, lines)), np.ones((n, lines), np.bool_)
+        for t in range(self.steps):
+            feedback = np.einsum("ij,ikj->ik", gains[:, t], x - states[:, None, t])
+            u = np.clip(actions[:, t, None] + shares * change[:, t, None] + feedback, -1.0, 1.0)
+            xs[:, :, t], us[:, :, t] = x, u
+            x, reward, ended = self._step(x, u, goals)
+            total += np.where(alive, reward, 0.0)
+            alive &= ~ended
+        if self.tail is not None:
+            total -= self.tail(x.reshape(-1, x.shape[-1])).reshape(n, lines)
+        rows, best = np.arange(n), total.argmax(axis=1)
+        return xs[rows, best], us[rows, best], total[rows, best]
+
+    def _expand(self, states: Array, actions: Array, targets: Array) -> tuple[Array, ...]:
+        """Return the model's slopes (n, T, m, n_state), the reward's (n, T, m) and curvature (n, T, m, m).
+
+        The m variables are the state's entries and the action. Last come the gradient (n, n_state) and the
+        curvature (n, n_state, n_state) of what the tail is worth.
+        """
+        n, steps, width = states.shape
+        m = width + 1
+        h = np.full(m, WIDTH)
+        i, j = np.triu_indices(m, 1)
+        moves = np.zeros((1 + 2 * m + 2 * len(i), m))
+        moves[1 : m + 1], moves[m + 1 : 2 * m + 1] = np.diag(h), -np.diag(h)
+        pairs = moves[1 + i] + moves[1 + j]
+        moves[2 * m + 1 :: 2], moves[2 * m + 2 :: 2] = pairs, -pairs
+        slopes = np.empty((n, steps, m, width))
+        gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
+        # The action is moved inward from its bounds, beyond which it has no effect.
+        inner = np.clip(actions, -1.0 + WIDTH, 1.0 - WIDTH)
+        size = max(1, 200_000 // (steps * len(moves)))
+        for first in range(0, n, size):
+            part = slice(first, first + size)
+            x = states[part, :, None] + moves[:, :width]
+            u = inner[part, :, None] + moves[:, width]
+            z, r, _ = self._step(x, u, targets[part, None, None])
+            slopes[part] = (z[..., 1 : m + 1, :] - z[..., m + 1 : 2 * m + 1, :]) / (2.0 * WIDTH)
+            plus, minus, middle = r[..., 1 : m + 1], r[..., m + 1 : 2 * m + 1], r[..., :1]
+            gradient[part] = (plus - minus) / (2.0 * WIDTH)
+            own = plus + minus - 2.0 * middle
+            curvature[part][..., range(m), range(m)] = own / WIDTH**2
+            both = r[..., 2 * m + 1 :: 2] + r[..., 2 * m + 2 :: 2] - 2.0 * middle
+            mixed = 0.5 * (both - own[..., i] - own[..., j]) / WIDTH**2
+            curvature[part][..., i, j] = curvature[part][..., j, i] = mixed
+        # At a bound the reward is as steep as just inside, but for the curvature.
+        gradient[..., -1] += curvature[..., -1, -1] * (actions - inner)
+        curvature = concave(curvature)
+        if self.tail is None:
+            return slopes, gradient, curvature, np.zeros((n, width)), np.zeros((n, width, width))
+        return slopes, gradient, curvature, *self._expand_tail(states, actions, targets)
+
+    def _expand_tail(self, states: Array, actions: Array, targets: Array) -> tuple[Array, Array]:
+        """Return gradient and curvature of minus the tail at the plan's end."""
+        assert self.tail is not None
+        ends = self._step(states[:, -1], actions[:, -1], targets)[0]
+        n, width = ends.shape
+        moves = WIDTH * np.eye(width)
+
+        def value(move: Array) -> Array:
+            assert self.tail is not None
+            return -self.tail(ends + move)
+
+        plus = np.stack([value(m) for m in moves], axis=1)
+        minus = np.stack([value(-m) for m in moves], axis=1)
+        curvature = np.empty((n, width, width))
+        for a in range(width):
+            for b in range(width):
+                corner = value(moves[a] + moves[b]) - value(moves[a] - moves[b])
+                corner += value(-moves[a] - moves[b]) - value(moves[b] - moves[a])
+                curvature[:, a, b] = corner / (4.0 * WIDTH**2)
+        return (plus - minus) / (2.0 * WIDTH), concave(curvature)
+
+    def _solve(
+        self, actions: Array, damping: Array, slopes: Array, gradient: Array, curvature: Array,
+        value_x: Array, value_xx: Array,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Return the change of the actions (n, T) and the gains (n, T, n_state), by dynamic programming."""
+        n, steps, _, width = slopes.shape
+        change, gains = np.empty((n, steps)), np.empty((n, steps, width))
+        for t in range(steps - 1, -1, -1):
+            f = slopes[:, t]
+            q = gradient[:, t] + np.einsum("nmi,ni->nm", f, value_x)
+            h = curvature[:, t] + f @ value_xx @ f.transpose(0, 2, 1)
+            q_x, q_u, h_xx, h_ux, h_uu = q[:, :-1], q[:, -1], h[:, :-1, :-1], h[:, -1, :-1], h[:, -1, -1]
+            bend = np.maximum(-h_uu, self.flat) + damping
+            wanted = actions[:, t] + q_u / bend
+            step = np.clip(wanted, -1.0, 1.0) - actions[:, t]
+            free = (np.abs(wanted) < 1.0)[:, None]
+            gain = np.where(free, h_ux / bend[:, None], 0.0)
+            change[:, t], gains[:, t] = step, gain
+            value_x = q_x + gain * (q_u + h_uu * step)[:, None] + h_ux * step[:, None]
+            cross = gain[:, :, None] * h_ux[:, None, :]
+            outer = gain[:, :, None] * gain[:, None, :] * h_uu[:, None, None]
+            value_xx = h_xx + outer + cross + cross.transpose(0, 2, 1)
+        return change, gains
+
+
+class Opening:
+    """One action for a while, then another controller: a guess that begins otherwise.
+
+    Parameters
+    ----------
+    action : float
+        The action to begin with.
+    steps : int
+        Steps for which it is kept.
+    then : controller
+        Who goes on.
+    """
+
+    def __init__(self, action: float, steps: int, then: Any) -> None:
+        self.action, self.steps, self.then = action, steps, then
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return the action for each observation; the state holds the step and the other's memory."""
+        shape = np.shape(observation)[:-1]
+        step, memory = (np.zeros(shape, np.intp), None) if state is None else state
+        if episode_start is not None:
+            step = np.where(np.reshape(episode_start, shape), 0, step)
+        actions, memory = self.then.predict(observation, memory, episode_start, deterministic)
+        opening = (step < self.steps)[..., None]
+        return np.where(opening, np.float32(self.action), actions), (step + 1, memory)
+
+
+def concave(matrices: Array) -> Array:
+    """Return symmetric matrices (..., m, m) without their upward curvature."""
+    values, vectors = np.linalg.eigh(matrices)
+    return (vectors * np.minimum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)

@@ -1,0 +1,779 @@
+"""The optimum of every task, computed: value iteration where the state has 2 or 3 dimensions, else bounds.
+
+``python -m agents.optimum --help`` tells more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.evaluate import evaluate_batch
+from agents.run import FIRST_FRESH_SEED, UserError, check_env, write
+from agents.value_iteration import (
+    CacheError,
+    Grid,
+    Kick,
+    ValueIteration,
+    carried,
+    interpolate_rows,
+    stretched,
+)
+from lag_envs import TASKS, __version__
+from lag_envs.benchmark import machine
+from lag_envs.envs.model import Model
+from lag_envs.tasks import load_task
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+DEFAULT_FOLDER = Path("runs/optimum")
+RESULTS, IMAGES = ROOT / "agents" / "results" / "optimum", ROOT / "docs" / "images"
+SCHEMA = 1
+#: Episodes that are compared.
+EPISODES = 1_000
+
+HELP = """value iteration keeps V_t, the largest return still to be had with t steps taken, at the nodes of a
+grid and goes backwards from the end of the episode. It is done on grids each twice as fine as the one before.
+
+what is written:
+  agents/results/optimum/ID.json   numbers: what is known from below and from above, and how
+  docs/images/value-ID.png         the value function at the start, where the best action changes sign
+  FOLDER/ID/.../values.npy         all V_t, up to 1 GB each, 12 GB for all ids; may be deleted at any time
+
+how to read the numbers:
+  grid value    mean of V_0 over the starts of 1,000 fixed episodes. Interpolation makes it err, to either
+                side, the less the finer the grid.
+  lower         mean return that the greedy policy really gets in those episodes, with the 95 % confidence
+                interval of a mean. A policy that gets it exists: the optimum is not below.
+  upper         grid values extrapolated linearly to cells without width: an ESTIMATE, no bound.
+  bound         what no policy can exceed, proved; crude.
+PivotedBar-v0 and PivotedBarBalance-v0 have a state of 4 dimensions. Solved is the task without a track, which
+is easier: its value is from above; lower is what the best agent gets, see the agents' results.
+
+It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): the same command goes on from there.
+
+examples:
+  python -m agents.optimum InclineBrake-v0 --quick    one id on coarse grids, in seconds; writes to FOLDER
+  python -m agents.optimum                            all ids, in about 20 minutes on one core
+  python -m agents.optimum CylinderInCylinderPump-v0 --new    anew, forgetting what was computed"""
+
+
+# --- what is solved -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the grid: its range, and where its nodes lie densely.
+
+    Parameters
+    ----------
+    label : str
+        Name with unit, for figures.
+    low, high : float
+        The range. States outside are taken to be as good as the nearest one on the edge.
+    cells : int
+        Cells at level 1, even; twice as many at level 2.
+    scale : float, optional
+        Within this distance of the centre the nodes lie evenly, farther out ever wider; None: all evenly.
+    centre : float or "target"
+        The dense place.
+    periodic : bool
+        Whether the range is one period.
+    """
+
+    label: str
+    low: float
+    high: float
+    cells: int
+    scale: float | None = None
+    centre: float | str = 0.0
+    periodic: bool = False
+
+    def nodes(self, level: float, target: float | None) -> Array:
+        """Return the nodes."""
+        cells = 2 * round(0.5 * level * self.cells)
+        if self.scale is None:
+            return np.linspace(self.low, self.high, cells + 1)
+        centre = target if self.centre == "target" else self.centre
+        assert isinstance(centre, float)
+        return stretched(self.low, centre, self.high, cells, self.scale)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is solved for an environment.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment whose task is solved.
+    axes : tuple of Axis
+        The grid.
+    observed : callable
+        From observations (n, n_observation) to the states on the grid, (n, d).
+    options : dict
+        Parameters of the task that differ from the environment's: those of a relaxation.
+    keep : tuple of int
+        Which entries of the scene's state are on the grid; the others are 0 there.
+    targets : tuple of float
+        Targets, from 0 on, to solve for; others are interpolated, negative ones mirrored. Empty: none.
+    pushes : int
+        Sizes of a kick that its expectation takes: midpoints of as many parts of its random number.
+    actions : int
+        Number of actions, evenly from -1 to 1.
+    levels : tuple of float
+        How fine the grids are, each twice as fine as the one before.
+    lost : float
+        Share of the grid in which so much is lost that figures need not tell one place from another.
+    """
+
+    env_id: str
+    axes: tuple[Axis, ...]
+    observed: Callable[[Array], Array] | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    keep: tuple[int, ...] = ()
+    targets: tuple[float, ...] = ()
+    pushes: int = 0
+    actions: int = 11
+    levels: tuple[float, ...] = (2, 4, 8)
+    lost: float = 0.0
+
+    def task(self) -> Task:
+        """Return the task that is solved."""
+        place, fixed = TASKS[self.env_id]
+        return load_task(place)(**(fixed | self.options))
+
+    def grid(self, level: float, target: float | None = None) -> Grid:
+        """Return the grid of a level."""
+        axes = tuple(axis.nodes(level, target) for axis in self.axes)
+        return Grid(axes, tuple(a.high - a.low if a.periodic else None for a in self.axes))
+
+
+TURN = 2.0 * math.pi
+PROBLEMS = {
+    problem.env_id: problem
+    for problem in (
+        Problem(
+            "PivotedBarFree-v0",
+            (
+                Axis("θ [rad]", 0.0, TURN, 80, periodic=True),
+                Axis("θ' [rad/s]", -12.0, 12.0, 80),
+            ),
+            observed=lambda o: np.stack([np.arctan2(o[:, 1], o[:, 0]), 8.0 * o[:, 2]], axis=1),
+        ),
+        Problem(
+            "InclineBrake-v0",
+            # At rest on the line the time to the crossing is 0/0: the grid ends a hair before it.
+            (
+                Axis("x [m]", -3.0, -1e-6, 80, scale=0.3, centre=-1e-6),
+                Axis("x' [m/s]", 0.0, 3.4, 80, scale=0.5, centre=0.5),
+            ),
+            observed=lambda o: np.stack([-o[:, 0], o[:, 1]], axis=1),
+            lost=0.1,
+        ),
+        Problem(
+            "CylinderInCylinderDamping-v0",
+            (Axis("θ [rad]", -2.5, 2.5, 80, scale=0.03), Axis("θ' [rad/s]", -9.0, 9.0, 80, scale=0.1)),
+            observed=lambda o: o,
+            pushes=4,
+            lost=0.1,
+        ),
+        Problem(
+            "PivotedBarBalance-v0",
+            (Axis("θ [rad]", math.pi - 0.35, math.pi + 0.35, 80), Axis("θ' [rad/s]", -3.5, 3.5, 80)),
+            # On a track so long, neither its ends nor the cost of s are ever felt.
+            options={"track": 1e9},
+            keep=(2, 3),
+            pushes=16,
+            lost=0.6,
+        ),
+        Problem(
+            "CylinderInCylinderPump-v0",
+            (
+                Axis("θ [rad]", -1.3, 1.3, 56),
+                Axis("θ' [rad/s]", -4.4, 4.4, 56),
+                Axis("ψ' [rad/s]", -3.0, 3.0, 6),
+            ),
+            observed=lambda o: o,
+            levels=(1, 2, 4),
+            lost=0.1,
+        ),
+        Problem(
+            "InclineTilt-v0",
+            (
+                Axis("x [m]", -0.5, 0.5, 36, scale=0.1, centre="target"),
+                Axis("w [m/s]", -1.0, 1.0, 36, scale=0.1),
+                Axis("φ [rad]", -0.1, 0.1, 12),
+            ),
+            observed=lambda o: o[:, :3],
+            targets=(0.0, 0.1, 0.2, 0.3),
+            levels=(1, 2, 4),
+            lost=0.3,
+        ),
+        Problem(
+            "CylinderInCylinderTilt-v0",
+            (
+                Axis("θ [rad]", -1.05, 1.05, 30, scale=0.05, centre="target"),
+                Axis("θ' [rad/s]", -4.0, 4.0, 30, scale=1.0),
+                Axis("ψ' [rad/s]", -6.0, 6.0, 16),
+            ),
+            observed=lambda o: o[:, :3],
+            targets=(0.0, 0.15, 0.3),
+            levels=(1, 2, 4),
+            lost=0.3,
+        ),
+    )
+}
+#: Whose value function bounds from above what is not solved itself, and which entries of the state it takes.
+RELAXATIONS = {"PivotedBar-v0": ("PivotedBarFree-v0", (2, 3))}
+
+
+class Solution:
+    """The value functions of a problem on the grids of one level.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is solved.
+    level : float
+        How fine.
+    folder : Path, optional
+        Where the values are cached; None keeps them in memory.
+    new : bool
+        Whether to forget what is cached.
+    quiet : bool
+        Whether to show no progress.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        level: float,
+        folder: Path | None = DEFAULT_FOLDER,
+        *,
+        new: bool = False,
+        quiet: bool = False,
+    ) -> None:
+        self.problem, self.level, self.task = problem, level, problem.task()
+        self.model = Model(self.task)
+        self.n_state = len(self.task.scene.state_names)
+        self.keep = list(problem.keep or range(self.n_state))
+        self.steps = int(self.task.limit)
+        self.kick: Kick | None = self._kick if problem.pushes else None
+        #: The targets asked for last, and the nodes of the axis that follows them: they last for an episode.
+        self._asked: Array = np.empty(0)
+        self._own: Array = np.empty((0, 0))
+        self.programs, self.values, self.seconds = [], [], 0.0
+        for target in problem.targets or (None,):
+            program = self.program(target)
+            label = f"{problem.env_id}, {' x '.join(map(str, program.grid.shape))} nodes" + (
+                "" if target is None else f", target {target:g}"
+            )
+            where = None if folder is None else folder / problem.env_id
+            self.values.append(program.solve(where, new=new, label=label, quiet=quiet))
+            self.programs.append(program)
+            self.seconds += program.seconds
+
+    def program(self, target: float | None) -> ValueIteration:
+        """Return the dynamic programme for a target."""
+        problem = self.problem
+        # Not in the fingerprint: what happens between the places where the step is tried.
+        parameters = {
+            "schema": SCHEMA, "env": problem.env_id, "options": problem.options, "target": target,
+            "level": self.level, "pushes": problem.pushes, "constants": self.task.constants(),
+        }  # fmt: skip
+        actions = np.linspace(-1.0, 1.0, problem.actions)
+        grid = problem.grid(self.level, target)
+        step = functools.partial(self.step, target=target)
+        return ValueIteration(grid, actions, step, self.steps, self.kick, parameters)
+
+    def states(self, points: Array) -> Array:
+        """Return the scene's states for points on the grid."""
+        states = np.zeros((len(points), self.n_state))
+        states[:, self.keep] = points
+        return states
+
+    def step(self, points: Array, actions: Array, target: ArrayLike | None) -> tuple[Array, Array, Any]:
+        """Take the model's step from points on the grid."""
+        ends, rewards, ended = self.model(self.states(points), actions, target)
+        return ends[:, self.keep], rewards, ended
+
+    def _kick(self, points: Array) -> tuple[Array, Array]:
+        """Return where no kick and kicks of all sizes lead, and how likely they are."""
+        states, pushes = self.states(points), self.problem.pushes
+        chance = self.task.numbers()["chance"]
+        # The first random number decides whether there is a kick, the second one its size.
+        draws = [(1.0 - 1e-9, 0.5), *((0.0, (i + 0.5) / pushes) for i in range(pushes))]
+        weights = np.array([1.0 - chance, *[chance / pushes] * pushes])
+        ones = np.ones(len(points))
+        kicked = [self.model.kicked(states, np.array([a * ones, b * ones])) for a, b in draws]
+        return np.stack(kicked)[:, :, self.keep], weights
+
+    def value(self, times: ArrayLike, points: Array, targets: Array | None = None) -> Array:
+        """Return V_t at points.
+
+        Parameters
+        ----------
+        times : array_like of int, shape (n,) or ()
+            Steps taken.
+        points : ndarray, shape (n, d)
+            States on the grid.
+        targets : ndarray, shape (n,), optional
+            Targets, where the task has them.
+        """
+        times = np.ascontiguousarray(np.broadcast_to(times, len(points)), np.int64)
+        if targets is None:
+            return self._at(0, times, points)
+        points = np.where(targets < 0.0, -1.0, 1.0)[:, None] * points  # the mirror image
+        targets = np.abs(targets)
+        known = np.array(self.problem.targets)
+        lower = np.clip(np.searchsorted(known, targets, side="right") - 1, 0, len(known) - 2)
+        part = (targets - known[lower]) / (known[lower + 1] - known[lower])
+        own = self._own_nodes(targets)
+        result = np.zeros(len(points))
+        for k in range(len(known)):
+            for rows, weight in ((lower == k, 1.0 - part), (lower + 1 == k, part)):
+                if rows.any():
+                    # Points are moved to where they lie among the nodes of target k as they do among their
+                    # own target's: so the target, and the edge at which an episode ends, have their like.
+                    there, axis = points[rows], self._moving
+                    there[:, axis] = carried(
+                        there[:, axis], self._own, own[rows], self.programs[k].grid.axes[axis]
+                    )
+                    result[rows] += weight[rows] * self._at(k, times[rows], there)
+        return result
+
+    def _at(self, k: int, times: NDArray[np.int64], points: Array) -> Array:
+        grid, values = self.programs[k].grid, self.values[k]
+        cells, places = grid.locate(points)
+        return interpolate_rows(values.reshape(len(values), -1), times, cells, places, grid.strides)
+
+    @property
+    def _moving(self) -> int:
+        """Number of the axis whose nodes follow the target."""
+        return [axis.centre for axis in self.problem.axes].index("target")
+
+    def _own_nodes(self, targets: Array) -> NDArray[np.intp]:
+        """Return for each target the row of `_own` with the nodes of the axis that follows it."""
+        different, rows = np.unique(targets, return_inverse=True)
+        if not np.array_equal(different, self._asked):
+            axis = self.problem.axes[self._moving]
+            self._own = np.array([axis.nodes(self.level, float(target)) for target in different])
+            self._asked = different
+        return rows
+
+    def expected(self, times: ArrayLike, points: Array, targets: Array | None = None) -> Array:
+        """Return E V_t over the random kick that follows at points."""
+        if self.kick is None:
+            return self.value(times, points, targets)
+        outcomes, weights = self.kick(points)
+        return sum(w * self.value(times, p, targets) for w, p in zip(weights, outcomes, strict=True))
+
+
+class Optimal:
+    """The greedy policy of a computed value function, with Stable-Baselines3's `predict`.
+
+    It looks one step ahead with the exact model: over a set of actions, then over finer ones around the best.
+    Its state is the number of steps taken in each episode.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment that value iteration solves.
+    level : float, optional
+        How fine the grid is; the finest that `python -m agents.optimum` uses. What is not in the cache is
+        computed, which takes a moment.
+    folder : Path, optional
+        The cache.
+    solution : Solution, optional
+        Instead of all that: a solution at hand.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> agent = Optimal("InclineBrake-v0", level=0.5, folder=None)
+    >>> observation, _ = gym.make("InclineBrake-v0").reset(seed=0)
+    >>> action, taken = agent.predict(observation)
+    >>> action, taken
+    (array([-1.], dtype=float32), array([1.]))
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        level: float | None = None,
+        folder: Path | None = DEFAULT_FOLDER,
+        solution: Solution | None = None,
+    ) -> None:
+        problem = PROBLEMS.get(env_id)
+        if problem is None or problem.observed is None:
+            able = ", ".join(id for id, p in PROBLEMS.items() if p.observed)
+            raise ValueError(f"value iteration gives no policy for {env_id!r}, only for {able}")
+        self.problem = problem
+        self.solution = solution or Solution(problem, level or problem.levels[-1], folder)
+        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
+        self.pace = 1.0
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: Array | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Array]:
+        """Return actions and the numbers of steps taken then, for one observation or a batch."""
+        observation = np.asarray(observation, np.float64)
+        single, batch = observation.ndim == 1, np.atleast_2d(observation)
+        n = len(batch)
+        taken = np.zeros(n) if state is None else np.broadcast_to(np.asarray(state, np.float64), n)
+        if episode_start is not None:
+            taken = np.where(np.broadcast_to(episode_start, n), 0.0, taken)
+        targets = batch[:, -1].copy() if self.problem.targets else None
+        assert self.problem.observed is not None
+        points = self.problem.observed(batch)
+        # The margin is for a clock that has gone tenths of a step.
+        after = np.minimum((taken + 1e-6).astype(np.int64) + 1, self.solution.steps)
+        coarse = self.solution.programs[0].actions
+        action = self._best(points, np.tile(coarse, (n, 1)), targets, after)
+        around = action[:, None] + (coarse[1] - coarse[0]) * np.linspace(-1.0, 1.0, 17)
+        action = self._best(points, np.clip(around, -1.0, 1.0), targets, after).astype(np.float32)
+        return (action if single else action[:, None]), taken + self.pace
+
+    def _best(self, points: Array, actions: Array, targets: Array | None, after: Any) -> Array:
+        """Return the best of each row's actions."""
+        n, m = actions.shape
+        goals = None if targets is None else np.repeat(targets, m)
+        ends, rewards, ended = self.solution.step(np.repeat(points, m, axis=0), actions.ravel(), goals)
+        later = self.solution.expected(np.repeat(after, m), ends, goals)
+        gains = (rewards + np.where(ended, 0.0, later)).reshape(n, m)
+        return np.take_along_axis(actions, gains.argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+# --- numbers ------------------------------------------------------------------------------------------------
+
+
+def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
+    """Return states and targets at the start of the episodes that agents are compared on."""
+    envs = gym.make_vec(env_id, episodes)
+    envs.reset(seed=FIRST_FRESH_SEED)
+    found = envs.unwrapped.state, envs.unwrapped.target
+    envs.close()
+    return found
+
+
+def trajectory(env_id: str, agent: Any, seed: int = FIRST_FRESH_SEED) -> Array:
+    """Return the states of an episode, shape (steps + 1, n_state)."""
+    env = gym.make(env_id)
+    observation, _ = env.reset(seed=seed)
+    states, state, over = [env.unwrapped.state.copy()], None, False
+    while not over:
+        action, state = agent.predict(observation, state)
+        observation, _, terminated, truncated, _ = env.step(action)
+        states.append(env.unwrapped.state.copy())
+        over = terminated or truncated
+    env.close()
+    return np.array(states)
+
+
+def mean_and_interval(returns: Array) -> dict[str, Any]:
+    """Return the mean with its 95 % confidence interval."""
+    mean, half = float(returns.mean()), 1.96 * float(returns.std(ddof=1)) / math.sqrt(len(returns))
+    return {"mean": round(mean, 4), "interval": [round(mean - half, 4), round(mean + half, 4)]}
+
+
+def proved_bound(env_id: str) -> tuple[float, str]:
+    """Return what no policy exceeds in the mean over the starts, and why."""
+    place, fixed = TASKS[env_id]
+    task: Any = load_task(place)(**fixed)
+    if env_id != "InclineBrake-v0":
+        return task.limit, "steps of an episode; no step pays more than 1"
+    # Without the price of speed, and never braked, the same task pays minus the time of the free fall.
+    task.gentle = 1e9
+    model = Model(task)
+    states, _ = starts(env_id)
+    total, running = np.zeros(len(states)), np.ones(len(states), np.bool_)
+    while running.any():
+        states[running], rewards, ended = model(states[running], -np.ones(running.sum()))
+        total[running] += rewards
+        running[running] = ~ended
+    return float(total.mean()), "minus the time that the way to the line takes without any brake"
+
+
+def seconds_to_upright(states: Array, dt: float) -> float:
+    """Return when a bar (θ in column 0) comes within 0.2 rad of upright to stay there [s]."""
+    off = np.abs(np.mod(states[:, 0], TURN) - math.pi) > 0.2
+    return float(dt * (np.flatnonzero(off)[-1] + 1)) if off.any() else 0.0
+
+
+def known_answers(env_id: str, agent: Optimal) -> dict[str, Any]:
+    """Return what is known of the optimum from elsewhere, as computed."""
+    if env_id == "PivotedBarFree-v0":
+        states = trajectory(env_id, agent)
+        return {"seconds_to_upright": round(seconds_to_upright(states, agent.solution.task.dt), 3)}
+    if env_id == "CylinderInCylinderDamping-v0":
+        from agents.controllers import Constant
+
+        full = evaluate_batch(env_id, Constant(1.0), FIRST_FRESH_SEED, EPISODES)
+        return {"full_damping": mean_and_interval(full)}
+    return {}
+
+
+def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
+    """Extrapolate values on grids each twice as fine as the one before to cells without width.
+
+    Returns
+    -------
+    linear : float
+        The limit if the error were in proportion to the cells' width, which takes it farthest.
+    limit : float
+        The limit by the order of the error that the last three values show, kept between 1 and 2.
+    order : float
+        That order; 1 where there are not three values, or where they do not converge evenly.
+
+    Examples
+    --------
+    >>> extrapolated([5.0, 4.0])
+    (3.0, 3.0, 1.0)
+    >>> extrapolated([9.0, 6.0, 5.25])
+    (4.5, 5.0, 2.0)
+    """
+    steps = np.diff(values)
+    order = 1.0
+    if len(steps) > 1 and steps[-1] != 0.0 and steps[-2] / steps[-1] > 1.0:
+        order = float(np.clip(np.log2(steps[-2] / steps[-1]), 1.0, 2.0))
+    return float(values[-1] + steps[-1]), float(values[-1] + steps[-1] / (2.0**order - 1.0)), order
+
+
+def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
+    """Solve what an environment needs, and return its numbers."""
+    source, entries = RELAXATIONS.get(env_id, (env_id, None))
+    problem = PROBLEMS[source]
+    levels = [problem.levels[0] / 2, problem.levels[0]] if quick else list(problem.levels)
+    states, targets = starts(env_id)
+    grids = []
+    for level in levels:
+        solution = Solution(problem, level, folder, new=new and source == env_id)
+        keep = solution.keep if entries is None else list(entries)
+        value = float(solution.value(0, states[:, keep], targets).mean())
+        grids.append(
+            {
+                "level": level, "nodes": list(solution.programs[0].grid.shape), "value": round(value, 4),
+                "cpu_seconds": round(solution.seconds, 2),
+                "caches": [program.name for program in solution.programs],
+            }
+        )  # fmt: skip
+        print(f"{env_id}: {' x '.join(map(str, grids[-1]['nodes']))} nodes, value {value:.3f}", flush=True)
+    relaxed = env_id != source or bool(problem.options)
+    lower, answers, started = None, {}, time.process_time()
+    if not relaxed:
+        agent = Optimal(env_id, solution=solution)
+        lower = mean_and_interval(evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES))
+        answers = known_answers(env_id, agent)
+    upper, limit, order = extrapolated([grid["value"] for grid in grids])
+    bound, why = proved_bound(env_id)
+    if lower is not None:
+        upper = max(upper, lower["mean"])
+    return {
+        "schema": SCHEMA,
+        "env": env_id,
+        "solved": source + (" with " + ", ".join(f"{k}={v:g}" for k, v in problem.options.items())
+                            if problem.options else ""),
+        "how": explanation(env_id, source, problem, grids),
+        "parameters": problem.task().constants(),
+        "axes": [
+            {"label": a.label, "low": a.low, "high": a.high, "cells_at_level_1": a.cells,
+             "even_within": a.scale, "centre": a.centre, "periodic": a.periodic}
+            for a in problem.axes
+        ],
+        "actions": problem.actions,
+        "targets": list(problem.targets),
+        "grids": grids,
+        "episodes": EPISODES,
+        "first_seed": FIRST_FRESH_SEED,
+        "lower": lower,
+        "upper_estimate": round(min(upper, bound), 4),
+        "likely": round(limit, 4),
+        "order": round(order, 2),
+        "bound": {"value": round(bound, 4), "why": why},
+        "known": answers,
+        "cpu_seconds": round(sum(g["cpu_seconds"] for g in grids) + time.process_time() - started, 1),
+        "machine": machine(),
+        "versions": {"lag-envs": __version__} | {n: version(n) for n in ("numpy", "numba", "gymnasium")},
+    }  # fmt: skip
+
+
+def explanation(env_id: str, source: str, problem: Problem, grids: Sequence[dict[str, Any]]) -> str:
+    """Return in words how the numbers came about."""
+    sizes = ", ".join(" x ".join(map(str, grid["nodes"])) for grid in grids)
+    text = (
+        f"Finite-horizon value iteration on grids of {sizes} nodes with {problem.actions} actions, "
+        "interpolated linearly; the step is the environment's own."
+    )
+    if problem.pushes:
+        text += f" Expectation over kicks: {problem.pushes} sizes, equally likely."
+    if problem.targets:
+        text += (
+            f" Solved for the targets {', '.join(f'{t:g}' for t in problem.targets)}; between them "
+            "interpolated linearly, negative ones by the mirror image."
+        )
+    text += (
+        f" Values are means over the starts of {EPISODES:,} episodes. upper_estimate: the last two grid "
+        "values extrapolated linearly to cells without width; likely: extrapolated by the order of "
+        "convergence that the last three show (between 1 and 2). Both are estimates, no bounds."
+    )
+    if env_id != source:
+        return text + (
+            f" The value function is that of {source}: the same task without the track, from above because "
+            "whatever is done on the track can be done without. From below: the best policy known, see the "
+            "results of the agents."
+        )
+    if problem.options:
+        return text + (
+            " Solved is a relaxation: a track without ends, and no price for being off its middle, so the "
+            "true optimum is lower. From below: the best policy known, see the results of the agents. The "
+            "range between is too wide for a score in percent."
+        )
+    return text + (
+        " lower: mean return of the greedy policy (one step ahead, then finer around the best action) in the "
+        "environment."
+    )
+
+
+# --- figures ------------------------------------------------------------------------------------------------
+
+
+def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
+    """Draw the value function at the start, and where the best action changes sign."""
+    import matplotlib
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    problem = PROBLEMS[env_id]
+    solution = Solution(problem, level, folder)
+    k = len(problem.targets) - 1 if problem.targets else 0
+    target = problem.targets[k] if problem.targets else None
+    program, values = solution.programs[k], solution.values[k]
+    greedy = program.greedy(values[1])
+    axes = program.grid.axes
+    third = [None] if len(axes) == 2 else [len(axes[2]) // 4, len(axes[2]) // 2, 3 * len(axes[2]) // 4]
+    with matplotlib.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(6.4, 4.6) if len(third) == 1 else (9.6, 3.9), dpi=100, layout="constrained")
+        plots = np.atleast_1d(figure.subplots(1, len(third), sharex=True, sharey=True))
+        low, high = float(np.quantile(values[0], problem.lost)), float(values[0].max())
+        levels = MaxNLocator(25).tick_values(low, high)
+        for plot, i in zip(plots, third, strict=True):
+            part = (slice(None), slice(None)) if i is None else (slice(None), slice(None), i)
+            colours = plot.contourf(
+                axes[0], axes[1], values[0][part].T, levels, cmap="viridis", extend="min",
+            )  # fmt: skip
+            plot.contour(axes[0], axes[1], greedy[part].T, [0.0], colors="white", linewidths=1.0)
+            plot.set_xlabel(problem.axes[0].label)
+            if i is not None:
+                name, unit = problem.axes[2].label.split()
+                plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
+        plots[0].set_ylabel(problem.axes[1].label)
+        if problem.observed is not None and len(axes) == 2:
+            states = trajectory(env_id, Optimal(env_id, solution=solution))[:, solution.keep]
+            if problem.axes[0].periodic:
+                states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)
+                jumps = np.abs(np.diff(states[:, 0])) > 0.5 * problem.axes[0].high
+                states = np.insert(states, np.flatnonzero(jumps) + 1, np.nan, axis=0)
+            plots[0].plot(*states.T, color="tab:red", linewidth=1.2, label="one episode")
+            plots[0].plot(*states[0], "o", color="tab:red", markersize=4)
+        plots[0].plot([], [], color="white", linewidth=1.0, label="best action changes sign")
+        legend = plots[0].legend(loc="upper right", fontsize=8, facecolor="0.35", labelcolor="white")
+        legend.set_zorder(5)
+        figure.colorbar(colours, ax=list(plots), label="largest return from here, $V_0$")
+        title = f"{env_id}: value at the start of an episode"
+        if problem.options:
+            title = f"{env_id} without ends of the track: value at the start"
+        figure.suptitle(title + ("" if target is None else f", target {target:g}"), fontsize=10)
+        plots[0].set_xlim(axes[0][0], axes[0][-1])
+        plots[0].set_ylim(axes[1][0], axes[1][-1])
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file, metadata={"Software": None})
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    p = argparse.ArgumentParser(
+        prog="python -m agents.optimum",
+        description="Compute the best return that is possible, for every task.",
+        epilog=HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("env", nargs="*", metavar="ENV", help="ids of environments (default: all)")
+    p.add_argument("--quick", action="store_true", help="coarse grids; everything is written to FOLDER")
+    p.add_argument(
+        "--folder",
+        type=Path,
+        default=DEFAULT_FOLDER,
+        help="where value functions are kept (default %(default)s)",
+    )
+    p.add_argument("--new", action="store_true", help="compute anew what is kept there")
+    return p
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, 2 for a mistake of the user's, 128 + signal when interrupted."""
+    args = parser().parse_args(arguments)
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        # What others are relaxed to comes first, so that it is there.
+        ids = [check_env(name) for name in args.env] or sorted(TASKS, key=lambda i: i in RELAXATIONS)
+        for env_id in dict.fromkeys(ids):
+            work(env_id, args)
+    except (UserError, CacheError, OSError) as error:
+        print(f"agents.optimum: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as error:
+        print("\nInterrupted; the same command (without --new) goes on.", file=sys.stderr)
+        return 128 + (error.args[0] if error.args else signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return 0
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    raise KeyboardInterrupt(number)
+
+
+def work(env_id: str, args: argparse.Namespace) -> None:
+    """Compute, write and draw one environment's optimum."""
+    results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
+    result = compute(env_id, args.folder, quick=args.quick, new=args.new)
+    write(results / f"{env_id}.json", json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+    if env_id in PROBLEMS:
+        levels = PROBLEMS[env_id].levels
+        draw(env_id, args.folder, images / f"value-{env_id}.png", levels[0] if args.quick else levels[1])
+    lower = result["lower"]
+    low = "see the agents' results" if lower is None else f"{lower['mean']:.3f} {lower['interval']}"
+    print(
+        f"{env_id}: lower {low}, upper estimate {result['upper_estimate']:.3f}, bound "
+        f"{result['bound']['value']:.3f}, {result['cpu_seconds']:.0f} s of CPU time\n"
+        f"  -> {results / env_id}.json",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,459 @@
+"""What is shown of the agents' results: figures, and the page docs/agents.md."""
+
+from __future__ import annotations
+
+import io
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
+
+IMAGES = "images"
+NOTES = Path(__file__).with_name("notes.toml")
+
+# --- figures -----------------------------------------------------------------------------------------------
+
+#: Okabe and Ito's colours, which the colour-blind can tell apart.
+COLOURS = {"learned": "#0072B2", "classical": "#D55E00", "optimal": "#000000"}
+MARKS = {"learned": "o", "classical": "s", "optimal": "D"}
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+#: Scores below this are drawn at the edge, with their number.
+LOWEST = -0.1
+
+
+def figures(data: Data, folder: Path) -> list[Path]:
+    """Draw all figures into a folder and return their files."""
+    envs = data["envs"]
+    drawn = {"agents-scores.png": scores_figure(envs)}
+    if any(agent["kind"] == "learned" for env in envs.values() for agent in env["agents"].values()):
+        drawn["agents-steps.png"] = curves_figure(envs, "steps")
+        drawn["agents-seconds.png"] = curves_figure(envs, "seconds")
+        drawn["agents-improvement.png"] = improvement_figure(envs)
+    for env_id, env in envs.items():
+        drawn[f"agents-robustness-{env_id}.png"] = robustness_figure(env_id, env)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in drawn.items():
+        save(figure, folder / name)
+    return [folder / name for name in drawn]
+
+
+def save(figure: Any, file: Path) -> None:
+    """Write a figure as a PNG of few colours, which is a third as large."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    Image.open(buffer).convert("RGB").quantize(96).save(file, optimize=True)
+
+
+def _figure(width: float, height: float) -> Any:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _panels(envs: Mapping[str, Data], heights: Sequence[float] | None = None) -> tuple[Any, list[Any]]:
+    """Return a figure and a panel for each environment, two beside each other."""
+    rows = -(-len(envs) // 2)
+    tall = heights or [2.6] * len(envs)
+    ratios = [max(tall[2 * i : 2 * i + 2]) for i in range(rows)]
+    figure = _figure(10.0, sum(ratios) + 0.3)
+    axes = figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": ratios}).ravel()
+    for ax in axes[len(envs) :]:
+        ax.remove()
+    for ax, env_id in zip(axes, envs, strict=False):
+        ax.set_title(env_id, fontsize=10)
+        ax.tick_params(labelsize=8)
+    return figure, list(axes[: len(envs)])
+
+
+def _what(env: Data) -> str:
+    return "score" if env["known"] else "mean return"
+
+
+def scores_figure(envs: Mapping[str, Data]) -> Any:
+    """Draw each agent's result, and beside it that of acting ten times as often."""
+    figure, axes = _panels(envs, [0.9 + 0.3 * len(env["agents"]) for env in envs.values()])
+    for ax, env in zip(axes, envs.values(), strict=True):
+        lowest = LOWEST if env["known"] else _lowest(env["agents"])
+        shown = env["agents"].values()
+        for row, agent in enumerate(shown):
+            colour = COLOURS[agent["kind"]]
+            for name, shift, face in ((NOMINAL, -0.14, colour), (OFTEN, 0.14, "white")):
+                found = agent["conditions"].get(name)
+                if found is None:
+                    continue
+                value = max(found["value"], lowest)
+                if value > lowest:
+                    ends = [max(found["low"], lowest), found["high"]]
+                    ax.plot(ends, [row + shift] * 2, "-", color=colour, lw=1.2)
+                    ax.plot(value, row + shift, MARKS[agent["kind"]], color=colour, mfc=face, ms=5)
+                else:
+                    text = f"◂ {number(found['value'])}{'' if name == NOMINAL else ' (often)'}"
+                    ax.text(lowest, row + shift, text, va="center", fontsize=7, color=colour)
+        ax.set_yticks(range(len(env["agents"])), list(env["agents"]), fontsize=8)
+        ax.set_ylim(len(env["agents"]) - 0.5, -0.5)
+        ax.set_xlabel(_what(env), fontsize=8)
+        if lowest > -math.inf:
+            ax.set_xlim(left=lowest)
+        if env["known"]:
+            values = [
+                a["conditions"].get(c, {"value": 0.0})["value"] for a in shown for c in (NOMINAL, OFTEN)
+            ]
+            ax.set_xlim(lowest, max(1.02, *values) + 0.03)
+            ax.axvline(1.0, color="0.6", lw=0.8)
+        ax.grid(axis="x", color="0.9")
+    from matplotlib.lines import Line2D
+
+    keys = [Line2D([], [], ls="", marker=MARKS[k], color=c, label=k) for k, c in COLOURS.items()]
+    keys.append(Line2D([], [], ls="", marker="o", color="0.3", mfc="white", label="open: ten times as often"))
+    figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    return figure
+
+
+def _lowest(agents: Mapping[str, Data]) -> float:
+    """Return the return below which agents are drawn at the edge."""
+    values = {name: agent["conditions"][NOMINAL]["value"] for name, agent in agents.items()}
+    low, high = values.get("random", -math.inf), max(values.values())
+    return low + LOWEST * (high - low) if low < high else -math.inf
+
+
+def curves_figure(envs: Mapping[str, Data], over: str) -> Any:
+    """Draw what learners reach over the steps, or the seconds, of training."""
+    shown = {i: e for i, e in envs.items() if any(a["kind"] == "learned" for a in e["agents"].values())}
+    names = sorted({n for e in shown.values() for n, a in e["agents"].items() if a["kind"] == "learned"})
+    figure, axes = _panels(shown)
+    for ax, env in zip(axes, shown.values(), strict=True):
+        for name in names:
+            curve = (env["agents"].get(name, {}).get("curves") or {}).get(over)
+            if curve is None:
+                continue
+            colour = LINES[names.index(name) % len(LINES)]
+            x = np.array(curve["x"]) / (1e3 if over == "steps" else 1.0)
+            ax.plot(x, curve["value"], color=colour, lw=1.5, ls=["-", "--", "-."][names.index(name) % 3])
+            if curve["low"] is not None:
+                ax.fill_between(x, curve["low"], curve["high"], color=colour, alpha=0.2, lw=0)
+        if env["known"]:
+            ax.set_ylim(LOWEST, 1.05)
+            ax.axhline(1.0, color="0.6", lw=0.8)
+        ax.set_xlabel("steps of the environment [thousands]" if over == "steps" else "time [s]", fontsize=8)
+        ax.set_ylabel(_what(env), fontsize=8)
+        ax.grid(color="0.9")
+    from matplotlib.lines import Line2D
+
+    keys = [
+        Line2D([], [], color=LINES[i % len(LINES)], ls=["-", "--", "-."][i % 3], label=name)
+        for i, name in enumerate(names)
+    ]
+    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), fontsize=8, frameon=False)
+    return figure
+
+
+def robustness_figure(env_id: str, env: Data) -> Any:
+    """Draw each agent's result under each condition, as a table with colours."""
+    agents = env["agents"]
+    most = max((agent["conditions"] for agent in agents.values()), key=len)
+    columns = list(dict.fromkeys([*most, *(c for agent in agents.values() for c in agent["conditions"])]))
+    values = np.array(
+        [[a["conditions"].get(c, {}).get("value", math.nan) for c in columns] for a in agents.values()]
+    )
+    if env["known"]:
+        low, high = 0.0, 1.0
+    else:
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    figure = _figure(1.6 + 0.52 * len(columns), 1.5 + 0.3 * len(agents))
+    ax = figure.subplots()
+    ax.set_facecolor("0.85")
+    ax.imshow(values, cmap="cividis", vmin=low, vmax=high, aspect="auto")
+    for (i, j), value in np.ndenumerate(values):
+        if not math.isnan(value):
+            bright = value > low + 0.55 * (high - low)
+            text = f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
+            text = text.replace("-0.00", "0.00")
+            ax.text(j, i, text, ha="center", va="center", fontsize=7, color="black" if bright else "white")
+    ax.set_xticks(range(len(columns)), columns, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
+    ax.set_yticks(range(len(agents)), list(agents), fontsize=8)
+    ax.set_title(f"{env_id}: {_what(env)}", fontsize=10)
+    return figure
+
+
+def improvement_figure(envs: Mapping[str, Data]) -> Any:
+    """Draw how likely a run of one learner is to be better than another agent."""
+    shown = {env_id: env for env_id, env in envs.items() if env["improvement"]}
+    figure, axes = _panels(shown, [1.4 + 0.3 * len(env["improvement"]) for env in shown.values()])
+    for ax, env in zip(axes, shown.values(), strict=True):
+        rows, columns = list(env["improvement"]), list(env["agents"])
+        values = np.array(
+            [[env["improvement"][r].get(c, {}).get("value", math.nan) for c in columns] for r in rows]
+        )
+        ax.set_facecolor("0.85")
+        ax.imshow(values, cmap="cividis", vmin=0.0, vmax=1.0, aspect="auto")
+        for (i, j), value in np.ndenumerate(values):
+            if not math.isnan(value):
+                colour = "black" if value > 0.55 else "white"
+                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+        ax.set_xticks(
+            range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor", fontsize=7
+        )
+        ax.set_yticks(range(len(rows)), rows, fontsize=8)
+    figure.supylabel("probability that a run of this ...", fontsize=9)
+    figure.supxlabel("... is better than this", fontsize=9)
+    return figure
+
+
+# --- the page -----------------------------------------------------------------------------------------------
+
+
+def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
+    """Return docs/agents.md.
+
+    Parameters
+    ----------
+    data : dict
+        What ``agents/results/summary.json`` holds.
+    notes : mapping of str to str, optional
+        A text for each environment, by default those in ``agents/notes.toml``.
+    """
+    notes = load_notes() if notes is None else notes
+    envs = data["envs"]
+    parts = [
+        "# Agents: what they reach",
+        "Made by `python -m agents.results` from `agents/results/summary.json`; do not edit it by hand.",
+        _reading(data),
+    ]
+    for env_id, env in envs.items():
+        parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else []), _range(env)]
+        parts += [_env_table(env, data["episodes"]), *([_problems(env)] if env.get("problems") else [])]
+        parts.append(
+            _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
+        )
+    parts += [
+        "## All environments",
+        "Each agent's result, filled, and that of acting ten times as often, open:",
+    ]
+    parts.append(_image("agents-scores.png", "Results of all agents with intervals"))
+    if data["learners"]:
+        parts += ["### Learners", _learners_table(data["learners"])]
+        parts.append(
+            "What a learner's policy reaches in the course of its training, over steps and over seconds:"
+        )
+        parts.append(_image("agents-steps.png", "Learning curves over steps"))
+        parts.append(_image("agents-seconds.png", "Learning curves over seconds"))
+        parts.append(
+            "How likely a training run of one learner is to end with a better policy than another agent's:"
+        )
+        parts.append(_image("agents-improvement.png", "Probability of improvement"))
+        parts.append(_improvement_table(envs))
+    parts += ["## How it was measured", _method(data), "### Noise", _noise_table(envs)]
+    parts += ["### Machine and versions", _about(data)]
+    return "\n\n".join(parts) + "\n"
+
+
+def load_notes() -> dict[str, str]:
+    """Return the texts about the environments."""
+    if not NOTES.exists():
+        return {}
+    return tomllib.loads(NOTES.read_text(encoding="utf-8"))
+
+
+def _reading(data: Data) -> str:
+    return (
+        "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best policy"
+        " known. Where no range is known, or it is too wide for a percentage to mean anything, the return"
+        " itself stands in its place. Learners: interquartile mean over training seeds, and in brackets its"
+        f" {100 * LEVEL:g} % interval by a stratified bootstrap; mean return ± standard error over seeds"
+        " (a single run is treated like what follows)."
+        " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
+        " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
+        " a tenth; it shows what lives off the discretisation. *Worst*: the lowest result under changed"
+        " parameters, noise and delay. Time and steps are those of one training run."
+    )
+
+
+def _range(env: Data) -> str:
+    if env["known"] is None:
+        return "No range is set for scores; the numbers are mean returns."
+    random, best = env["known"]
+    return f"Mean return of random actions {random:g}, best known {best:g}."
+
+
+def _env_table(env: Data, episodes: int) -> str:
+    what = "score" if env["known"] else "return"
+    head = [
+        "agent",
+        "seeds",
+        "mean return",
+        f"{what} ({100 * LEVEL:g} %)",
+        "ten times as often",
+        "worst",
+        "training",
+    ]
+    rows = []
+    for name, agent in env["agents"].items():
+        conditions = agent["conditions"]
+        nominal, often = conditions[NOMINAL], conditions.get(OFTEN)
+        others = {c: v["value"] for c, v in conditions.items() if c not in (NOMINAL, OFTEN)}
+        worst = min(others, key=others.__getitem__, default=None)
+        learned = agent["kind"] == "learned"
+        fewer = nominal["episodes"] != episodes
+        rows.append(
+            [
+                name + (f" ({nominal['episodes']:,} episodes)" if fewer else ""),
+                str(len(agent["seeds"])) if learned else "",
+                plus_minus(nominal["return"], nominal["return_error"]),
+                with_interval(nominal),
+                "" if often is None else with_interval(often),
+                "" if worst is None else f"{number(others[worst])}: {worst}",
+                f"{agent['seconds']:,.0f} s, {agent['steps']:,.0f} steps" if learned else "",
+            ]
+        )
+    return table(head, rows)
+
+
+def _problems(env: Data) -> str:
+    return "Left out:\n\n" + "\n".join(f"- {problem}" for problem in env["problems"])
+
+
+def _learners_table(learners: Data) -> str:
+    rows = [
+        [
+            name,
+            with_interval({"value": found["value"], **_ends(found["interval"])}),
+            f"{len(found['envs'])}: {', '.join(found['envs'])}",
+            str(found["runs"]),
+        ]
+        for name, found in learners.items()
+    ]
+    text = "Over all environments with a score, each resampled by itself. Compare only equal environments."
+    return text + "\n\n" + table(["learner", f"score ({100 * LEVEL:g} %)", "environments", "runs"], rows)
+
+
+def _improvement_table(envs: Mapping[str, Data]) -> str:
+    rows = [
+        [env_id, one, other, with_interval({"value": found["value"], **_ends(found["interval"])})]
+        for env_id, env in envs.items()
+        for one, others in env["improvement"].items()
+        for other, found in others.items()
+        if 0.0 < found["value"] < 1.0
+        and (found["value"] >= 0.5 or env["agents"][other]["kind"] != "learned")
+        and (found["value"] != 0.5 or one < other)
+    ]
+    if not rows:
+        return "All runs of the one are better than all of the other, in every case."
+    text = f"Neither 0 nor 1, with {100 * LEVEL:g} % interval; two learners in the likelier order:"
+    return text + "\n\n" + table(["environment", "learner", "better than", "probability"], rows)
+
+
+def _method(data: Data) -> str:
+    return "\n".join(
+        [
+            f"- Episodes: {data['episodes']:,} under each condition, where a table says nothing else. They"
+            f" are seeded {data['first_seed']:,} and on, which training and tuning never use; the same for"
+            " all agents. Agents act deterministically.",
+            *_fewer(data),
+            "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their seconds;"
+            " running rewards and the chance of a kick are scaled with `dt`.",
+            "- *Parameters*: each of the scene's 20 % lower and higher, the others as they are; a moment of"
+            " inertia that is not given follows mass and size. The agents stay those of the environment as it"
+            " is, and so does the range of scores: part of a loss, or gain, is the changed task's.",
+            "- *Noise*: Gaussian, drawn anew for each entry of the observation at each step, with a standard"
+            " deviation of 1 % and 5 % of what the entry itself has over random actions (100 episodes).",
+            "- *Late*: the agent sees the observation of the step before.",
+            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, SciPy's, strata being the"
+            " environments and elements the seeds, as in rliable (Agarwal et al., NeurIPS 2021), with whose"
+            " functions tests compare ours. The probability of improvement compares runs: an agent that was"
+            " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"
+            " between tests.",
+        ]
+    )
+
+
+def _fewer(data: Data) -> list[str]:
+    """Tell which agents took too long for all episodes."""
+    found: dict[tuple[str, int], None] = {}
+    for env in data["envs"].values():
+        for name, agent in env["agents"].items():
+            most = agent["conditions"][NOMINAL]["episodes"]
+            found |= {
+                (name, c["episodes"]): None for c in agent["conditions"].values() if c["episodes"] < most
+            }
+    if not found:
+        return []
+    names = ", ".join(f"{name} in {n:,} episodes only" for name, n in found)
+    return [
+        f"- Under changed conditions {names}. Returns there are moved by as much as the agent's return in"
+        " these episodes differs from its return in all, both without the change."
+    ]
+
+
+def _noise_table(envs: Mapping[str, Data]) -> str:
+    rows = [
+        [env_id, ", ".join(f"{entry} {value:.3g}" for entry, value in env["spread"].items())]
+        for env_id, env in envs.items()
+        if env.get("spread")
+    ]
+    return table(["environment", "standard deviation of each entry under random actions"], rows)
+
+
+def _about(data: Data) -> str:
+    machine = data["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
+    agents = [agent for env in data["envs"].values() for agent in env["agents"].values()]
+    places = sorted({place for agent in agents for place in agent.get("trained_on", ())})
+    trained = "\n".join(f"- {place}" for place in places)
+    text = (
+        f"Measured on {machine['processor']}, {machine['cores']} cores, {machine['system']}, Python"
+        f" {machine['python']}; {data['date']}. {versions}."
+    )
+    return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
+
+
+def _ends(interval: Sequence[float] | None) -> Data:
+    return dict(zip(("low", "high"), interval or (math.nan, math.nan), strict=True))
+
+
+def _image(file: str, text: str) -> str:
+    return f"![{text}]({IMAGES}/{file})"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
+
+
+def number(value: float) -> str:
+    """Return a result with as many digits as say something.
+
+    Examples
+    --------
+    >>> number(0.98765), number(-3.21), number(417.923)
+    ('0.988', '-3.21', '417.9')
+    """
+    digits = 3 if abs(value) < 2.0 else 2 if abs(value) < 100.0 else 1
+    text = f"{value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0.0 else text
+
+
+def with_interval(found: Mapping[str, float]) -> str:
+    """Return a value with its interval, where it has one."""
+    if found["low"] is None or math.isnan(found["low"]):
+        return number(found["value"])
+    return f"{number(found['value'])} ({number(found['low'])}, {number(found['high'])})"
+
+
+def plus_minus(mean: float, error: float) -> str:
+    """Return a mean with its standard error, to the error's second digit.
+
+    Examples
+    --------
+    >>> plus_minus(417.923, 0.0312), plus_minus(-4.0, 0.0)
+    ('417.923 ± 0.031', '-4.00 ± 0.00')
+    """
+    digits = 2 if error <= 0.0 else min(4, max(0, 1 - math.floor(math.log10(error))))
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"

@@ -1,0 +1,245 @@
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from agents.controllers import CONTROLLERS, ILQR, PD, Constant, TiltLQR, make_controller, tune
+from agents.controllers.basic import Reader
+from agents.controllers.linear import discretise, equations, linearise
+from agents.controllers.pivoted_bar import EnergyShapingLQR
+from agents.evaluate import evaluate_batch
+from lag_envs.envs.model import Model
+from lag_envs.tasks import TASKS, load_task
+
+SEED = 1_000_000_000
+BAR, FREE, BALANCE = "PivotedBar-v0", "PivotedBarFree-v0", "PivotedBarBalance-v0"
+INCLINE, BRAKE = "InclineTilt-v0", "InclineBrake-v0"
+SHELL, PUMP, DAMPING = (f"CylinderInCylinder{task}-v0" for task in ("Tilt", "Pump", "Damping"))
+
+
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def make_task(env_id, **options):
+    place, fixed = TASKS[env_id]
+    return load_task(place)(**fixed | options)
+
+
+# --- what they reach: mean returns over 1,000 episodes ---
+
+SCORES = {
+    (BAR, "energy shaping + LQR"): 418.0,
+    (FREE, "energy shaping + LQR"): 408.7,
+    (BALANCE, "LQR"): 448.0,
+    (INCLINE, "PD"): 179.5,
+    (INCLINE, "cascade"): 180.8,
+    (BRAKE, "full damping"): -4.75,
+    (BRAKE, "best constant"): -3.95,
+    (BRAKE, "switching line"): -1.74,
+    (SHELL, "PD"): 197.5,
+    (SHELL, "LQR"): 197.6,
+    (PUMP, "energy pump"): 141.8,
+    (DAMPING, "full damping"): 305.0,
+    (DAMPING, "best constant"): 316.0,
+    (DAMPING, "switching line"): 366.0,
+}
+#: Planning takes longer: fewer episodes, and the returns of what the plans start from.
+PLANS = {
+    BAR: (418.8, "energy shaping + LQR"),
+    FREE: (422.3, "energy shaping + LQR"),
+    INCLINE: (182.0, "cascade"),
+    SHELL: (197.6, "LQR"),
+    PUMP: (144.9, "energy pump"),
+}
+
+
+@pytest.mark.parametrize(("env_id", "name"), SCORES)
+def test_controller_reaches(env_id, name):
+    returns = evaluate_batch(env_id, make_controller(env_id, name), SEED, 1000)
+    assert returns.mean() > SCORES[env_id, name]
+
+
+@pytest.mark.parametrize("env_id", [FREE, *(slow(e) for e in PLANS if e != FREE)])
+def test_plan_reaches(env_id):
+    least, start = PLANS[env_id]
+    n = 4 if env_id == FREE else 32
+    returns = evaluate_batch(env_id, make_controller(env_id, "iLQR"), SEED, n)
+    before = evaluate_batch(env_id, make_controller(env_id, start), SEED, n)
+    assert returns.mean() > least
+    assert (returns > before - 0.01).all()
+
+
+def test_every_controller_is_tested():
+    tested = set(SCORES) | {(e, "iLQR") for e in PLANS} | {(e, n) for e in TASKS for n in ("zero", "random")}
+    assert tested == {(e, name) for e, makers in CONTROLLERS.items() for name in makers}
+    assert list(CONTROLLERS) == list(TASKS)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "least", "options"),
+    [
+        (BAR, "energy shaping + LQR", 415.0, {"mass": 0.4, "dt": 0.01}),
+        (BALANCE, "LQR", 420.0, {"com_distance": 0.25}),
+        slow(INCLINE, "cascade", 175.0, {"control": "tilt"}),
+        slow(INCLINE, "PD", 175.0, {"control": "tilt"}),
+        slow(BAR, "energy shaping + LQR", 400.0, {"com_distance": 0.2, "track": math.inf}),
+        (BRAKE, "switching line", -2.0, {"tilt": 0.2, "dt": 0.01}),
+        (SHELL, "LQR", 195.0, {"damping": 0.3, "dt": 0.02}),
+        (DAMPING, "switching line", 320.0, {"mass": 1.3}),
+    ],
+)
+def test_controller_takes_parameters_from_the_task(env_id, name, least, options):
+    agent = make_controller(env_id, name, **options)
+    assert evaluate_batch(env_id, agent, SEED, 32, **options).mean() > least
+
+
+# --- how they are asked ---
+
+
+@pytest.fixture(scope="module")
+def observations():
+    """Return a batch of observations of an environment, none of them alike."""
+
+    def make(env_id, n):
+        rng = np.random.default_rng(0)
+        task = make_task(env_id)
+        centre, start = np.array(task.centre), np.array(task.start)
+        states = centre + start * rng.uniform(-1.0, 1.0, (n, len(centre)))
+        if env_id in (BAR, FREE):
+            states[n // 2 :, -2:] = [3.0, 0.1]  # where the LQR takes over
+        goal = 0.0 if task.target_range is None else task.target_range * rng.uniform(-1.0, 1.0, n)
+        read = Reader(task)
+        seen = task.observe(task.scene.lift(states), goal, SimpleNamespace(**task.constants()))
+        values = np.stack(np.broadcast_arrays(*seen), axis=-1).astype(np.float32)
+        np.testing.assert_allclose(read(values)[0], states, atol=1e-6)
+        np.testing.assert_allclose(read(values)[1], goal, atol=1e-6)
+        return values
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"), [(e, n) for e in CONTROLLERS for n in CONTROLLERS[e] if n not in ("random", "iLQR")]
+)
+def test_one_observation_is_answered_as_a_batch(env_id, name, observations):
+    agent = make_controller(env_id, name)
+    batch = observations(env_id, 6)
+    actions, _ = agent.predict(batch)
+    assert actions.shape == (6, 1) and actions.dtype == np.float32
+    assert (np.abs(actions) <= 1.0).all()
+    for one, action in zip(batch, actions, strict=True):
+        np.testing.assert_allclose(agent.predict(one)[0], action, atol=1e-6)
+
+
+def test_plans_are_kept_outside(observations):
+    task = make_task(SHELL, duration=1.0)
+    agent = ILQR(task, [TiltLQR(task)], iterations=3, steps=12)
+    first, second = observations(SHELL, 4)[:2], observations(SHELL, 4)[2:]
+    _, state = agent.predict(first)
+    _, other = agent.predict(second)  # another episode in between
+    follow, later = agent.predict(first, state)
+    np.testing.assert_array_equal(follow, agent.predict(first, state)[0])
+    # Episodes that start anew are planned anew, the others go on.
+    _, mixed = agent.predict(np.stack([first[0], second[1]]), later, np.array([False, True]))
+    assert mixed.step.tolist() == [3, 1]
+    np.testing.assert_array_equal(mixed.actions[0], state.actions[0])
+    np.testing.assert_allclose(mixed.actions[1], other.actions[1], atol=1e-9)
+    # One observation alone.
+    action, state = agent.predict(first[0])
+    assert action.shape == (1,)
+    # Beyond the plan the guess goes on.
+    for _ in range(13):
+        action, state = agent.predict(first[0], state)
+    np.testing.assert_array_equal(action, TiltLQR(task).predict(first[0])[0])
+
+
+def test_hysteresis_is_kept_outside():
+    agent = EnergyShapingLQR(make_task(FREE))
+    e = math.sqrt(0.5 * (agent.catch + agent.lose) / agent.cost[0, 0])
+    between = np.array([[-math.cos(e), -math.sin(e), 0.0]] * 2)
+    _, holds = agent.predict(between, np.array([False, True]))
+    assert holds.tolist() == [False, True]
+    _, holds = agent.predict(between, holds, np.array([True, True]))
+    assert holds.tolist() == [False, False]
+
+
+# --- linearisation ---
+
+REST = {
+    BAR: [0.0, 0.0, math.pi, 0.0],
+    INCLINE: [0.1, 0.0, 0.0],
+    SHELL: [0.3, 0.0, 16.35 * math.sin(0.3)],
+    FREE: [math.pi, 0.0],
+    BALANCE: [0.0, 0.0, math.pi, 0.0],
+    PUMP: [0.0, 0.0, 0.0],
+    DAMPING: [0.0, 0.0],
+}
+
+
+@pytest.mark.parametrize("env_id", [BAR, INCLINE, SHELL, *(slow(e) for e in list(REST)[3:])])
+def test_linearisation_is_the_slope_of_the_model(env_id):
+    task = make_task(env_id)
+    rest, n, h = np.array(REST[env_id]), len(REST[env_id]), 1e-4
+    control = 0.5 * task.limit_control if env_id == DAMPING else 0.0
+    a, b = discretise(*linearise(task.scene, rest, control), task.dt)
+    model, goal = Model(task), None if task.target_range is None else 0.0
+    moves = h * np.vstack([np.eye(n + 1), -np.eye(n + 1)])
+    ends = model(rest + moves[:, :n], moves[:, n], goal)[0]
+    slopes = (ends[: n + 1] - ends[n + 1 :]).T / (2.0 * h)
+    np.testing.assert_allclose(slopes[:, :n], a, rtol=1e-5, atol=1e-6)
+    per_action = task.limit_control * (0.5 if env_id == DAMPING else 1.0)
+    np.testing.assert_allclose(slopes[:, n], per_action * b[:, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_equations_of_every_control():
+    for env_id, options in [(e, {}) for e in TASKS] + [(INCLINE, {"control": "tilt"})]:
+        eqs = equations(make_task(env_id, **options).scene)
+        assert len(eqs.rates) == len(eqs.states)
+        assert all(rate.free_symbols <= {*eqs.states, eqs.control} for rate in eqs.rates)
+
+
+# --- mistakes ---
+
+
+def test_unknown_names_get_hints():
+    with pytest.raises(ValueError, match="did you mean PivotedBar-v0"):
+        make_controller("PivotedBr-v0", "zero")
+    with pytest.raises(ValueError, match="did you mean cascade"):
+        make_controller(INCLINE, "casc")
+    with pytest.raises(ValueError, match="there are zero, random, LQR"):
+        make_controller(BALANCE, "xyz")
+    with pytest.raises(TypeError, match="unknown keyword 'weight'"):
+        make_controller(BALANCE, "LQR", weight=1.0)
+
+
+def test_what_cannot_work_is_refused():
+    with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 4\) for theta, theta_dot, psi_dot"):
+        make_controller(SHELL, "LQR").predict(np.zeros(3))
+    with pytest.raises(ValueError, match="Balance has random kicks"):
+        ILQR(make_task(BALANCE), [Constant(0.0)])
+    with pytest.raises(ValueError, match="inertia=0"):
+        make_controller(PUMP, "energy pump", inertia=0.0)
+    for controller in (TiltLQR, PD):
+        with pytest.raises(ValueError, match="damping"):
+            controller(make_task(SHELL, damping=0.0))
+
+
+# --- tuning ---
+
+
+def test_tuning(capsys, monkeypatch):
+    assert tune.TUNABLE.keys() == CONTROLLERS.keys()
+    used = []
+
+    def evaluated(env_id, agent, seed, episodes):
+        used.append(range(seed, seed + episodes))
+        return np.array([-((agent.action - 0.4) ** 2)])
+
+    monkeypatch.setattr(tune, "evaluate_batch", evaluated)
+    assert tune.main([BRAKE, "--only", "best constant", "--episodes", "5"]) == 0
+    assert "best constant: {'action': 0.4}" in capsys.readouterr().out
+    assert {(r.start, len(r)) for r in used} == {(3_000_000_000, 5)}
+    assert tune.main(["InclineBrak-v0"]) == 2
+    assert "did you mean InclineBrake-v0" in capsys.readouterr().err

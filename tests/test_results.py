@@ -1,0 +1,426 @@
+"""What was measured of agents: statistics against known answers, the command, figures and page."""
+
+import errno
+import json
+import warnings
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from agents import measure, report, results
+from agents.analysis import (
+    NOMINAL,
+    OFTEN,
+    estimate,
+    improvement,
+    interval,
+    iqm,
+    iqm_of_all,
+    learning_curve,
+    level,
+    summarise_env,
+    summarise_learners,
+)
+from agents.controllers import Constant, do_nothing
+from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
+from agents.measure import Condition, Entrant, Job, conditions
+from lag_envs.tasks import TASKS, load_task
+
+ROOT = Path(__file__).parents[1]
+ENV = "InclineBrake-v0"
+
+
+def rliable_metrics():
+    """Return rliable's metrics; its other parts do not import beside every pandas."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return pytest.importorskip("rliable.metrics")
+
+
+# --- statistics ---
+
+
+def test_iqm_by_hand():
+    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 70.0]) == np.mean([2.0, 3.0, 4.0, 5.0])
+    assert iqm([1.0, 3.0]) == 2.0  # too few to leave any out
+    assert iqm_of_all([0.0, 5.0], [1.0, 3.0]) == 2.0
+    np.testing.assert_array_equal(iqm([[0.0, 1.0, 2.0, 90.0], [4.0, 4.0, 4.0, 4.0]], axis=1), [1.5, 4.0])
+
+
+def test_improvement_by_hand():
+    assert improvement([2.0, 2.0], [1.0]) == 1.0
+    assert improvement([1.0], [1.0, 2.0]) == 0.25
+    assert improvement([[1.0, 2.0], [0.0, 0.0]], [[0.0, 1.5], [1.0, 1.0]]).tolist() == [0.75, 0.0]
+
+
+def test_statistics_agree_with_rliable():
+    metrics = rliable_metrics()
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(10, 3)), rng.normal(0.3, size=(10, 3))
+    assert iqm_of_all(*x.T) == pytest.approx(metrics.aggregate_iqm(x), rel=1e-12)
+    ours = np.mean([improvement(a, b) for a, b in zip(x.T, y.T, strict=True)])
+    assert ours == pytest.approx(metrics.probability_of_improvement(x, y), rel=1e-12)
+
+
+def test_interval_is_that_of_resampling_each_stratum():
+    # Two elements: their mean takes the lower, the upper or the middle with 1/4, 1/4, 1/2.
+    assert interval(iqm, [0.0, 1.0]) == [0.0, 1.0]
+    assert interval(iqm, [3.0, 3.0, 3.0]) == [3.0, 3.0]
+    assert interval(iqm, [3.0]) is None and interval(iqm_of_all, [1.0, 2.0], [3.0]) is None
+    # As rliable does it: rows of a matrix (runs, tasks) are drawn anew for each column by itself.
+    rng = np.random.default_rng(1)
+    scores = rng.normal([0.0, 1.0, 5.0], size=(8, 3))
+    drawn = [iqm_of_all(*(column[rng.integers(8, size=8)] for column in scores.T)) for _ in range(1500)]
+    expected = np.quantile(drawn, [0.025, 0.975])
+    np.testing.assert_allclose(interval(iqm_of_all, *scores.T), expected, atol=0.1)
+    assert interval(iqm_of_all, *scores.T) == interval(iqm_of_all, *scores.T)  # same numbers each time
+
+
+def test_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(2)
+    ends = [interval(iqm, sample) for sample in rng.normal(size=(60, 20))]
+    assert 0.8 <= np.mean([low < 0.0 < high for low, high in ends]) <= 1.0
+
+
+def test_estimate_by_hand():
+    single = estimate([[1.0, 3.0, 1.0, 3.0]])
+    error = np.sqrt(4.0 / 3.0) / 2.0
+    assert single["value"] == single["mean"] == 2.0 and single["error"] == pytest.approx(error)
+    assert single["high"] - 2.0 == pytest.approx(1.96 * error) == 2.0 - single["low"]
+    several = estimate([[0.0, 2.0], [2.0, 4.0], [8.0, 8.0]])
+    assert several["each"] == [1.0, 3.0, 8.0] and several["mean"] == several["value"] == 4.0
+    assert several["error"] == pytest.approx(np.std([1.0, 3.0, 8.0], ddof=1) / np.sqrt(3.0))
+    assert several["low"] == 1.0 and several["high"] == 8.0
+    assert estimate([[5.0]])["error"] == 0.0
+
+
+def test_fewer_episodes_are_levelled():
+    """A condition that changes nothing costs nothing, whichever episodes it was measured in."""
+    found = level({NOMINAL: [[1.0, 2.0, 9.0]], OFTEN: [[1.0, 2.0]], "late": [[0.0, 1.0]]})
+    assert found[OFTEN][0].mean() == 4.0 and found["late"][0].mean() == 3.0
+    np.testing.assert_array_equal(found[NOMINAL][0], [1.0, 2.0, 9.0])
+
+
+def test_learning_curve_by_hand():
+    curves = [[[0, 0.0, 1.0], [100, 2.0, 3.0]], [[20, 1.0, 5.0], [120, 3.0, 5.0]]]
+    found = learning_curve(curves, 0)
+    assert (found["x"][0], found["x"][-1]) == (20.0, 100.0)
+    assert found["value"][0] == pytest.approx(np.mean([1.4, 5.0]))
+    assert (found["low"][-1], found["high"][-1]) == (3.0, 5.0)
+    assert learning_curve(curves, 1)["x"][-1] == 2.0
+    assert learning_curve(curves[:1], 0)["low"] is None
+    assert learning_curve([], 0) is None and learning_curve([[[0, 0.0, 1.0]]], 0) is None
+
+
+def learner(name, seeds, best=0.9, n=4):
+    """Return what is measured of a learner, invented; returns lie between 0 and 10."""
+    rng = np.random.default_rng(len(name))
+    returns = [10.0 * (best + 0.05 * rng.normal(size=n)) for _ in range(seeds)]
+    curve = [[0, 0.1, 0.0], [500, 3.0, 5.0], [1000, 6.0, 10.0 * best]]
+    return {
+        "name": name,
+        "kind": "learned",
+        "conditions": {NOMINAL: returns, OFTEN: returns, "late": [r - 2.0 for r in returns]},
+        "seeds": list(range(seeds)),
+        "steps": [1000] * seeds,
+        "seconds": [6.0] * seeds,
+        "curves": [curve] * seeds,
+        "trained_on": ["a machine: torch 2"],
+    }
+
+
+def classical(name, value):
+    returns = [[value - 0.5, value + 0.5, value, value]]
+    return {"name": name, "kind": "classical", "conditions": {NOMINAL: returns, "late": returns}}
+
+
+def invented():
+    """Return a whole summary of invented results."""
+    agents = [learner("ppo", 5), learner("sac+", 3, 0.8), learner("td3", 1), classical("a|b", 9.9)]
+    envs = {
+        "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], (0.0, 10.0)),
+        "PivotedBarBalance-v0": summarise_env(agents[::2], None),
+        "InclineTilt-v0": summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
+    }
+    for env in envs.values():
+        env |= {"spread": {"s": 0.5}, "problems": ["optimal: not computed"]}
+    machine = {"processor": "P", "cores": 2, "system": "S", "python": "3"}
+    return {
+        "schema": 1,
+        "date": "2026-01-01",
+        "first_seed": 10**9,
+        "episodes": 4,
+        "machine": machine,
+        "versions": {"numpy": "2"},
+        "envs": envs,
+        "learners": summarise_learners(envs),
+    }
+
+
+def test_summary_of_an_environment():
+    env = invented()["envs"]["PivotedBar-v0"]
+    assert [*env["agents"]] == ["a|b", "td3", "ppo", "sac+", "zero"]
+    found = env["agents"]["a|b"]["conditions"][NOMINAL]
+    assert found["value"] == pytest.approx(0.99) and found["return"] == pytest.approx(9.9)
+    assert env["agents"]["ppo"]["conditions"]["late"]["value"] == pytest.approx(
+        env["agents"]["ppo"]["conditions"][NOMINAL]["value"] - 0.2
+    )
+    assert set(env["improvement"]) == {"ppo", "sac+", "td3"}
+    assert env["improvement"]["ppo"]["sac+"]["value"] == 1.0 and len(env["improvement"]["ppo"]) == 4
+    assert env["improvement"]["td3"]["ppo"]["interval"] is None
+    assert invented()["learners"]["ppo"]["envs"] == ["PivotedBar-v0"]  # the others have no score
+
+
+# --- measuring ---
+
+
+def test_sensor():
+    start, on = np.ones(2, np.bool_), np.array([False, True])
+    observations = [np.full((2, 3), float(i), np.float32) for i in range(3)]
+    late = Sensor(late=True)
+    assert late(observations[0], start).tolist() == [[0.0] * 3] * 2
+    assert late(observations[1], ~start).tolist() == [[0.0] * 3] * 2
+    # The second begins an episode: there is nothing from before.
+    assert late(observations[2], on).tolist() == [[1.0] * 3, [2.0] * 3]
+    noisy = Sensor(noise=[0.0, 1.0, 5.0])
+    seen = noisy(np.zeros((20_000, 3), np.float32), np.ones(20_000, np.bool_))
+    assert seen.dtype == np.float32
+    np.testing.assert_allclose(seen.std(axis=0), [0.0, 1.0, 5.0], rtol=0.02)
+    assert (noisy(np.zeros((20_000, 3), np.float32), start) != seen)[:, 1:].any()
+
+
+def test_what_an_agent_sees_in_a_batch():
+    """Noise and delay change what it sees, not what happens; without them nothing changes."""
+    agent = Constant(0.3)
+    plain = evaluate_batch(ENV, agent, 7, 3)
+    np.testing.assert_array_equal(evaluate_batch(ENV, agent, 7, 3, observe=Sensor(1.0, True)), plain)
+    with gym.make(ENV) as env:
+        np.testing.assert_allclose(evaluate(env, agent, range(7, 10)), plain, rtol=1e-12)
+
+
+def test_observation_spread():
+    rng, seen = np.random.default_rng(5), []
+    with gym.make(ENV) as env:
+        seen.append(env.reset(seed=5)[0])
+        while True:
+            observation, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, 1).astype(np.float32))
+            if terminated or truncated:
+                break
+            seen.append(observation)
+    np.testing.assert_allclose(observation_spread(ENV, 5, 1), np.std(seen, axis=0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_conditions_make_environments(env_id):
+    found = {c.name: c for c in conditions(env_id)}
+    assert list(found)[:2] == [NOMINAL, OFTEN] and {"noise 1 %", "noise 5 %", "late"} <= set(found)
+    assert {"mass -20 %", "mass +20 %", "gravity -20 %", "gravity +20 %"} <= set(found)
+    place, fixed = TASKS[env_id]
+    tasks = {name: load_task(place)(**fixed | condition.options) for name, condition in found.items()}
+    assert tasks[OFTEN].dt == pytest.approx(tasks[NOMINAL].interval / 10.0)
+    assert tasks[OFTEN].limit == 10.0 * tasks[NOMINAL].steps
+    assert tasks["gravity +20 %"].scene.gravity == pytest.approx(1.2 * tasks[NOMINAL].scene.gravity)
+
+
+def test_agents_with_a_clock_are_told_its_pace():
+    class Clock:
+        pace = 1.0
+
+    class ILQR:
+        pass
+
+    entrant = Entrant(ENV, "clock", "classical", Clock, "")
+    usual, often = (Job(entrant, c, 1) for c in conditions(ENV)[:2])
+    assert often.steps == 10 * usual.steps
+    clock = Clock()
+    assert measure.set_pace(clock, often) and clock.pace == pytest.approx(0.1)
+    assert measure.set_pace(clock, usual) and clock.pace == 1.0
+    assert measure.set_pace(ILQR(), usual) and not measure.set_pace(ILQR(), often)
+    assert measure.set_pace(Constant(0.0), often)
+
+
+# --- the command ---
+
+
+def leave_run(folder, number, **changes):
+    """Leave a finished run's folder."""
+    path = folder / ENV / "ppo" / f"seed{number}"
+    path.mkdir(parents=True)
+    result = {
+        "schema": 1, "env": ENV, "algo": "ppo", "seed": number, "steps": 1000, "trained": 1024,
+        "hyperparameters": {"gamma": 0.9}, "wall_seconds": 6.0, "curve": [[0, 0.1, -5.0], [1024, 6.0, -2.0]],
+        "evaluation": {"returns": [-2.0]}, "versions": {"torch": "2"}, "machine": "M",
+    }  # fmt: skip
+    (path / "result.json").write_text(json.dumps(result | changes))
+    (path / "model.zip").write_bytes(b"policy %d" % number)
+    return path
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Return a function that runs the command on a few agents and conditions."""
+    monkeypatch.setattr(results, "EPISODES", 4)
+    few = [
+        Condition(NOMINAL),
+        Condition("gravity +20 %", {"gravity": 11.8}),
+        Condition("noise 5 %", noise=0.05),
+    ]
+    for module in (measure, results):
+        monkeypatch.setattr(module, "conditions", lambda env_id: few)
+    monkeypatch.setattr(measure, "classical", lambda env_id: {"zero": do_nothing})
+    monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
+    monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
+    monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
+    monkeypatch.setattr(results, "observation_spread", lambda env_id, seed: np.array([0.5, 0.1]))
+
+    def run(*arguments):
+        folders = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
+        status = results.main([*arguments, *folders])
+        return status, "".join(capsys.readouterr())
+
+    return run
+
+
+def summary(tmp_path):
+    return json.loads((tmp_path / results.SUMMARY).read_text())
+
+
+def test_command_measures_and_resumes(command, tmp_path, monkeypatch):
+    folders = [leave_run(tmp_path / "runs", seed) for seed in (0, 1, 10)]
+    status, output = command("--envs", ENV)
+    assert status == 0 and "12 measurements, 0 of them made before" in output
+    data = summary(tmp_path)
+    agents = data["envs"][ENV]["agents"]
+    assert set(agents) == {"ppo", "zero"} and agents["ppo"]["seeds"] == [0, 1, 10]
+    expected = [evaluate_batch(ENV, Constant(0.1 * k), 10**9, 4).mean() for k in (0, 1, 0)]
+    np.testing.assert_allclose(agents["ppo"]["conditions"][NOMINAL]["return"], np.mean(expected), rtol=1e-4)
+    assert agents["zero"]["conditions"]["gravity +20 %"] != agents["zero"]["conditions"][NOMINAL]
+    assert (tmp_path / results.PAGE).read_text() == report.page(data)
+    assert "optimal: not computed" in (tmp_path / results.PAGE).read_text()
+
+    # Nothing is measured twice, but a new policy is.
+    status, output = command("--envs", ENV)
+    assert status == 0 and "12 measurements, 12 of them made before" in output
+    (folders[1] / "model.zip").write_bytes(b"another policy")
+    assert "9 of them made before" in command("--envs", ENV)[1]
+    # A line that was broken off, or damaged, is measured again.
+    file = tmp_path / "runs" / "measurements" / f"{ENV}.jsonl"
+    file.write_bytes(file.read_bytes()[:-10])
+    assert "11 of them made before" in command("--envs", ENV)[1]
+    assert "12 of them made before" in command("--envs", ENV)[1]
+    # Agents that are not there now keep their numbers, unless told otherwise.
+    for folder in folders:
+        (folder / "result.json").unlink()
+    assert command("--envs", ENV)[0] == 0
+    assert summary(tmp_path)["envs"][ENV]["agents"]["ppo"] == agents["ppo"]
+    assert "no finished run" not in (tmp_path / results.PAGE).read_text()
+    assert command("--envs", ENV, "--new")[0] == 0
+    assert set(summary(tmp_path)["envs"][ENV]["agents"]) == {"zero"}
+    assert "no finished run" in (tmp_path / results.PAGE).read_text()
+
+
+def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
+    leave_run(tmp_path / "runs", 0)
+    (leave_run(tmp_path / "runs", 1) / "result.json").write_text('{"schema": 1')
+    leave_run(tmp_path / "runs", 2, seed=7)
+    (leave_run(tmp_path / "runs", 3) / "model.zip").unlink()
+    leave_run(tmp_path / "runs", 4, hyperparameters={"gamma": 0.5})
+    leave_run(tmp_path / "runs", 5, curve="?")
+    leave_run(tmp_path / "runs", 6)
+
+    def policy(folder):
+        if folder.name == "seed6":
+            raise results.UserError("the policy cannot be read")
+        return Constant(0.0)
+
+    monkeypatch.setattr(measure, "_policy", policy)
+    status, output = command("--envs", ENV)
+    assert status == 1
+    for message in (
+        "seed1/result.json cannot be read", "seed 7, not of what its folder says", "result but no model.zip",
+        "other hyperparameters than", "seed5/result.json cannot be read", "seed 6, nominal: UserError: the",
+    ):  # fmt: skip
+        assert message in output
+    assert summary(tmp_path)["envs"][ENV]["agents"]["ppo"]["seeds"] == [0]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (KeyboardInterrupt(), 130, "What was measured is kept"),
+        (OSError(errno.ENOSPC, "No space left on device"), 2, "what was measured before is kept"),
+    ],
+)
+def test_command_that_is_broken_off(error, status, message, command, tmp_path, monkeypatch):
+    add = measure.Store.add
+
+    def stop(self, *arguments):
+        if self.returns:
+            raise error
+        add(self, *arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(measure.Store, "add", stop)
+        found, output = command("--envs", ENV)
+    assert found == status and message in output and not (tmp_path / results.SUMMARY).exists()
+    found, output = command("--envs", ENV)
+    assert found == 0 and "3 measurements, 1 of them made before" in output
+
+
+def test_command_says_what_is_wrong(command, tmp_path):
+    for arguments, message in (
+        (["--envs", "InclineBrak-v0"], "did you mean InclineBrake-v0"),
+        (["--envs", ENV, "--agents", "ppo"], "no agent 'ppo' here; there are zero"),
+        (["--envs", ENV, "--episodes", "0"], "--episodes must lie between"),
+        (["--redraw"], "measure first"),
+    ):
+        status, output = command(*arguments)
+        assert status == 2 and message in output, output
+    results.write(tmp_path / results.SUMMARY, "{}")
+    for arguments in (["--redraw"], ["--envs", ENV]):
+        status, output = command(*arguments)
+        assert status == 2 and "cannot be read" in output
+    (tmp_path / "runs").write_text("a file")
+    status, output = command("--envs", ENV, "--new")
+    assert status == 2 and "--runs must be a folder" in output
+
+
+# --- what is shown ---
+
+
+def test_page_and_figures_of_any_results(tmp_path):
+    data = results.rounded(invented())
+    results.write(tmp_path / results.SUMMARY, results.to_json(data))
+    assert summary(tmp_path) == data
+    stale = tmp_path / results.PICTURES / "agents-stale.png"
+    results.write(stale, b"of an agent that is gone")
+    assert results.main(["--redraw", "--output", str(tmp_path)]) == 0
+    assert not stale.exists()
+    text = (tmp_path / results.PAGE).read_text()
+    assert text == report.page(data) and "nan" not in text
+    assert "| a\\|b |  | 9.90 ± 0.20 | 0.990 (0.950, 1.030) |" in text
+    assert "Left out:" in text and "sac+" in text
+    linked = {line.split("images/")[1].rstrip(")") for line in text.splitlines() if "](images/" in line}
+    drawn = {file.name for file in (tmp_path / results.PICTURES).iterdir()}
+    assert linked == drawn
+    for file in (tmp_path / results.PICTURES).iterdir():
+        assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size < 120_000
+
+
+def test_notes_are_about_environments_that_exist():
+    assert set(report.load_notes()) == set(TASKS)
+    assert "It is best." in report.page(invented(), {"PivotedBar-v0": "It is best."})
+
+
+def test_committed_page_is_made_from_the_committed_results():
+    if not (ROOT / results.SUMMARY).exists():
+        pytest.skip("nothing has been measured yet")
+    data = summary(ROOT)
+    text = (ROOT / results.PAGE).read_text(encoding="utf-8")
+    assert text == report.page(data), "python -m agents.results --redraw"
+    for line in text.splitlines():
+        if "](images/" in line:
+            file = ROOT / "docs" / line.split("](")[1].rstrip(")")
+            assert file.stat().st_size < 120_000

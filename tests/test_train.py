@@ -1,0 +1,321 @@
+"""The training script: learners, checkpoints, seeds side by side, Ray, and what users get wrong."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import yaml
+
+from agents import learners, run, train
+from agents.evaluate import evaluate, evaluate_batch
+from agents.learners import ALGORITHMS, HYPERPARAMS, hyperparameters, load_policy
+from agents.run import Run, UserError
+from agents.sb3_vec_env import bin_centres
+from lag_envs.tasks import TASKS
+
+ROOT = Path(__file__).parents[1]
+ENV = "InclineTilt-v0"
+#: Hyperparameters for a training that takes a second.
+SHORT = {
+    "ppo": {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 2},
+    "sac": {"n_envs": 4, "learning_starts": 40, "batch_size": 16, "gradient_steps": 1},
+}
+SHORT |= {name: SHORT["sac"] for name in ("td3", "tqc", "dqn")}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(learners, "EPISODES", 3)
+    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
+    monkeypatch.setattr(learners, "TESTS", 3)
+
+
+def make_run(folder, algo="ppo", env_id=ENV, steps=400, **more):
+    hyper = hyperparameters(algo, env_id) | SHORT[algo] | more
+    return Run(Path(folder), env_id, algo, 3, steps, hyper)
+
+
+def go(run, until=10**9):
+    """Train until so many steps are done; return whether the run is finished."""
+    return learners.train(
+        run,
+        show=lambda r: None,
+        tested=lambda r: None,
+        stop=lambda: run.trained >= until and until < run.steps,
+    )
+
+
+@pytest.fixture
+def command(capsys, tmp_path):
+    """Return a function that runs the script here; it returns the status and what was printed."""
+
+    def command(*arguments):
+        status = train.main([*arguments, "--output", str(tmp_path)])
+        return status, "".join(capsys.readouterr())
+
+    return command
+
+
+@pytest.fixture
+def config(tmp_path):
+    """Return a file of hyperparameters with which a run takes seconds."""
+    file = tmp_path / "short.yml"
+    entry = {name: value for name, value in hyperparameters("ppo", ENV).items() if name != "env_wrapper"}
+    file.write_text(yaml.safe_dump({ENV: entry | SHORT["ppo"] | {"n_timesteps": 400}}))
+    return file
+
+
+# --- learners ---
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_learner_goes_on_as_if_nothing_had_happened(algo, tmp_path):
+    whole, cut = make_run(tmp_path / "whole", algo), make_run(tmp_path / "cut", algo)
+    assert go(whole)
+    for until in (150, 270):
+        assert not go(cut, until)
+        assert cut.path(run.CHECKPOINT).exists() and cut.load_result() is None
+        cut = make_run(tmp_path / "cut", algo)
+    assert go(cut)
+    first, second = (json.loads((tmp_path / n / run.RESULT).read_text()) for n in ("whole", "cut"))
+    assert first["evaluation"] == second["evaluation"] and len(first["evaluation"]["returns"]) == 3
+    assert [c[0::2] for c in first["curve"]] == [c[0::2] for c in second["curve"]]
+    assert (
+        first["trained"] >= 400
+        and first["versions"]["torch"]
+        and first["hyperparameters"] == cut.hyperparameters
+    )
+    assert not cut.path(run.CHECKPOINT).exists()
+    # The policy that was written acts like the one that was evaluated, one by one and together.
+    policy = load_policy(tmp_path / "cut")
+    returns = evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3)
+    assert returns.tolist() == first["evaluation"]["returns"]
+    with gym.make(ENV) as env:
+        one = evaluate(env, policy, [run.FIRST_FRESH_SEED])
+    np.testing.assert_allclose(one, returns[:1], rtol=1e-4)
+
+
+def test_normalised_observations_belong_to_the_policy(tmp_path):
+    going = make_run(tmp_path, normalize=True)
+    go(going)
+    policy = load_policy(tmp_path)
+    assert policy.normalise is not None
+    expected = json.loads(going.path(run.RESULT).read_text())["evaluation"]["returns"]
+    assert evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3).tolist() == expected
+    policy.normalise = None
+    assert evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3).tolist() != expected
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_hyperparameters_are_there_for_every_environment(algo):
+    entries = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
+    assert set(TASKS) <= set(entries)
+    for env_id in TASKS:
+        entry = hyperparameters(algo, env_id)
+        assert entry["n_timesteps"] >= 1e4 and entry["policy"] == "MlpPolicy"
+
+
+def test_bins_are_gymnasiums():
+    with gym.make(ENV) as env:
+        theirs = gym.wrappers.DiscretizeAction(env, 9)
+        np.testing.assert_allclose(bin_centres(9)[:, None], [theirs.action(i) for i in range(9)], atol=1e-7)
+
+
+def test_learners_refuse_what_they_do_not_know(tmp_path):
+    with pytest.raises(UserError, match="did you mean tqc"):
+        hyperparameters("tqd", ENV)
+    with pytest.raises(UserError, match="ppo does not take the hyperparameters"):
+        go(make_run(tmp_path, nonsense=1))
+    with pytest.raises(UserError, match=r"wrapper gymnasium.wrappers.ClipReward is not known"):
+        go(make_run(tmp_path, env_wrapper=[{"gymnasium.wrappers.ClipReward": {}}]))
+    for text, message in (
+        ("a: [", "cannot be read"),
+        ("a: 1", "no entry for"),
+        (f"{ENV}: {{}}", "lacks n_timesteps"),
+    ):
+        (tmp_path / "bad.yml").write_text(text)
+        with pytest.raises(UserError, match=message):
+            hyperparameters("ppo", ENV, tmp_path / "bad.yml")
+
+
+# --- damaged and foreign files ---
+
+
+def test_checkpoints_of_others_and_damaged_ones_are_refused(tmp_path):
+    begun = make_run(tmp_path)
+    go(begun, 150)
+    data = begun.path(run.CHECKPOINT).read_bytes()
+    for other, message in (
+        (make_run(tmp_path, steps=500), "steps 400, not 500"),
+        (make_run(tmp_path, gamma=0.9), r"other hyperparameters \(gamma\)"),
+        (make_run(tmp_path, env_id="InclineBrake-v0"), "env 'InclineTilt-v0', not"),
+    ):
+        with pytest.raises(UserError, match=message):
+            go(other)
+    for damaged in (b"", b"nonsense", data[: len(data) // 2]):
+        begun.path(run.CHECKPOINT).write_bytes(damaged)
+        with pytest.raises(UserError, match=r"checkpoint.pkl cannot be read .*--new starts anew"):
+            go(make_run(tmp_path))
+    begun.path(run.CHECKPOINT).write_bytes(data)
+    assert go(make_run(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "content", ["{", "[]", '{"schema": 0}', '{"schema": 1, "evaluation": {"returns": 1}}']
+)
+def test_a_damaged_result_is_named(content, tmp_path):
+    (tmp_path / run.RESULT).write_text(content)
+    with pytest.raises(UserError, match=r"result.json cannot be read"):
+        make_run(tmp_path).load_result()
+    with pytest.raises(UserError, match=r"result.json cannot be read"):
+        load_policy(tmp_path)
+
+
+def test_a_damaged_model_is_named(tmp_path):
+    going = make_run(tmp_path, steps=100)
+    go(going)
+    going.path(run.MODEL).write_bytes(b"nonsense")
+    with pytest.raises(UserError, match=r"the policy in .* cannot be read"):
+        load_policy(tmp_path)
+
+
+def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
+    going = make_run(tmp_path)
+    go(going, 150)
+    saved = going.path(run.CHECKPOINT).read_bytes()
+
+    def full(self, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    events = []
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        train.work(make_run(tmp_path), events.append, lambda: False)
+    assert events[-1][0] == "end" and "No space left on device" in events[-1][2]
+    assert going.path(run.CHECKPOINT).read_bytes() == saved
+    assert go(make_run(tmp_path))
+
+
+# --- the command ---
+
+
+def test_seeds_side_by_side(command, config, tmp_path):
+    """Two seeds train, a third one cannot."""
+    folder = tmp_path / ENV / "ppo"
+    folder.mkdir(parents=True)
+    (folder / "seed2").write_text("in the way")
+    arguments = (ENV, "--config", str(config))
+    status, output = command(*arguments, "--seeds", "3")
+    assert status == 1 and "seed 2 failed: " in output and "To go on:" in output
+    assert "seed 0: finished, return" in output and "seed 1: finished, return" in output
+    results = [json.loads((folder / f"seed{k}" / run.RESULT).read_text()) for k in range(2)]
+    assert results[0]["evaluation"]["returns"] != results[1]["evaluation"]["returns"]
+    assert list(folder.glob("seed1/tensorboard/*/events*"))
+    # Finished seeds are left as they are.
+    before = (folder / "seed0" / run.MODEL).stat().st_mtime_ns
+    status, output = command(*arguments, "--seeds", "2")
+    assert status == 0 and output.count("finished before") == 2
+    assert (folder / "seed0" / run.MODEL).stat().st_mtime_ns == before
+    (folder / "seed1" / run.RESULT).write_text("{")
+    status, output = command(*arguments, "--seeds", "2")
+    assert status == 2 and "result.json cannot be read" in output
+
+
+def test_killed_and_interrupted_runs_go_on(config, tmp_path):
+    arguments = [
+        sys.executable, "-m", "agents.train", ENV, "--steps", "30000", "--config", str(config), "--jobs", "1",
+        "--output", str(tmp_path),
+    ]  # fmt: skip
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))
+    }
+
+    def start():
+        return subprocess.Popen(
+            arguments, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    for number in (signal.SIGKILL, signal.SIGINT):
+        process = start()
+        for line in process.stdout:
+            if " steps, " in line and ":         0 steps" not in line:
+                break
+        process.send_signal(number)
+        output = process.communicate(timeout=60)[0]
+    assert process.returncode == 130, output
+    assert "To go on:" in output and "agents.train InclineTilt-v0" in output
+    content = Run(tmp_path / ENV / "ppo" / "seed0", ENV, "ppo", 0, 30000, hyperparameters("ppo", ENV, config))
+    assert content.load_checkpoint() is not None and content.trained >= 3700 and len(content.curve) >= 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["InclineTlt-v0"], "did you mean InclineTilt-v0"),
+        ([ENV, "--algo", "sacc"], "did you mean sac"),
+        ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
+        ([ENV, "--steps", "-5"], "--steps must lie between 1"),
+        ([ENV, "--config", "nowhere.yml"], "nowhere.yml cannot be read"),
+    ],
+)
+def test_mistakes_are_named(arguments, message, command):
+    status, output = command(*arguments)
+    assert status == 2 and message in output and output.startswith("agents.train: error:")
+
+
+def test_help_is_quick():
+    started = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "agents.train", "--help"], cwd=ROOT, capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
+    )  # fmt: skip
+    assert done.returncode == 0 and "result.json" in done.stdout and "--ray" in done.stdout
+    assert time.perf_counter() - started < 20.0
+
+
+# --- the libraries around ---
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install 'lag-envs[ray]'")
+def test_on_a_local_ray_cluster(command, config, tmp_path):
+    arguments = (ENV, "--seeds", "2", "--config", str(config))
+    status, output = command(*arguments, "--ray", "local")
+    assert status == 0, output
+    here = [tmp_path / ENV / "ppo" / f"seed{k}" for k in range(2)]
+    returns = [json.loads((f / run.RESULT).read_text())["evaluation"]["returns"] for f in here]
+    assert load_policy(here[1]).predict(np.zeros(4, np.float32))[0].shape == (1,)
+    # The same numbers as without Ray.
+    status, _ = command(*arguments, "--new")
+    assert status == 0
+    assert [json.loads((f / run.RESULT).read_text())["evaluation"]["returns"] for f in here] == returns
+
+
+def test_ray_that_is_not_there(command, config):
+    status, output = command(ENV, "--config", str(config), "--ray", "127.0.0.1:1")
+    assert status == 2 and ("pip install" in output or "no Ray cluster at" in output)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="the RL Zoo is not installed: pip install rl_zoo3")
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_the_zoo_takes_the_hyperparameters(algo, tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable, "-m", "rl_zoo3.train", "--algo", algo, "--env", ENV, "--gym-packages", "lag_envs",
+            "--conf-file", str(HYPERPARAMS / f"{algo}.yml"), "-n", "200", "--eval-freq", "-1",
+            "-f", str(tmp_path), "-P",
+        ],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert list(tmp_path.glob(f"{algo}/{ENV}_1/{ENV}.zip"))
