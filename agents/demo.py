@@ -111,7 +111,7 @@ def open_run(args: argparse.Namespace) -> Run:
 
 def report(run: Run, video: bool) -> None:
     """Compare the policy with other agents; write results, picture and video, print a table."""
-    from agents.controllers import CONTROLLERS
+    from lag_envs.controllers import CONTROLLERS
 
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())

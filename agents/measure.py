@@ -105,7 +105,7 @@ def gather(env_id: str, runs: Path) -> Field:
 
 def classical(env_id: str) -> dict[str, Callable[[Task], Any]]:
     """Return what makes an environment's classical controllers from its task, by name."""
-    from agents.controllers import CONTROLLERS
+    from lag_envs.controllers import CONTROLLERS
 
     return dict(CONTROLLERS[env_id])
 

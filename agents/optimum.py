@@ -527,7 +527,7 @@ def known_answers(env_id: str, agent: Optimal) -> dict[str, Any]:
         states = trajectory(env_id, agent)
         return {"seconds_to_upright": round(seconds_to_upright(states, agent.solution.task.dt), 3)}
     if env_id == "CylinderInCylinderDamping-v0":
-        from agents.controllers import Constant
+        from lag_envs.controllers import Constant
 
         full = evaluate_batch(env_id, Constant(1.0), FIRST_FRESH_SEED, EPISODES)
         return {"full_damping": mean_and_interval(full)}

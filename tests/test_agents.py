@@ -13,9 +13,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from agents import demo
-from agents.controllers import Constant, EnergyShapingLQR, Random, do_nothing, linearised
 from agents.evaluate import evaluate, evaluate_batch
 from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
+from lag_envs.controllers import Constant, EnergyShapingLQR, Random, do_nothing, linearised
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
 

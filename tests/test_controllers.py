@@ -4,11 +4,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents.controllers import CONTROLLERS, ILQR, PD, Constant, TiltLQR, make_controller, tune
-from agents.controllers.basic import Reader
-from agents.controllers.linear import discretise, equations, linearise
-from agents.controllers.pivoted_bar import EnergyShapingLQR
+from agents import tune
 from agents.evaluate import evaluate_batch
+from lag_envs.controllers import CONTROLLERS, ILQR, PD, Constant, TiltLQR, make_controller
+from lag_envs.controllers.basic import Reader
+from lag_envs.controllers.linear import discretise, equations, linearise
+from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.tasks import TASKS, load_task
 

@@ -23,9 +23,9 @@ from agents.analysis import (
     summarise_env,
     summarise_learners,
 )
-from agents.controllers import Constant, do_nothing
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
+from lag_envs.controllers import Constant, do_nothing
 from lag_envs.tasks import TASKS, load_task
 
 ROOT = Path(__file__).parents[1]

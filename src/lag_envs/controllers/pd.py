@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import sympy
 
-from agents.controllers.basic import Array, Law
-from agents.controllers.linear import equations
+from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.linear import equations
 from lag_envs.tasks.cylinder_in_cylinder import Tilt as ShellTilt
 from lag_envs.tasks.incline import Tilt as InclineTilt
 

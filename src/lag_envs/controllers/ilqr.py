@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controllers.basic import Array, Reader, as_actions
+from lag_envs.controllers.basic import Array, Reader, as_actions
 from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import sympy
 
-from agents.controllers.basic import Array, Law
-from agents.controllers.ilqr import ILQR, Opening
-from agents.controllers.linear import equations, linearise, regulator
+from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.ilqr import ILQR, Opening
+from lag_envs.controllers.linear import equations, linearise, regulator
 from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.controllers.basic import Array, Law
-from agents.controllers.linear import regulator
+from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.linear import regulator
 from lag_envs.envs.model import Model
 from lag_envs.tasks.incline import Brake, Tilt
 

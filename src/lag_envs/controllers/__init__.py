@@ -15,12 +15,12 @@ import difflib
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from agents.controllers.basic import Constant, Random, do_nothing
-from agents.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR, plan_pumping
-from agents.controllers.ilqr import ILQR
-from agents.controllers.incline import SwitchingLine, TiltCascade
-from agents.controllers.pd import PD
-from agents.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, linearised, lqr, plan_swing_up
+from lag_envs.controllers.basic import Constant, Random, do_nothing
+from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR, plan_pumping
+from lag_envs.controllers.ilqr import ILQR
+from lag_envs.controllers.incline import SwitchingLine, TiltCascade
+from lag_envs.controllers.pd import PD
+from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, linearised, lqr, plan_swing_up
 from lag_envs.tasks import TASKS, load_task
 
 __all__ = [
@@ -52,7 +52,7 @@ _SWING_UP: dict[str, Callable[[Any], Any]] = {
 }
 
 #: How each controller of each environment is made from the task. The best constant brakes were found by
-#: ``python -m agents.controllers.tune``.
+#: ``python -m agents.tune``.
 CONTROLLERS: dict[str, dict[str, Callable[[Any], Any]]] = {
     "PivotedBar-v0": _SWING_UP,
     "PivotedBarFree-v0": _SWING_UP,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.controllers.basic import Array, Law, Reader, as_actions, to_action
-from agents.controllers.ilqr import ILQR, Opening
-from agents.controllers.linear import linearise, regulator
+from lag_envs.controllers.basic import Array, Law, Reader, as_actions, to_action
+from lag_envs.controllers.ilqr import ILQR, Opening
+from lag_envs.controllers.linear import linearise, regulator
 from lag_envs.scenes import PivotedBar
 from lag_envs.tasks.pivoted_bar import Balance, SwingUp
 
@@ -28,7 +28,7 @@ class EnergyShapingLQR:
     on a track, softly back to its middle. Near upright the LQR takes over, and hands back only when out of
     its depth: nearness is the LQR's own cost to go, and the two thresholds differ.
 
-    The numbers are what ``python -m agents.controllers.tune`` found, with a track and without.
+    The numbers are what ``python -m agents.tune`` found, with a track and without.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class BalanceLQR(Law):
     """Keep a bar upright by a linear-quadratic regulator.
 
     The reward alone would have the control as hard as can be; what is added has the regulator ready for
-    the next kick. The weights are what ``python -m agents.controllers.tune`` found.
+    the next kick. The weights are what ``python -m agents.tune`` found.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Find the few numbers of the controllers that are not derived, on seeds that no evaluation uses.
 
-``python -m agents.controllers.tune ENV`` prints what it found for each controller of the environment; those
+``python -m agents.tune ENV`` prints what it found for each controller of the environment; those
 that are the controllers' defaults were found in this way.
 """
 
@@ -13,13 +13,13 @@ from typing import Any
 
 from scipy.optimize import differential_evolution
 
-from agents.controllers import CONTROLLERS, check_id
-from agents.controllers.basic import Constant
-from agents.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR
-from agents.controllers.incline import SwitchingLine, TiltCascade
-from agents.controllers.pd import PD
-from agents.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR
 from agents.evaluate import evaluate_batch
+from lag_envs.controllers import CONTROLLERS, check_id
+from lag_envs.controllers.basic import Constant
+from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR
+from lag_envs.controllers.incline import SwitchingLine, TiltCascade
+from lag_envs.controllers.pd import PD
+from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR
 from lag_envs.tasks import TASKS, load_task
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
@@ -37,7 +37,6 @@ TUNABLE: dict[str, dict[str, tuple[Callable[..., Any], dict[str, tuple[float, fl
                 "catch": (0.5, 6.0),
                 "lose": (6.0, 60.0),
                 "pump": (0.3, 6.0),
-                "surplus": (0.0, 0.5),
                 "centring": (0.5, 10.0),
             },
         )
@@ -89,7 +88,7 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for an environment that does not exist."""
-    p = argparse.ArgumentParser(prog="python -m agents.controllers.tune", description=__doc__)
+    p = argparse.ArgumentParser(prog="python -m agents.tune", description=__doc__)
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
     p.add_argument("--episodes", type=int, default=2000, help="episodes per trial (default %(default)s)")
