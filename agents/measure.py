@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from agents.analysis import NOMINAL, OFTEN, Data, rounded
 from agents.evaluate import Sensor, evaluate_batch
 from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
-from lag_envs import TASKS, __version__
+from lag_envs import TASKS, __version__, controllers
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
 AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
+CONTROLLERS = Path(controllers.__file__).parent
 #: Agents that act by a clock; unless they have a `pace`, they cannot act more often.
 COUNTS_STEPS = ("Optimal", "ILQR")
 
@@ -81,7 +82,7 @@ def gather(env_id: str, runs: Path) -> Field:
     place, fixed = TASKS[env_id]
     task = load_task(place)(**fixed)
     for name, make in classical(env_id).items():
-        found.entrants.append(Entrant(env_id, name, "classical", partial(make, task), digest("controllers")))
+        found.entrants.append(Entrant(env_id, name, "classical", partial(make, task), digest(CONTROLLERS)))
     if reason := no_optimum(env_id):
         found.absent.append(f"optimal: {reason}")
     else:
@@ -105,9 +106,7 @@ def gather(env_id: str, runs: Path) -> Field:
 
 def classical(env_id: str) -> dict[str, Callable[[Task], Any]]:
     """Return what makes an environment's classical controllers from its task, by name."""
-    from lag_envs.controllers import CONTROLLERS
-
-    return dict(CONTROLLERS[env_id])
+    return dict(controllers.CONTROLLERS[env_id])
 
 
 def no_optimum(env_id: str) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
+from lag_envs.scores import KNOWN_RETURNS
 
 IMAGES = "images"
 NOTES = Path(__file__).with_name("notes.toml")
@@ -252,6 +253,29 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     parts += ["## How it was measured", _method(data), "### Noise", _noise_table(envs)]
     parts += ["### Machine and versions", _about(data)]
     return "\n\n".join(parts) + "\n"
+
+
+def summary(data: Data) -> str:
+    """Return README's table: the best agent of each kind, by environment, with the range that scores have."""
+    rows = []
+    for env_id, env in data["envs"].items():
+        best: dict[str, str] = {}
+        for name, agent in env["agents"].items():  # the best first
+            best.setdefault(agent["kind"], f"{name}: {with_interval(agent['conditions'][NOMINAL])}")
+        random, known = env["known"] or (math.nan, math.nan)
+        estimate = KNOWN_RETURNS[env_id].estimate if env_id in KNOWN_RETURNS else math.nan
+        rows.append(
+            [
+                f"`{env_id}`",
+                number(random),
+                number(known),
+                number(estimate),
+                *(best.get(kind, "") for kind in ("classical", "learned", "optimal")),
+            ]
+        )
+    head = ["environment", "random", "best known", "optimum, estimated"]
+    head += [f"best {kind} agent: score" for kind in ("classical", "learned")] + ["optimal policy: score"]
+    return table(head, rows)
 
 
 def load_notes() -> dict[str, str]:

@@ -43,6 +43,7 @@ EPILOG = f"""what it reads and writes:
   RUNS/measurements/ENV.jsonl  what has been measured; it is not measured again
   OUTPUT/{SUMMARY}   all numbers
   OUTPUT/{PAGE}        the page, with figures in OUTPUT/{PICTURES}
+  OUTPUT/README.md            the table in it, where there is one
 
 It may be broken off at any time; the same command goes on. Agents that are not there now (other machines'
 runs, say) keep the numbers that the summary has of them. Commands for different --envs may run side by side.
@@ -276,13 +277,17 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 
 
 def show(data: Data, output: Path) -> int:
-    """Write figures and page."""
-    from agents.report import figures, page
+    """Write figures, page, and README's table."""
+    from agents.report import figures, page, summary
+    from lag_envs.report.docs import replaced
 
     files = figures(data, output / PICTURES)
     for old in set((output / PICTURES).glob("agents-*.png")) - set(files):
         old.unlink()
     write(output / PAGE, page(data))
+    readme = output / "README.md"
+    if readme.exists():
+        write(readme, replaced(readme.read_text(encoding="utf-8"), "agents", summary(data)))
     print(f"Written: {output / PAGE} and {len(files)} figures")
     return 0
 

@@ -13,89 +13,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from agents import demo
-from agents.evaluate import evaluate, evaluate_batch
 from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
-from lag_envs.controllers import Constant, EnergyShapingLQR, Random, do_nothing, linearised
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
 ENV = "PivotedBar-v0"
-
-
-@pytest.fixture(scope="module")
-def controller():
-    with gym.make(ENV) as env:
-        return EnergyShapingLQR(env.unwrapped.task)
-
-
-# --- controllers ---
-
-
-def test_controller_swings_up_and_holds(controller):
-    returns = evaluate_batch(ENV, controller, 1_000_000_000, 100)
-    assert returns[:20].mean() > 417.0  # what it is known to reach
-    assert returns.min() > 410.0  # none needs one swing more, or falls
-    assert score(ENV, returns.mean()) > 0.99
-
-
-def test_controller_acts_on_one_observation_as_on_a_batch(controller):
-    with gym.make(ENV) as env:
-        one = evaluate(env, controller, range(5, 8))
-    np.testing.assert_allclose(one, evaluate_batch(ENV, controller, 5, 3), rtol=1e-12)
-
-
-def test_controller_hands_over_with_hysteresis(controller):
-    def observation(e):
-        return np.array([0.0, 0.0, -np.cos(e), -np.sin(e), 0.0])
-
-    def holds(e, before):
-        return bool(controller.predict(observation(e), np.array(before))[1])
-
-    between = np.sqrt(0.5 * (controller.catch + controller.lose) / controller.cost[2, 2])
-    assert holds(0.1, False) and holds(0.1, True)
-    assert not holds(between, False) and holds(between, True)
-    assert not holds(np.pi, True)
-    # An episode's start wipes out what was before.
-    assert not controller.predict(observation(between), np.array(True), np.array([True]))[1]
-
-
-def test_controller_gets_a_bar_at_rest_going(controller):
-    action, _ = controller.predict(np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
-    assert abs(action.item()) == 1.0
-
-
-def test_controller_asks_for_a_track():
-    with gym.make("PivotedBarFree-v0") as env, pytest.raises(ValueError, match="track=None"):
-        EnergyShapingLQR(env.unwrapped.task)
-
-
-def test_linearisation_follows_the_motion(controller):
-    scene, dt = controller.scene, 1e-3
-    a, b = linearised(scene)
-    x, u = 1e-6 * np.array([1.0, -2.0, 3.0, -1.0]), 2e-6
-    state = x + np.array([0.0, 0.0, np.pi, 0.0])
-    forth, back = (scene.simulate(state, [u], h)[1] for h in (dt, 0.5 * dt))
-    slope = (4.0 * (back - state) - (forth - state)) / dt  # of second order, forward
-    np.testing.assert_allclose(slope, a @ x + b * u, rtol=1e-3, atol=1e-11)
-
-
-def test_doing_nothing_is_zero_control():
-    for id in TASKS:
-        with gym.make(id) as env:
-            env.reset(seed=1)
-            action, _ = do_nothing(env).predict(env.observation_space.sample())
-            assert action.shape == env.action_space.shape
-            env.step(action)
-            assert env.unwrapped.control == 0.0, id
-
-
-def test_agents_without_knowledge():
-    assert Constant(0.5).predict(np.zeros((3, 5)))[0].tolist() == [[0.5]] * 3
-    first, second = (Random(1).predict(np.zeros((3, 5)))[0] for _ in range(2))
-    assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
-    assert evaluate_batch(ENV, Constant(0.0), 0, 20).mean() == pytest.approx(0.0, abs=0.1)
-    assert evaluate_batch(ENV, Random(0), 0, 100).mean() == pytest.approx(KNOWN_RETURNS[ENV].random, abs=3.0)
 
 
 def test_score():

@@ -1,16 +1,27 @@
 import math
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from agents import tune
-from agents.evaluate import evaluate_batch
-from lag_envs.controllers import CONTROLLERS, ILQR, PD, Constant, TiltLQR, make_controller
+from agents.evaluate import evaluate, evaluate_batch
+from lag_envs.controllers import (
+    CONTROLLERS,
+    ILQR,
+    PD,
+    Constant,
+    Random,
+    TiltLQR,
+    do_nothing,
+    make_controller,
+)  # fmt: skip
 from lag_envs.controllers.basic import Reader
 from lag_envs.controllers.linear import discretise, equations, linearise
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
+from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS, load_task
 
 SEED = 1_000_000_000
@@ -232,6 +243,9 @@ def test_what_cannot_work_is_refused():
 
 def test_tuning(capsys, monkeypatch):
     assert tune.TUNABLE.keys() == CONTROLLERS.keys()
+    for env_id, tunable in tune.TUNABLE.items():
+        for maker, ranges in tunable.values():
+            maker(make_task(env_id), **{name: 0.5 * (low + high) for name, (low, high) in ranges.items()})
     used = []
 
     def evaluated(env_id, agent, seed, episodes):
@@ -244,3 +258,63 @@ def test_tuning(capsys, monkeypatch):
     assert {(r.start, len(r)) for r in used} == {(3_000_000_000, 5)}
     assert tune.main(["InclineBrak-v0"]) == 2
     assert "did you mean InclineBrake-v0" in capsys.readouterr().err
+
+
+# --- the swing-up, and agents that know nothing ---
+
+
+@pytest.fixture(scope="module")
+def controller():
+    with gym.make(BAR) as env:
+        return EnergyShapingLQR(env.unwrapped.task)
+
+
+def test_controller_swings_up_and_holds(controller):
+    returns = evaluate_batch(BAR, controller, 1_000_000_000, 100)
+    assert returns[:20].mean() > 417.0  # what it is known to reach
+    assert returns.min() > 410.0  # none needs one swing more, or falls
+    assert score(BAR, returns.mean()) > 0.99
+
+
+def test_controller_acts_on_one_observation_as_on_a_batch(controller):
+    with gym.make(BAR) as env:
+        one = evaluate(env, controller, range(5, 8))
+    np.testing.assert_allclose(one, evaluate_batch(BAR, controller, 5, 3), rtol=1e-12)
+
+
+def test_controller_hands_over_with_hysteresis(controller):
+    def observation(e):
+        return np.array([0.0, 0.0, -np.cos(e), -np.sin(e), 0.0])
+
+    def holds(e, before):
+        return bool(controller.predict(observation(e), np.array(before))[1])
+
+    between = np.sqrt(0.5 * (controller.catch + controller.lose) / controller.cost[2, 2])
+    assert holds(0.1, False) and holds(0.1, True)
+    assert not holds(between, False) and holds(between, True)
+    assert not holds(np.pi, True)
+    # An episode's start wipes out what was before.
+    assert not controller.predict(observation(between), np.array(True), np.array([True]))[1]
+
+
+def test_controller_gets_a_bar_at_rest_going(controller):
+    action, _ = controller.predict(np.array([0.0, 0.0, 1.0, 0.0, 0.0]))
+    assert abs(action.item()) == 1.0
+
+
+def test_doing_nothing_is_zero_control():
+    for id in TASKS:
+        with gym.make(id) as env:
+            env.reset(seed=1)
+            action, _ = do_nothing(env).predict(env.observation_space.sample())
+            assert action.shape == env.action_space.shape
+            env.step(action)
+            assert env.unwrapped.control == 0.0, id
+
+
+def test_agents_without_knowledge():
+    assert Constant(0.5).predict(np.zeros((3, 5)))[0].tolist() == [[0.5]] * 3
+    first, second = (Random(1).predict(np.zeros((3, 5)))[0] for _ in range(2))
+    assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
+    assert evaluate_batch(BAR, Constant(0.0), 0, 20).mean() == pytest.approx(0.0, abs=0.1)
+    assert evaluate_batch(BAR, Random(0), 0, 100).mean() == pytest.approx(KNOWN_RETURNS[BAR].random, abs=3.0)

@@ -20,7 +20,7 @@ from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, T
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.incline import SwitchingLine, TiltCascade
 from lag_envs.controllers.pd import PD
-from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, linearised, lqr, plan_swing_up
+from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, lqr, plan_swing_up
 from lag_envs.tasks import TASKS, load_task
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "TiltCascade",
     "TiltLQR",
     "do_nothing",
-    "linearised",
     "lqr",
     "make_controller",
     "plan_pumping",

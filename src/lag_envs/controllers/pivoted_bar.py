@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, Law, Reader, as_actions, to_action
 from lag_envs.controllers.ilqr import ILQR, Opening
-from lag_envs.controllers.linear import linearise, regulator
-from lag_envs.scenes import PivotedBar
+from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.pivoted_bar import Balance, SwingUp
 
 #: What upright is, behind the support's place and speed, if those are states.
@@ -155,12 +154,6 @@ def from_upright(x: Array) -> Array:
     off = x.copy()
     off[..., -2] = np.remainder(off[..., -2], 2.0 * math.pi) - math.pi
     return off
-
-
-def linearised(scene: PivotedBar) -> tuple[Array, Array]:
-    """Return A and B of x' = A x + B s'' near upright, for x = (s, s', θ - π, θ') or (θ - π, θ')."""
-    a, b = linearise(scene, UPRIGHT[-len(scene.state_names) :])
-    return a, b[:, 0]
 
 
 def lqr(task: SwingUp) -> tuple[Array, Array]:
