@@ -27,6 +27,7 @@ demo: setup  ## train and evaluate an agent on PivotedBar-v0
 baselines: setup  ## compute, train and measure all agents (hours; may be broken off), write docs/agents.md
 	$(BIN)/python -m agents.optimum
 	$(BIN)/python -m agents.train all --seeds 5
+	$(BIN)/python -m agents.train all --algo sac td3 tqc dqn --seeds 1
 	$(BIN)/python -m agents.results $(ARGS)
 
 test: setup  ## run the tests and doctests, all but the slow ones

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import datetime
-import json
 import os
 import sys
 import tempfile
@@ -16,6 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from agents.analysis import rounded
+from agents.results import to_json
+from agents.run import write
 from lag_envs.benchmark import (
     ONE_THREAD,
     Contestant,
@@ -62,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("\n".join(table(rows)))
     if args.output:
         about = {"date": datetime.date.today().isoformat(), "machine": machine(), "rounds": args.rounds}
-        args.output.write_text(json.dumps(about | {"env": ENV, "rows": rows}, indent=1) + "\n")
+        write(args.output, to_json(about | {"env": ENV, "rows": rounded(rows)}))
     return 0 if complete and not any(row["problem"] for row in rows) else 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -12,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
+from lag_envs.benchmark import quartiles, short
 from lag_envs.scores import KNOWN_RETURNS
 
 IMAGES = "images"
 NOTES = Path(__file__).with_name("notes.toml")
+ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 
 # --- figures -----------------------------------------------------------------------------------------------
 
@@ -250,6 +253,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         )
         parts.append(_image("agents-improvement.png", "Probability of improvement"))
         parts.append(_improvement_table(envs))
+    parts += ["## The adapter", adapter()] if ADAPTER.exists() else []
     parts += ["## How it was measured", _method(data), "### Noise", _noise_table(envs)]
     parts += ["### Machine and versions", _about(data)]
     return "\n\n".join(parts) + "\n"
@@ -435,6 +439,21 @@ def _about(data: Data) -> str:
         f" {machine['python']}; {data['date']}. {versions}."
     )
     return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
+
+
+def adapter() -> str:
+    """Tell what `python -m agents.bench` measured of our `VecEnv`."""
+    found = json.loads(ADAPTER.read_text(encoding="utf-8"))
+    rows = []
+    for row in found["rows"]:
+        ours, theirs = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
+        rows.append([row["kind"], str(row["num_envs"]), ours, theirs, f"{row['ratio'][1]:.1f}"])
+    text = (
+        f"`make_sb3_vec_env` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
+        f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
+        f" {found['rounds']} interleaved rounds (`python -m agents.bench`). A learner spends its time learning."
+    )
+    return text + "\n\n" + table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
 
 
 def _ends(interval: Sequence[float] | None) -> Data:

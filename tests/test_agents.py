@@ -12,7 +12,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import demo
+from agents import bench, demo, report
 from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
@@ -199,3 +199,16 @@ def test_demo_help_is_quick():
     )  # fmt: skip
     assert done.returncode == 0 and "--new" in done.stdout and "model.zip" in done.stdout
     assert time.perf_counter() - started < 20.0
+
+
+# --- the adapter's speed ---
+
+
+def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(bench, "SIZES", (2,))
+    monkeypatch.setattr(bench, "TRAINED", 16)
+    monkeypatch.setattr(report, "ADAPTER", tmp_path / "adapter.json")
+    assert bench.main(["--rounds", "1", "--output", str(report.ADAPTER)]) == 0
+    assert "DummyVecEnv" in capsys.readouterr().out
+    assert "| step | 2 | " in report.adapter() and "| PPO | 16 | " in report.adapter()
+    assert bench.main(["--rounds", "0"]) == 2
