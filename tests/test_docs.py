@@ -16,6 +16,7 @@ from rollouts import IDS, actions, make
 
 from lag_envs.report.docs import generated
 from lag_envs.report.report import SECTIONS
+from lag_envs.scores import KNOWN_RETURNS
 from lag_envs.tasks import TASKS, load_task
 
 ROOT = Path(__file__).parents[1]
@@ -283,15 +284,10 @@ def test_readme_names_every_id():
 
 @each_id
 def test_readme_row(env_id):
-    """README's table repeats what the page says, where it gives a number."""
+    """README's table repeats what page and scale of scores say."""
     env, row = make(env_id), environments()[env_id]
-    returns = {r["Id"]: r for r in table(page(env)["Optimal Value"])}[env_id]
-    random, *_, best = (value.split(" ± ")[0] for value in list(returns.values())[1:])
-    assert agrees(row["random"], float(random))
-    if row["optimum"].startswith("≥"):
-        assert agrees(row["optimum"].removeprefix("≥ "), float(best))
-    else:
-        assert row["optimum"] in plain(page(env)["Optimal Value"])
+    known = KNOWN_RETURNS[env_id]
+    assert agrees(row["optimum"].removeprefix("≥ "), known.best) and agrees(row["random"], known.random)
     stated = re.search(r"is at most ([\d.]+) rad/s", plain(page(env)["Numerical Accuracy"]))
     assert row["certified"] == (stated[1] if stated else "exact")
     (control,) = table(page(env)["Action Space"])

@@ -117,8 +117,9 @@ class SwingUp(Task):
 
     ## Optimal Value
 
-    418 to 421 with a track and 421 without (finite-horizon value iteration on a grid: estimates, not
-    proofs; upright after about 2 s). Over 4,096 episodes:
+    At least 419.0 with a track and 422.5 without: a plan by iLQR on the exact model gets that, upright after
+    1.9 s. At most about 423 (finite-horizon value iteration without the track, extrapolated to a grid without
+    width: an estimate, not a proof). Over 4,096 episodes (mean ± standard error):
 
     | Id | Random actions | Zero control |
     | -- | -------------- | ------------ |
@@ -313,8 +314,10 @@ class Balance(SwingUp):
 
     ## Optimal Value
 
-    Not known; at most 500. Over 4,096 episodes (mean ± standard error), the last column being the feedback
-    action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
+    At least 452 (a linear-quadratic regulator gets it) and at most 498: that is finite-horizon value
+    iteration without ends of the track, which is far easier. The range is too wide to tell how good a policy
+    is in percent of the optimum. Over 4,096 episodes (mean ± standard error), the last column being the
+    feedback action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
 
     | Id | Random actions | Zero control | Linear feedback |
     | -- | -------------- | ------------ | --------------- |
