@@ -1,0 +1,73 @@
+"""Coarse value functions for the leaderboard's page: ``python -m agents.board_values [ID ...]``.
+
+Writes ``leaderboard/values/ID.json``: the largest return still to be had at the start of an episode, over two
+entries of the state; others are 0, and so is the target. Coarse grids are enough for a picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.optimum import DEFAULT_FOLDER, PROBLEMS, RELAXATIONS, Solution
+from agents.run import check_env, write
+from lag_envs import TASKS
+
+POINTS = 61  #: along each axis
+
+
+def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
+    """Return an environment's value function as the page takes it.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment.
+    folder : Path, optional
+        Where value functions are kept; None keeps them in memory.
+
+    Returns
+    -------
+    dict
+        ``axes``: two dicts with the state's name as ``label``, and ``low``, ``high``, ``n``; ``values``: n rows
+        of n numbers, by the first axis. Where most is lost the value is the same everywhere, so that the other
+        places can be told apart.
+    """
+    problem = PROBLEMS[RELAXATIONS.get(env_id, (env_id, ()))[0]]
+    solution = Solution(problem, problem.levels[0], folder, quiet=True)
+    names = solution.task.scene.state_names
+    axes = [
+        {"label": names[solution.keep[i]], "low": axis.low, "high": axis.high, "n": POINTS}
+        for i, axis in enumerate(problem.axes[:2])
+    ]
+    mesh = np.meshgrid(*(np.linspace(a["low"], a["high"], POINTS) for a in axes), indexing="ij")
+    points = np.zeros((POINTS * POINTS, len(problem.axes)))
+    points[:, 0], points[:, 1] = (m.ravel() for m in mesh)
+    targets = np.zeros(len(points)) if problem.targets else None
+    values = solution.value(0, points, targets)
+    values = np.maximum(values, np.quantile(values, problem.lost)).reshape(POINTS, POINTS)
+    rounded = [[float(f"{x:.4g}") for x in row] for row in values]
+    return {"axes": axes, "values": rounded}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the files."""
+    parser = argparse.ArgumentParser(prog="python -m agents.board_values", description=__doc__)
+    parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
+    parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
+    args = parser.parse_args(arguments)
+    for env_id in [check_env(name) for name in args.env] or TASKS:
+        path = args.board / "values" / f"{env_id}.json"
+        write(path, json.dumps(coarse(env_id), separators=(",", ":")) + "\n")
+        print(path, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
