@@ -385,7 +385,8 @@ def _method(data: Data) -> str:
             " all agents. Agents act deterministically.",
             *_fewer(data),
             "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their seconds;"
-            " running rewards and the chance of a kick are scaled with `dt`.",
+            " running rewards and the chance of a kick are scaled with `dt`. Kicks, where there are any, are"
+            " others then, and an agent does not have the same luck.",
             "- *Parameters*: each of the scene's 20 % lower and higher, the others as they are; a moment of"
             " inertia that is not given follows mass and size. The agents stay those of the environment as it"
             " is, and so does the range of scores: part of a loss, or gain, is the changed task's.",
