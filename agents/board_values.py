@@ -35,9 +35,9 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``axes``: two dicts with the state's name as ``label``, and ``low``, ``high``, ``n``; ``values``: n rows
-        of n numbers, by the first axis. Where most is lost the value is the same everywhere, so that the other
-        places can be told apart.
+        ``axes``: two dicts with the state's name as ``label``, and ``low``, ``high``, ``n``; ``values``: n
+        rows of n numbers, by the first axis. Where most is lost the value is the same everywhere, so that
+        the other places can be told apart.
     """
     problem = PROBLEMS[RELAXATIONS.get(env_id, (env_id, ()))[0]]
     solution = Solution(problem, problem.levels[0], folder, quiet=True)

@@ -452,7 +452,7 @@ def adapter() -> str:
     text = (
         f"`make_sb3_vec_env` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
-        f" {found['rounds']} interleaved rounds (`python -m agents.bench`). A learner spends its time learning."
+        f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
     )
     return text + "\n\n" + table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
 

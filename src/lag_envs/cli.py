@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from datetime import date
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -313,6 +314,30 @@ def run_report(args: argparse.Namespace) -> int:
         raise UserError(str(error)) from error
 
 
+# --- leaderboard, verify, export ---
+
+
+def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
+    """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
+
+    def call(given: Any) -> Any:
+        for package in ("jinja2", "safetensors", "scipy", "tqdm"):
+            if find_spec(package) is None:
+                raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
+        from lag_envs.leaderboard.board import BoardError
+        from lag_envs.leaderboard.spread import SpreadError
+        from lag_envs.leaderboard.submission import Refused
+
+        try:
+            return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)
+        except (BoardError, Refused, SpreadError, OSError) as error:
+            if isinstance(error, BrokenPipeError):
+                raise
+            raise UserError(str(error)) from error
+
+    return call
+
+
 # --- the command ---
 
 COMMANDS: tuple[Command, ...] = (
@@ -365,6 +390,50 @@ examples:
         declare_report,
         run_report,
     ),
+    Command(
+        "export",
+        "turn a trained model into a submission",
+        """Turn models of Stable-Baselines3 into a submission to the leaderboard, which is data only, and
+prove that both act alike. Loading a model runs code, so export your own only.
+
+examples:
+  lag-envs export runs/PivotedBar-v0/ppo --author "A. Author" --license MIT    all seeds of a training here
+  lag-envs export s0.zip s1.zip s2.zip s3.zip s4.zip --env PivotedBar-v0 --env-steps 500000 --seconds 600 \\
+      --author "A. Author" --license MIT                                       models from elsewhere""",
+        _leaderboard("export", "declare_export"),
+        _leaderboard("export", "run_export"),
+    ),
+    Command(
+        "verify",
+        "recompute the scores of a submission",
+        """Check submissions to the leaderboard and recompute their scores. Nothing in them is run, and
+nothing is changed.
+
+examples:
+  lag-envs verify PivotedBar-v0-PPO                  1,000 episodes of each policy
+  lag-envs verify PivotedBar-v0-PPO --episodes 50    a first look
+  lag-envs verify leaderboard/inbox/* --jobs 8       several side by side
+  lag-envs verify leaderboard/inbox/* --ray auto     on the machines of a Ray cluster""",
+        _leaderboard("verify", "declare_verify"),
+        _leaderboard("verify", "run_verify"),
+    ),
+    Command(
+        "leaderboard",
+        "keep the leaderboard",
+        """Keep a leaderboard: take submissions in, recompute their scores, show and publish the ranking. A
+submission is verified with a nonce that was published after it was added: `add` takes it in, `nonce`
+publishes one and verifies what waits. After Ctrl-C, or a kill, `add` without a folder goes on.
+
+examples:
+  lag-envs leaderboard add my-submission             take it in; it waits for the next nonce
+  lag-envs leaderboard nonce 5f3c...                 publish a nonce, verify what waits for it
+  lag-envs leaderboard add mine/* --nonce test-1     both at once, for a board of your own
+  lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of the others
+  lag-envs leaderboard serve                         the page, at http://127.0.0.1:8000
+  lag-envs leaderboard add --help                    more about one action""",
+        _leaderboard("cli", "declare_leaderboard"),
+        _leaderboard("cli", "run_leaderboard"),
+    ),
 )
 
 EXAMPLES = """examples:
@@ -372,11 +441,12 @@ EXAMPLES = """examples:
   lag-envs info PivotedBar-v0        all about one of them
   lag-envs bench --quick             how fast they are beside others
   lag-envs report --quick            how wrong they are beside others
+  lag-envs leaderboard list          who is best at them
   lag-envs bench --help              more about one command"""
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of the whole command."""
+def parser(command_name: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of the whole command; given a subcommand, only its arguments are declared."""
     whole = argparse.ArgumentParser(
         prog="lag-envs",
         description="Mechanics as Gymnasium environments, stepped to near machine precision.",
@@ -394,18 +464,20 @@ def parser() -> argparse.ArgumentParser:
             epilog=examples and "examples:" + examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        command.declare(one)
+        if command_name in (None, command.name):
+            command.declare(one)
         one.set_defaults(run=command.run)
     return whole
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its status: 0, 2 for a mistake in the command line, 130 when broken off."""
-    args = parser().parse_args(arguments)
-    if "run" not in args:
-        parser().print_help(sys.stderr)
-        return 2
+    given = sys.argv[1:] if arguments is None else arguments
     try:
+        args = parser(next((word for word in given if not word.startswith("-")), "")).parse_args(given)
+        if "run" not in args:
+            parser("").print_help(sys.stderr)
+            return 2
         return args.run(args)
     except UserError as error:
         print(f"lag-envs: error: {error}", file=sys.stderr)
@@ -466,4 +538,5 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # As the module that others import, so that a UserError of theirs is one of ours.
+    sys.exit(import_module("lag_envs.cli").main())

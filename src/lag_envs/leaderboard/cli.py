@@ -1,0 +1,277 @@
+"""The command ``lag-envs leaderboard``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import secrets
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish
+
+
+def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``leaderboard``."""
+    actions = parser.add_subparsers(dest="action", required=True, title="actions", metavar="ACTION")
+
+    def action(name: str, help: str, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+        one = actions.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+        one.add_argument(
+            "--board",
+            metavar="FOLDER",
+            type=Path,
+            default=Path("leaderboard"),
+            help="the board's folder (default: leaderboard)",
+        )
+        one.set_defaults(act=run)
+        return one
+
+    def spread_over(one: argparse.ArgumentParser) -> None:
+        one.add_argument(
+            "--jobs",
+            metavar="N",
+            type=_positive,
+            default=os.cpu_count() or 1,
+            help="submissions verified side by side (default: one per core)",
+        )
+        one.add_argument(
+            "--ray",
+            metavar="ADDRESS",
+            help="verify on a Ray cluster: its address, auto for a running one, local for one made here",
+        )
+
+    one = action("add", "take submissions in, and verify all that is pending and has a nonce", _add)
+    one.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="a submission")
+    one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after they are added")
+    spread_over(one)
+    one = action("nonce", "publish a nonce, and verify what was added before", _nonce)
+    one.add_argument(
+        "value",
+        metavar="VALUE",
+        nargs="?",
+        help="best one that nobody can choose, such as the next output of a public beacon (default: random)",
+    )
+    spread_over(one)
+    one = action("list", "show the ranking, and the state of all others", _list)
+    one.add_argument("env", metavar="ENV", nargs="?", help="only this environment")
+    one = action("show", "show all about one submission", _show)
+    one.add_argument("id", metavar="ID", help="as `list` shows it")
+    one.add_argument("--json", action="store_true", help="as JSON, with curves, profile and replays")
+    one = action("withdraw", "take a submission off the board", _withdraw)
+    one.add_argument("id", metavar="ID", help="as `list` shows it")
+    one.add_argument("--reason", metavar="TEXT", required=True, help="shown on the page")
+    one = action("build", "write the page", _build)
+    one.add_argument(
+        "out", metavar="OUT", nargs="?", type=Path, default=Path("site"), help="folder (default: site)"
+    )
+    one = action("serve", "write the page into a temporary folder and show it to this machine", _serve)
+    one.add_argument(
+        "--port", metavar="N", type=int, default=8000, help="port; 0 for any that is free (default: 8000)"
+    )
+
+
+def run_leaderboard(args: argparse.Namespace) -> int:
+    """Do what is asked, or raise a BoardError or SpreadError."""
+    return args.act(args)
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
+    return int(text)
+
+
+# --- add, nonce ---------------------------------------------------------------------------------------------
+
+
+def _add(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.submission import Refused, load
+
+    board = Board(args.board)
+    failed, ours = 0, []
+    for folder in args.folders:
+        try:
+            entry = board.add(load(folder))
+        except (Refused, BoardError) as error:
+            failed += 1
+            print(f"{folder}: refused: {error}", file=sys.stderr)
+            continue
+        ours.append(entry.id)
+        if entry.state != "pending":
+            print(f"{entry.id}: is there already, {entry.state}")
+    if args.nonce is not None:
+        state = board.read()
+        waiting = [e for e in state.waiting() if state.nonce(e) is None]
+        # Where the same command was broken off before, the nonce is published already.
+        if any(not args.folders or e.id in ours for e in waiting):
+            board.publish(args.nonce)
+    return 1 if _finish(board, args) + failed else 0
+
+
+def _nonce(args: argparse.Namespace) -> int:
+    board = Board(args.board)
+    if not board.read().waiting():
+        raise BoardError("nothing is pending: a nonce now would be known before the next submission")
+    value = secrets.token_hex(16) if args.value is None else args.value
+    board.publish(value)
+    print(f"nonce: {value}")
+    return 1 if _finish(board, args) else 0
+
+
+def _finish(board: Board, args: argparse.Namespace) -> int:
+    """Verify what is pending, with progress on a terminal; return how many could not be."""
+
+    def tell(entry: Entry, what: str) -> None:
+        print(f"{entry.id}: {what}", flush=True)
+
+    def spread(check: Check, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
+        from tqdm import tqdm
+
+        from lag_envs.leaderboard.spread import map_submissions
+
+        jobs = min(args.jobs, len(folders))
+        if args.ray is not None or jobs > 1:
+            found = map_submissions(check, folders, jobs, args.ray)
+            yield from tqdm(found, "verifying", len(folders), disable=None, leave=False)
+            return
+
+        def one(folder: Path) -> dict[str, Any]:
+            with tqdm(desc=folder.name, unit=" steps", unit_scale=True, disable=None, leave=False) as bar:
+
+                def progress(done: int, total: int) -> None:
+                    bar.total = total
+                    bar.update(done - bar.n)
+
+                return check(folder, progress)
+
+        yield from map_submissions(one, folders)
+
+    return finish(board, spread=spread, tell=tell)
+
+
+# --- list, show, withdraw -----------------------------------------------------------------------------------
+
+
+def _list(args: argparse.Namespace) -> int:
+    board = Board(args.board)
+    state = _some(board)
+    boards = [b for b in board_data(board)["environments"] if b["rows"] or b["other"]]
+    if args.env is not None:
+        boards = [b for b in boards if b["id"] == args.env]
+        if not boards:
+            known = ", ".join(sorted({entry.env for entry in state.entries.values()}))
+            raise BoardError(f"the board has nothing of {args.env!r}; it has {known}")
+    for number, found in enumerate(boards):
+        frozen = ", frozen" if found["frozen"] else ""
+        print("\n" * (number > 0) + f"{found['id']}, protocol {found['protocol']}{frozen}")
+        lines = [("rank", "score", "95 % interval", "success", "kind", "name", "id")] if found["rows"] else []
+        for row in found["rows"]:
+            low, high = row["interval"]
+            success = "" if row["success"] is None else f"{100.0 * row['success']['rate']:.1f} %"
+            ends = f"{low:.4f} to {high:.4f}"
+            told = (row["kind"], _plain(row["name"]), row["id"])
+            lines.append((str(row["rank"]), f"{row['score']:.4f}", ends, success, *told))
+        print("\n".join("  " + line for line in _columns(lines)), end="\n" * bool(lines))
+        for other in found["other"]:
+            reason = f": {_plain(other['reason'])}" if other["reason"] else ""
+            print(f"  {other['id']} {other['state']}{reason}")
+    return 0
+
+
+def _some(board: Board) -> State:
+    """Return the board's state, or raise a BoardError where there is nothing on it."""
+    state = board.read()
+    if not state.entries:
+        raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
+    return state
+
+
+def _show(args: argparse.Namespace) -> int:
+    board = Board(args.board)
+    state = _some(board)
+    entry = state.entry(args.id)
+    told: dict[str, Any] = {
+        key: value for key, value in vars(entry).items() if value and key not in ("sha256", "reason")
+    }
+    told["state"] = f"{entry.state}: {entry.reason}" if entry.reason else entry.state
+    told["authors"] = ", ".join(entry.authors)
+    told["files"] = str(board.submission(entry.id))
+    row: dict[str, Any] = {}
+    if entry.state == "verified":
+        boards = board_data(board)["environments"]
+        found = next(b for b in boards if (b["id"], b["protocol"]) == (entry.env, entry.protocol))
+        row = next(r for r in found["rows"] if r["id"] == entry.id)
+    if args.json:
+        print(json.dumps(told | row, indent=2))
+        return 0
+    for key in ("profile", "curves", "replays", "above", "id", "name", "authors", "kind", "state", "added"):
+        row.pop(key, None)
+    if row.get("robustness"):
+        row["robustness"] = ", ".join(f"{name}: {value:.4g}" for name, value in row["robustness"].items())
+    if row.get("success"):
+        row["success"] = "{rate:.4g} ({low:.4g} to {high:.4g})".format(**row["success"])
+    if row.get("interval"):
+        row["interval"] = "{:.4g} to {:.4g}".format(*row["interval"])
+    shown = [(key.replace("_", " "), value) for key, value in (told | row).items() if value not in (None, "")]
+    print("\n".join(_columns([(key, _plain(value)) for key, value in shown])))
+    return 0
+
+
+def _withdraw(args: argparse.Namespace) -> int:
+    Board(args.board).withdraw(args.id, args.reason)
+    print(f"{args.id}: withdrawn")
+    return 0
+
+
+def _plain(value: Any) -> str:
+    """Return text that does nothing to a terminal."""
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+# --- build, serve -------------------------------------------------------------------------------------------
+
+
+def _build(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.site.build import build
+
+    build(board_data(Board(args.board)), args.out)
+    print(f"{args.out / 'index.html'}")
+    return 0
+
+
+def _serve(args: argparse.Namespace) -> int:
+    """Serve to this machine only, until Ctrl-C."""
+    from functools import partial
+    from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+
+    from lag_envs.leaderboard.site.build import build
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *args: Any) -> None:
+            pass
+
+    with tempfile.TemporaryDirectory() as folder:
+        build(board_data(Board(args.board)), Path(folder))
+        try:
+            server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
+        except (OSError, OverflowError) as error:
+            raise BoardError(
+                f"port {args.port} cannot be had ({error}); --port 0 takes a free one"
+            ) from error
+        with server:
+            print(f"http://127.0.0.1:{server.server_address[1]} (Ctrl-C ends)", flush=True)
+            server.serve_forever()
+    return 0

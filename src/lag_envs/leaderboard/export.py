@@ -1,0 +1,441 @@
+"""Turn models of Stable-Baselines3 into a submission, and prove that both act alike.
+
+A model's file runs code when it is loaded. Export your own models; nobody else's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pickle
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.fields import Fields
+from lag_envs.leaderboard.policies import architecture
+from lag_envs.leaderboard.submission import Refused, Submission, write
+
+#: Algorithms: where the class is, and the module that a model's file names for its policy.
+ALGORITHMS = {
+    "ppo": ("stable_baselines3", "PPO", "stable_baselines3.common.policies"),
+    "a2c": ("stable_baselines3", "A2C", "stable_baselines3.common.policies"),
+    "sac": ("stable_baselines3", "SAC", "stable_baselines3.sac.policies"),
+    "td3": ("stable_baselines3", "TD3", "stable_baselines3.td3.policies"),
+    "dqn": ("stable_baselines3", "DQN", "stable_baselines3.dqn.policies"),
+    "tqc": ("sb3_contrib", "TQC", "sb3_contrib.tqc.policies"),
+}
+#: Names of PyTorch's activations here.
+ACTIVATIONS = {
+    "Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "LeakyReLU": "leaky_relu", "SiLU": "silu",
+    "Sigmoid": "sigmoid",
+}  # fmt: skip
+#: Largest difference of the actions of model and export.
+DIFFERENCE = 1e-5
+MODEL, NORMALISATION, RESULT = "model.zip", "vecnormalize.pkl", "result.json"
+
+
+class ExportError(Exception):
+    """A model that cannot be exported; the text says why."""
+
+
+@dataclass
+class Source:
+    """A model's files, and what is known of its training."""
+
+    model: Path
+    normalise: Path | None = None
+    result: Mapping[str, Any] | None = None
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
+    """Return the models at paths: files, folders of a training run, or folders of such folders.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        An SB3 ``.zip``; a folder with ``model.zip``, and ``vecnormalize.pkl`` and ``result.json`` where there
+        are any; or a folder in which such folders lie.
+    normalise : sequence of Path
+        For each of the paths, if all are files, the pickled ``VecNormalize``.
+    """
+    if normalise and (len(normalise) != len(paths) or any(p.is_dir() for p in paths)):
+        raise ExportError(f"{len(normalise)} normalisations for {len(paths)} paths: one file for each file")
+    found: list[Source] = []
+    for i, path in enumerate(paths):
+        if path.is_file():
+            found.append(Source(path, normalise[i] if normalise else None))
+            continue
+        folders = [path] if (path / MODEL).exists() else sorted(f.parent for f in path.glob(f"*/{MODEL}"))
+        if not folders:
+            raise ExportError(f"{path} is no model, nor a folder with {MODEL} in it or one level below")
+        for folder in folders:
+            result, norm = folder / RESULT, folder / NORMALISATION
+            found.append(
+                Source(
+                    folder / MODEL,
+                    norm if norm.exists() else None,
+                    _json(result) if result.exists() else None,
+                )
+            )
+    return found
+
+
+def _json(file: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError("it holds no object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"{file} cannot be read: {error}") from error
+    return content
+
+
+def _algorithm(file: Path) -> str:
+    """Return the algorithm of a model's file."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            data = json.loads(archive.read("data"))
+        module = data["policy_class"]["__module__"]
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise ExportError(f"{file} is no model of Stable-Baselines3: {error}") from error
+    names = [name for name, (*_, known) in ALGORITHMS.items() if known == module]
+    if not names:
+        raise ExportError(
+            f"{file} has a policy of {module}, which is not known; --algo says what it is like: "
+            + ", ".join(ALGORITHMS)
+        )
+    return "a2c" if "a2c" in names and "n_epochs" not in data else names[0]
+
+
+def _load(source: Source, algo: str) -> tuple[Any, Any]:
+    """Return model and normalisation, or None for the latter."""
+    from importlib import import_module
+
+    module, name, _ = ALGORITHMS[algo]
+    try:
+        model = getattr(import_module(module), name).load(source.model, device="cpu")
+        normalise = None if source.normalise is None else pickle.loads(source.normalise.read_bytes())
+    except ImportError:
+        raise
+    except Exception as error:  # whatever a file that is no model leads to
+        raise ExportError(f"{source.model} cannot be read: {type(error).__name__}: {error}") from error
+    return model, normalise if normalise is not None and normalise.norm_obs else None
+
+
+# --- converting ---------------------------------------------------------------------------------------------
+
+
+def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return a model's policy as the table ``[policy]`` and its arrays.
+
+    Parameters
+    ----------
+    model : BaseAlgorithm
+        A model of Stable-Baselines3; of its distribution the mode is taken.
+    normalise : VecNormalize, optional
+        Its normalisation of observations.
+
+    Raises
+    ------
+    ExportError
+        For a policy that is not a network of fully connected layers, or of other spaces.
+    """
+    from gymnasium import spaces
+
+    policy, space = model.policy, model.action_space
+    table: dict[str, Any] = {"architecture": "mlp"}
+    discrete = isinstance(space, spaces.Discrete)
+    if not discrete and (space.shape != (1,) or (space.low, space.high) != (-1.0, 1.0)):
+        raise ExportError(f"the action space must be one number in [-1, 1], or Discrete, got {space}")
+    if hasattr(policy, "mlp_extractor"):  # PPO, A2C
+        owner, parts = policy, [policy.mlp_extractor.policy_net, policy.action_net]
+        squash = "tanh" if policy.squash_output else "clip"
+    elif hasattr(policy, "q_net"):
+        owner, parts, squash = policy.q_net, [policy.q_net.q_net], "clip"
+    else:
+        owner, squash = policy.actor, "tanh"
+        parts = [getattr(owner, "latent_pi", []), owner.mu]
+    extractor = type(owner.features_extractor if hasattr(owner, "features_extractor") else None).__name__
+    if extractor != "FlattenExtractor":
+        raise ExportError(f"observations must go to the network as they are, not through a {extractor}")
+    layers = [layer for part in parts for layer in _flat(part)]
+    if type(layers[-1]).__name__ == "Hardtanh":  # the mean's limit under SAC's and TQC's gSDE
+        last = layers.pop()
+        if last.max_val != -last.min_val:
+            raise ExportError(f"the last layer's clipping must be symmetric, got {last}")
+        table["mean_limit"] = float(last.max_val)
+    if type(layers[-1]).__name__ == "Tanh":  # TD3's
+        layers.pop()
+    linear, activations = layers[::2], layers[1::2]
+    names = {type(a).__name__ for a in activations}
+    if any(type(a).__name__ != "Linear" for a in linear) or len(linear) != len(activations) + 1:
+        raise ExportError(f"the network must be of linear layers and activations by turns, got {layers}")
+    if len(names) > 1 or not names <= set(ACTIVATIONS):
+        raise ExportError(
+            f"all activations must be one of {', '.join(ACTIVATIONS)}, got {', '.join(sorted(names))}"
+        )
+    for a in activations:
+        if getattr(a, "alpha", 1.0) != 1.0 or getattr(a, "negative_slope", 0.01) != 0.01:
+            raise ExportError(f"{a} has another parameter than PyTorch's usual one")
+    arrays = {}
+    for k, layer in enumerate(linear):
+        arrays[f"weight_{k}"] = layer.weight.detach().numpy().copy()
+        arrays[f"bias_{k}"] = np.zeros(layer.out_features, np.float32)
+        if layer.bias is not None:
+            arrays[f"bias_{k}"] = layer.bias.detach().numpy().copy()
+    table["hidden"] = [layer.out_features for layer in linear[:-1]]
+    if names:
+        table["activation"] = ACTIVATIONS[names.pop()]
+    table |= {"bins": int(space.n)} if discrete else {"squash": squash}
+    if normalise is not None:
+        table["normalise"] = {"epsilon": float(normalise.epsilon), "clip": float(normalise.clip_obs)}
+        arrays["obs_mean"] = np.array(normalise.obs_rms.mean, np.float64)
+        arrays["obs_var"] = np.array(normalise.obs_rms.var, np.float64)
+    return table, arrays
+
+
+def _flat(module: Any) -> list[Any]:
+    """Return the layers of nested sequences, without those that do nothing."""
+    parts = list(module.children()) if hasattr(module, "children") else list(module)
+    if parts:
+        return [layer for part in parts for layer in _flat(part)]
+    return [] if type(module).__name__ in ("Identity", "Flatten", "Sequential", "list") else [module]
+
+
+def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[float, int]:
+    """Return the largest difference of a model's actions and an agent's, and the number of observations.
+
+    Half of the observations are on the way: of episodes in which the model acts, and of some in which actions
+    are random. The others are random, up to twice as far out.
+
+    Where the model chooses between actions and two are worth the same to float32's rounding, either is right.
+    """
+    import gymnasium as gym
+
+    rng, seen = np.random.default_rng(0), []
+
+    def act(observation: NDArray) -> NDArray:
+        values = observation if normalise is None else normalise.normalize_obs(observation)
+        action = np.asarray(model.predict(values, deterministic=True)[0])
+        return action if agent_centres is None else agent_centres[action][:, None]
+
+    agent_centres = getattr(agent, "centres", None)
+    envs = gym.make_vec(env_id, 64, autoreset_mode="SameStep")
+    observation, _ = envs.reset(seed=0)
+    for _ in range(int(protocol.make_task(env_id).limit)):
+        seen.append(observation)
+        action = act(observation)
+        action[48:] = rng.uniform(-1.0, 1.0, (16, 1))
+        observation = envs.step(action)[0]
+    envs.close()
+    path = rng.permutation(np.concatenate(seen))[:8192]
+    far = 2.0 * np.abs(path).max(axis=0)
+    both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
+    theirs, ours = act(both)[:, 0], agent.predict(both)[0][:, 0]
+    off = np.abs(theirs.astype(np.float64) - ours)
+    if agent_centres is not None:
+        worth = agent.outputs(both.astype(np.float64))
+        chosen = np.abs(agent_centres - theirs[:, None]).argmin(axis=1)
+        lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
+        off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
+    return float(off.max()), len(both)
+
+
+# --- exporting ----------------------------------------------------------------------------------------------
+
+
+def export(
+    sources: Sequence[Source],
+    folder: Path,
+    *,
+    authors: Sequence[str],
+    license: str,
+    env: str | None = None,
+    name: str | None = None,
+    algo: str | None = None,
+    code: str = "",
+    description: str = "",
+    env_steps: int | None = None,
+    seconds: float | None = None,
+    hardware: str | None = None,
+) -> tuple[Submission, float, int]:
+    """Write models, one for each training seed, as a submission.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+        The models.
+    folder : Path
+        Where to; must not exist.
+    authors, license, name, code, description
+        See `Submission`; the name is the algorithm's where not given.
+    env, env_steps, seconds, hardware
+        Taken from the runs' ``result.json`` where not given; steps from the model, the hardware from this
+        machine where there is none. Seconds are one training's.
+    algo : str, optional
+        One of `ALGORITHMS`; found out where not given.
+
+    Returns
+    -------
+    submission : Submission
+        What was written.
+    difference : float
+        The largest difference of the actions of a model and its export, `DIFFERENCE` at most.
+    observations : int
+        For how many observations of each model they were compared.
+
+    Raises
+    ------
+    ExportError
+        For models that cannot be exported, or that do not act as their export does.
+    """
+    known = [s.result for s in sources if s.result]
+    env = env or _same("environment", [r.get("env") for r in known], "--env")
+    if env not in protocol.GOALS:
+        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.GOALS)}")
+    if os.path.lexists(folder):
+        raise ExportError(f"{folder} is there already; remove it, or choose another place")
+    if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):
+        raise ExportError("it is not known how long a training took; --seconds tells")
+    tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
+    for number, source in enumerate(sources):
+        kind = algo or _algorithm(source.model)
+        if name is None:
+            name = ALGORITHMS[kind][1]
+        model, normalise = _load(source, kind)
+        table, content = convert(model, normalise)
+        try:
+            made = architecture(env, Fields("[policy]", dict(table)))
+            shapes = {key: value.shape for key, value in content.items()}
+            if shapes != made.arrays:
+                raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
+            agent = made.agent({k: v.astype(np.float64) for k, v in content.items()})
+        except Refused as error:
+            raise ExportError(f"{source.model}: {error}") from error
+        one, count = difference(model, normalise, agent, env)
+        if not one <= DIFFERENCE:
+            raise ExportError(
+                f"{source.model}: model and export differ by {one:.1e} in an action, more than {DIFFERENCE:g}"
+            )
+        result = source.result or {}
+        seed = result.get("seed", getattr(model, "seed", None))
+        seed = number if seed is None or int(seed) in arrays else int(seed)
+        if seed in arrays:
+            raise ExportError(f"{source.model}: there is another model of seed {seed}")
+        tables.append(table)
+        arrays[seed] = content
+        off = max(off, one)
+        steps.append(int(result.get("trained", model.num_timesteps)))
+        took.append(result.get("wall_seconds", 0.0))
+        curves += _curve(seed, result.get("curve", []))
+    for table in tables:
+        if table != tables[0]:
+            raise ExportError(f"the models' networks differ: {table} and {tables[0]}")
+    training = {
+        "env_steps": max(steps) if env_steps is None else env_steps,
+        "seconds": round(float(np.mean(took)), 2) if seconds is None else seconds,
+        "hardware": hardware or (known and known[0].get("machine")) or _hardware(),
+        "curves": curves,
+    }
+    try:
+        submission = write(
+            folder, env=env, name=name or "", authors=list(authors), license=license, kind="learned",
+            policy=tables[0], arrays=arrays, training=training, code=code, description=description,
+        )  # fmt: skip
+    except (Refused, OSError) as error:
+        raise ExportError(str(error)) from error
+    return submission, off, count
+
+
+def _same(what: str, values: Sequence[Any], option: str) -> Any:
+    if not values or None in values:
+        raise ExportError(f"the {what} is not known; {option} tells")
+    if len(set(values)) > 1:
+        raise ExportError(
+            f"the models are of more than one {what}: {', '.join(map(str, sorted(set(values))))}"
+        )
+    return values[0]
+
+
+def _curve(seed: int, points: Sequence[Sequence[float]]) -> list[dict[str, Any]]:
+    """Return the learning curve from (steps, seconds, mean return), each number of steps once."""
+    last = {int(p[0]): float(p[-1]) for p in points}
+    kept = sorted(last.items())
+    kept = kept[:: -(-len(kept) // protocol.CURVE)] if kept else []
+    if not kept:
+        return []
+    return [{"seed": seed, "steps": [s for s, _ in kept], "returns": [float(f"{r:.6g}") for _, r in kept]}]
+
+
+def _hardware() -> str:
+    from lag_envs.benchmark import machine
+
+    about = machine()
+    return f"{about['processor']}, {about['cores']} cores"
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+def declare_export(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``export``."""
+    add = parser.add_argument
+    add(
+        "models", metavar="MODEL", nargs="+", type=Path,
+        help=f"an SB3 .zip; or a folder with {MODEL}, {NORMALISATION}, {RESULT}; or a folder of those",
+    )  # fmt: skip
+    add("--author", metavar="NAME", action="append", required=True, help="may be given several times")
+    add("--license", metavar="SPDX", required=True, help="licence of the policies, such as MIT or CC-BY-4.0")
+    add("--output", metavar="FOLDER", type=Path, help="default: ENV-NAME; must not exist")
+    add("--env", metavar="ID", help=f"the environment (default: what {RESULT} says)")
+    add("--name", help="as the board shows it (default: the algorithm)")
+    add(
+        "--normalise", metavar="PKL", nargs="+", type=Path, default=[],
+        help="pickled VecNormalize, one for each MODEL that is a file",
+    )  # fmt: skip
+    add("--algo", choices=list(ALGORITHMS), help="default: found out")
+    add("--code", metavar="URL", default="", help="https address of the code it was trained with")
+    add("--description", metavar="TEXT", default="", help="a line about it")
+    add("--env-steps", metavar="N", type=int, help="steps of one training (default: what is known)")
+    add("--seconds", metavar="S", type=float, help="wall time of one training (default: what is known)")
+    add("--hardware", metavar="TEXT", help="what it was trained on (default: what is known; this machine)")
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Turn models into a submission."""
+    from lag_envs.cli import UserError
+
+    try:
+        import torch
+
+        torch.set_num_threads(1)  # such networks are too small to share out
+        sources = find(args.models, args.normalise)
+        known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")
+        name = args.name or ALGORITHMS[args.algo or _algorithm(sources[0].model)][1]
+        submission, off, count = export(
+            sources, args.output or Path(f"{known}-{name}".replace(" ", "-").replace("/", "-")),
+            env=args.env, name=name, authors=args.author, license=args.license, algo=args.algo,
+            code=args.code, description=args.description, env_steps=args.env_steps, seconds=args.seconds,
+            hardware=args.hardware,
+        )  # fmt: skip
+    except ImportError as error:
+        raise UserError(f'{error.name} is missing: pip install "lag-envs[agents,leaderboard]"') from error
+    except ExportError as error:
+        raise UserError(str(error)) from error
+    print(
+        f"{submission.folder}: {submission.env}, {submission.name}, {len(submission.policies)} policies\n"
+        f"largest difference of an action from the models': {off:.1e}, over {count} observations of each\n"
+        f"digest {submission.digest}"
+    )
+    return 0

@@ -1,0 +1,50 @@
+"""Compiled loops of the policies: each row's result depends on that row alone, to the bit.
+
+A library's matrix product does not promise that, nor the same bits for another number of rows or threads.
+Sums go in order and are not fused, so that they are the same on every machine.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)
+def affine(x: Any, weight: Any, bias: Any) -> Any:
+    """Return x @ weight + bias for x (n, i), weight (i, o), bias (o,)."""
+    n, wide = len(x), weight.shape[1]
+    out = np.empty((n, wide))
+    for r in range(n):
+        for j in range(wide):
+            out[r, j] = bias[j]
+        for i in range(weight.shape[0]):
+            value = x[r, i]
+            for j in range(wide):
+                out[r, j] += value * weight[i, j]
+    return out
+
+
+@numba.njit(cache=True)
+def interpolate(values: Any, strides: Any, cells: Any, places: Any) -> Any:
+    """Return the multilinear interpolation of flat values.
+
+    Each row has its cell's first node, as numbers along the axes in cells (n, d), and the place in the cell
+    from 0 to 1 in places (n, d).
+    """
+    n, d = cells.shape
+    out = np.empty(n)
+    for r in range(n):
+        total = 0.0
+        for corner in range(1 << d):
+            weight, index = 1.0, 0
+            for j in range(d):
+                upper = (corner >> j) & 1
+                weight *= places[r, j] if upper else 1.0 - places[r, j]
+                index += (cells[r, j] + upper) * strides[j]
+            if weight != 0.0:
+                total += weight * values[index]
+        out[r] = total
+    return out

@@ -1,0 +1,177 @@
+"""What a score on the leaderboard means: episodes, seeds, success, disturbances, and limits of a submission.
+
+A change of any number here is a new protocol, and with it begins a new board.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+PROTOCOL = 1
+#: Version of ``submission.toml``.
+SCHEMA = 1
+#: Episodes of each policy, and those under each disturbance.
+EPISODES, DISTURBED_EPISODES = 1000, 100
+#: Policies that a learner submits at least, one per training seed; and that anyone submits at most.
+LEARNED_POLICIES, MOST_POLICIES = 5, 20
+#: How far mean returns may lie apart on two machines, relative to the way from random to best known.
+#: Libraries round the last digit of tanh differently, and that may grow in the course of an episode.
+TOLERANCE = 1e-3
+
+
+class Refused(Exception):
+    """A submission that is not accepted; the text says why, and is safe to print."""
+
+
+# --- limits of a submission ---------------------------------------------------------------------------------
+
+#: Bytes of ``submission.toml``, of one policy's arrays, of all together; characters of a line of the TOML.
+TOML_BYTES, POLICY_BYTES, FOLDER_BYTES, LINE = 65_536, 4_194_304, 16_777_216, 1_000
+#: Bytes of the header of a safetensors file.
+HEADER_BYTES = 16_384
+#: Hidden layers, their width, and numbers of a network.
+LAYERS, WIDTH, NUMBERS = 8, 1_024, 262_144
+#: Points of a learning curve.
+CURVE = 200
+
+
+# --- seeds --------------------------------------------------------------------------------------------------
+
+
+def first_seed(digest: str, nonce: str, policy: int) -> int:
+    """Return the reset seed of a policy's first episode; episode i has the i-th after it.
+
+    Nobody can train on them: they follow from the submission's own bytes and from a nonce that is published
+    later.
+
+    Parameters
+    ----------
+    digest : str
+        The submission's digest.
+    nonce : str
+        The nonce.
+    policy : int
+        Number of the policy in the submission, from 0.
+    """
+    text = hashlib.sha256(f"{digest}\n{nonce}\n{policy}\n".encode()).digest()
+    # Far beyond the seeds that people train with.
+    return 2**40 + int.from_bytes(text[:8], "big") % 2**62
+
+
+# --- success ------------------------------------------------------------------------------------------------
+
+
+class Goal(NamedTuple):
+    """When an episode counts as a success, and when its goal is reached.
+
+    Parameters
+    ----------
+    text : str
+        Both, in words.
+    inside : callable
+        From the task, states (n, n_state) at a step's end and targets (n,) to whether the goal holds, (n,).
+    hold : float or None
+        Seconds before the episode's end from which on the goal must hold without a break. None: it need not.
+    terminated : bool or None
+        Whether the episode must have terminated. None: must not, and reaching the goal does not matter.
+    """
+
+    text: str
+    inside: Callable[[Task, Array, Array], NDArray[np.bool_]]
+    hold: float | None = 1.0
+    terminated: bool | None = False
+
+
+def _upright(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
+    off = np.remainder(states[:, -2], 2.0 * math.pi) - math.pi
+    return np.abs(off) <= 0.2
+
+
+def _near(distance: float) -> Callable[[Task, Array, Array], NDArray[np.bool_]]:
+    return lambda task, states, targets: np.abs(states[:, 0] - targets) <= distance
+
+
+def _gently_across(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
+    return (states[:, 0] >= 0.0) & (states[:, 1] <= 0.55)
+
+
+def _swinging(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
+    k = task.constants()
+    energy = 0.5 * states[:, 1] ** 2 + k["weight"] * (1.0 - np.cos(states[:, 0]))
+    return np.abs(energy - k["wanted_energy"]) <= 0.2 * k["wanted_energy"]
+
+
+def _at_rest(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
+    return states[:, 0] ** 2 + states[:, 1] ** 2 / task.constants()["weight"] <= 0.1**2
+
+
+_SWING_UP = Goal(
+    "success: within 0.2 rad of upright throughout the last second; time: until it is so for good", _upright
+)
+#: The environments that have a board.
+GOALS: dict[str, Goal] = {
+    "PivotedBar-v0": _SWING_UP,
+    "PivotedBarFree-v0": _SWING_UP,
+    "PivotedBarBalance-v0": Goal(
+        "success: neither the bar nor the support leaves its limits in 10 s; there is no time",
+        lambda task, states, targets: np.zeros(len(states), np.bool_), None, None,
+    ),
+    "InclineTilt-v0": Goal(
+        "success: within 5 cm of the mark throughout the last second; time: until it is so for good",
+        _near(0.05),
+    ),
+    "InclineBrake-v0": Goal(
+        "success: across the line, at 0.55 m/s at most at the end of that step; time: until then",
+        _gently_across, None, True,
+    ),
+    "CylinderInCylinderTilt-v0": Goal(
+        "success: within 0.05 rad of the target throughout the last second; time: until it is so for good",
+        _near(0.05),
+    ),
+    "CylinderInCylinderPump-v0": Goal(
+        "success: energy within 20 % of the wanted one throughout the last second; time: until it is so for "
+        "good",
+        _swinging,
+    ),
+    "CylinderInCylinderDamping-v0": Goal(
+        "success: never loses contact in 10 s; time: until it comes to rest first, √(θ² + θ'²/ω₀²) <= 0.1",
+        _at_rest, None, None,
+    ),
+}  # fmt: skip
+
+
+# --- disturbances -------------------------------------------------------------------------------------------
+
+
+def make_task(env_id: str, **options: Any) -> Task:
+    """Return the task of an environment, with parameters that differ from its own."""
+    place, fixed = TASKS[env_id]
+    return load_task(place)(**(fixed | options))
+
+
+def often(env_id: str) -> dict[str, Any]:
+    """Return the environment's arguments for acting ten times as often; a second is worth the same."""
+    return {"dt": make_task(env_id).interval / 10.0}
+
+
+def disturbances(env_id: str) -> dict[str, dict[str, Any]]:
+    """Return the environment's arguments for each of its numbers off by 20 %; policies don't know of it."""
+    scene, found = make_task(env_id).scene, {}
+    for parameter in dataclasses.fields(scene):
+        value = getattr(scene, parameter.name)
+        if isinstance(value, float) and 0.0 < value < math.inf:
+            for share, sign in ((0.8, "-"), (1.2, "+")):
+                found[f"{parameter.name} {sign}20 %"] = {parameter.name: share * value}
+    return found

@@ -1,0 +1,353 @@
+"""Writes the leaderboard's page: an overview, and a page for every environment.
+
+What comes from submissions is untrusted. It reaches HTML through jinja2's escaping only, scripts as JSON
+without ``<``, ``>`` and ``&``, and links only where it is an address of http or https.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from lag_envs.leaderboard.site.scenery import describe
+
+#: Names the files that the last build wrote; only these are ever removed.
+MANIFEST = "site.json"
+STATIC = Path(__file__).parent / "static"
+#: Poses of one episode that an overview's picture shows.
+POSES = 15
+
+KINDS = {"learned": "Learned", "controller": "Controller", "optimal": "Optimal"}
+
+
+class Column(NamedTuple):
+    """A column of a ranking: its key in a row, heading, what it means, and whether small is good."""
+
+    key: str
+    label: str
+    meaning: str
+    rising: bool = False
+
+
+COLUMNS = (
+    Column("rank", "Rank", "Agents share a rank where it is not clear which of them is better.", True),
+    Column("name", "Agent", "The submission's name, and who submitted it.", True),
+    Column(
+        "score",
+        "Score",
+        "Interquartile mean over training seeds and episodes, 0 for the random policy, 1 for the best known "
+        "return; the bar is the 95 % bootstrap interval.",
+    ),
+    Column("return", "Return", "Mean return of an episode, in the environment's own reward."),
+    Column("gap", "Gap", "Optimality gap: by how much runs fall short of a score of 1, on average.", True),
+    Column("success", "Success", "Share of episodes that succeed, with Wilson's 95 % interval."),
+    Column("settle", "Settle", "Median time until the goal is reached for good.", True),
+    Column("effort", "Effort", "Mean square of the action.", True),
+    Column("env_steps", "Steps", "Environment steps used for training, as stated by the authors.", True),
+    Column("seconds", "Training", "Time used for training, as stated by the authors.", True),
+    Column("robustness", "Robust", "Least score over environments with changed masses, drag and the like."),
+    Column("often", "10 × rate", "Score when acting ten times as often."),
+)
+
+
+def build(data: Mapping[str, Any], out: Path) -> None:
+    """Write the page.
+
+    A browser that looks at the old page meanwhile, and a process killed at any moment, leave whole pages:
+    scripts, styles and data have the hash of their content in their names, pages are replaced at once, the
+    overview last, and what no page refers to any more goes in the end.
+
+    Parameters
+    ----------
+    data : Mapping
+        What `lag_envs.leaderboard.board.board_data` returns.
+    out : Path
+        Folder of the page; made if it does not exist.
+
+    Raises
+    ------
+    FileExistsError
+        If the folder holds an ``index.html`` that no earlier build wrote.
+    NotADirectoryError, OSError
+        If the folder cannot be written.
+    """
+    out = Path(out)
+    before = _manifest(out)
+    pages, files = render(data)
+    wanted = {**files, **pages}
+    _write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
+    for name, text in wanted.items():
+        # A name with a hash says what is in the file, so it need not be written again.
+        if name in pages or not (out / name).is_file():
+            _write(out / name, text)
+    for name in before - set(wanted):
+        (out / name).unlink(missing_ok=True)
+    _write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
+
+
+def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the pages, the overview last, and the files they refer to: text by path."""
+    files: dict[str, str] = {}
+
+    def keep(stem: str, kind: str, text: str) -> str:
+        name = f"assets/{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.{kind}"
+        files[name] = text
+        return name
+
+    style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
+    script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
+    boards, taken = [], {"index"}
+    for given in data["environments"]:
+        board = _board(_clean(given), data["protocol"])
+        while board["page"] in taken:
+            board["page"] += "-2"
+        taken.add(board["page"])
+        for i, row in enumerate(board["rows"]):
+            replays = row.pop("replays")
+            row["file"] = None
+            if replays:
+                # The script that fetches the file knows it by this key.
+                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({_json(replays)});\n")
+        boards.append(board)
+
+    templates = Environment(
+        loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    templates.filters |= {"number": number, "steps": steps, "duration": duration, "percent": percent}
+    templates.globals |= {
+        "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
+        "script": script, "protocol": data["protocol"], "value_of": value_of, "embed": _embedded,
+    }  # fmt: skip
+    drawn = ("scene", "geometry", "state_names", "control", "dt", "poster", "optimum")
+    summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
+    page = templates.get_template("environment.html")
+    pages = {f"{b['page']}.html": page.render(board=b, title=b["id"], now=b["page"]) for b in boards}
+    index = templates.get_template("index.html")
+    pages["index.html"] = index.render(title="Overview", now="index", summary=summary)
+    return pages, files
+
+
+def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
+    """Return an environment's data with all that the templates and the script ask for."""
+    board: dict[str, Any] = {
+        "known": None,
+        "value": None,
+        "other": [],
+        "goal": None,
+        "geometry": None,
+        "control": None,
+        "frozen": False,
+    }
+    board |= {
+        "scene": None,
+        "state_names": [],
+        "state_units": [],
+        "dt": None,
+        "start": None,
+        "title": given["id"],
+    }
+    board |= {"protocol": protocol} | given | describe(given["id"])
+    board["rows"] = [_row(dict(row)) for row in given["rows"]]
+    board["page"] = re.sub(r"[^A-Za-z0-9_-]+", "-", str(given["id"]))[:80]
+    if board["protocol"] != protocol:
+        board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
+    known, board["optimum"] = board["known"], None
+    if known and known.get("estimate") is not None and known["best"] != known["random"]:
+        board["optimum"] = (known["estimate"] - known["random"]) / (known["best"] - known["random"])
+    # Of the best agent that can be watched; without any, the scene as it is at the start.
+    shown = next((row for row in board["rows"] if row["replays"]), None)
+    board["shown"] = shown and shown["name"]
+    still = {"states": [board["start"]], "target": None} if board["start"] else None
+    board["poster"] = _poster(shown["replays"][0], board) if shown else still
+    return board
+
+
+def _row(row: dict[str, Any]) -> dict[str, Any]:
+    empty: dict[str, Any] = dict.fromkeys(
+        [c.key for c in COLUMNS] + ["interval", "license", "description", "hardware", "id", "above"]
+    )
+    row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row
+    row["code"] = safe_url(row.get("code"))
+    row["curves"], row["profile"] = row["curves"] or [], row["profile"] or []
+    row["replays"] = [r for r in row.get("replays") or [] if r.get("states")]
+    row["authors"] = [str(a) for a in row["authors"] or []]
+    row["find"] = " ".join(
+        str(x) for x in (row["name"], *row["authors"], row["id"], row["description"] or "")
+    ).casefold()
+    return row
+
+
+def _scores(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    return [{key: row[key] for key in ("name", "kind", "score", "interval")} for row in rows]
+
+
+def safe_url(url: Any) -> str | None:
+    """Return an address of http or https as it is, and None for all else.
+
+    Examples
+    --------
+    >>> safe_url("https://example.org/a"), safe_url("javascript:alert(1)"), safe_url(" https://x")
+    ('https://example.org/a', None, None)
+    """
+    if not isinstance(url, str) or len(url) > 500 or re.search(r"[\x00-\x20\x7f\\\"'<>]", url):
+        return None
+    try:
+        parts = urlsplit(url)
+        return url if parts.scheme in ("http", "https") and parts.hostname else None
+    except ValueError:
+        return None
+
+
+def _poster(replay: Mapping[str, Any], board: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return poses of an episode at equal times, while most of it happens."""
+    states: Sequence[Sequence[float]] = replay["states"]
+    names = board["state_names"]
+    angle = names.index("theta") if "theta" in names else 0
+    if not names or len(states[0]) != len(names):
+        return None
+    path = [0.0]
+    for a, b in pairwise(states):
+        path.append(path[-1] + abs(b[angle] - a[angle]))
+    end = max(1, next((i for i, x in enumerate(path) if x >= 0.98 * path[-1]), len(path) - 1))
+    chosen = [round(i * end / (POSES - 1)) for i in range(POSES)]
+    poses = [states[min(i, len(states) - 1)] for i in dict.fromkeys(chosen)]
+    return {"states": poses, "target": replay.get("target")}
+
+
+# --- numbers as text --------------------------------------------------------------------------------------
+
+
+def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
+    """Return what a column is sorted by."""
+    value = row[key]
+    if key == "name":
+        return str(value).casefold()
+    if key == "success" and isinstance(value, Mapping):
+        return value.get("rate")
+    if isinstance(value, Mapping):
+        numbers = [x for x in value.values() if isinstance(x, int | float)]
+        return min(numbers, default=None)
+    return value
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a number with so many digits after the point, fewer for large ones.
+
+    Examples
+    --------
+    >>> number(0.98765), number(-421.0), number(-1.7386), number(-1e-9), number(None)
+    ('0.988', '−421.0', '−1.739', '0.000', '–')
+    """
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return "–"
+    size = abs(value)
+    text = f"{value:.{digits if size < 10 else max(1, digits - 1) if size < 100 else 1}f}"
+    return text.replace("-", "−") if float(text) else text.replace("-", "")
+
+
+def percent(value: Any) -> str:
+    r"""Return a share as text.
+
+    Examples
+    --------
+    >>> percent(0.98765), percent(1.0), percent(None)
+    ('98.8\xa0%', '100\xa0%', '–')
+    """
+    if not isinstance(value, int | float):
+        return "–"
+    return f"{100.0 * value:.1f}".removesuffix(".0") + "\N{NO-BREAK SPACE}%"
+
+
+def steps(value: Any) -> str:
+    r"""Return a count as text.
+
+    Examples
+    --------
+    >>> steps(500_000), steps(1_250_000), steps(None)
+    ('500\xa0k', '1.25\xa0M', '–')
+    """
+    if not isinstance(value, int | float):
+        return "–"
+    for size, sign in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g}\N{NO-BREAK SPACE}{sign}"
+    return f"{value:.0f}"
+
+
+def duration(value: Any) -> str:
+    r"""Return seconds as text.
+
+    Examples
+    --------
+    >>> duration(1.25), duration(95), duration(9000), duration(None)
+    ('1.25\xa0s', '1.58\xa0min', '2.5\xa0h', '–')
+    """
+    if not isinstance(value, int | float):
+        return "–"
+    for size, sign in ((3600.0, "h"), (60.0, "min")):
+        if value >= size:
+            return f"{value / size:.3g}\N{NO-BREAK SPACE}{sign}"
+    return f"{value:.3g}\N{NO-BREAK SPACE}s"
+
+
+# --- data and files ---------------------------------------------------------------------------------------
+
+
+def _clean(value: Any) -> Any:
+    """Return the value with None for numbers that JSON does not have, without characters that are none."""
+    if isinstance(value, Mapping):
+        return {_clean(str(k)): _clean(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(v) for v in value]
+    if isinstance(value, str):
+        return re.sub(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _json(value: Any) -> str:
+    """Return JSON that neither ends a script element nor means anything but itself in JavaScript."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _embedded(value: Any) -> Markup:
+    return Markup(_json(value))
+
+
+def _manifest(out: Path) -> set[str]:
+    """Return the files that the last build wrote."""
+    try:
+        names = json.loads((out / MANIFEST).read_text("utf-8"))["files"]
+        # A manifest that somebody wrote by hand must not remove what lies elsewhere.
+        return {n for n in names if re.fullmatch(r"(assets/)?[\w-]+\.(html|css|js)", n)}
+    except FileNotFoundError:
+        if (out / "index.html").exists():
+            raise FileExistsError(
+                f"{out} holds an index.html that is not a leaderboard's: name another folder, or empty it"
+            ) from None
+        return set()
+    except (ValueError, KeyError, TypeError) as error:
+        raise FileExistsError(f"{out / MANIFEST} cannot be read ({error}): remove the folder") from error
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that is there either whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        new.write_text(text, encoding="utf-8")
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)

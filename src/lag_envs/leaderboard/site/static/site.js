@@ -1,0 +1,1309 @@
+"use strict";
+/* The leaderboard's page. Plain JavaScript, no build step, nothing from elsewhere, works from file: too.
+ *
+ * What comes from submissions is untrusted: it becomes text (textContent) or numbers, never markup.
+ *
+ * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, start.
+ */
+(() => {
+  const TURN = 2 * Math.PI;
+  const SVG = "http://www.w3.org/2000/svg";
+  const COLOURS = 8;
+  const find = (selector, root = document) => root.querySelector(selector);
+  const all = (selector, root = document) => [...root.querySelectorAll(selector)];
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+  // --- helpers ---------------------------------------------------------------------------------------------
+
+  /** Make an element; attributes are set as such, children are elements or text. */
+  function make(name, attributes = {}, ...children) {
+    const element = document.createElement(name);
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    element.append(...children);
+    return element;
+  }
+
+  function draw(name, attributes = {}, ...children) {
+    const element = document.createElementNS(SVG, name);
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    element.append(...children);
+    return element;
+  }
+
+  const isNumber = (x) => typeof x === "number" && Number.isFinite(x);
+  const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+  const mix = (a, b, share) => a + (b - a) * share;
+
+  function text(x, digits = 3) {
+    if (!isNumber(x)) return "–";
+    const words = x.toFixed(digits);
+    return Number(words) === 0 ? words.replace("-", "") : words.replace("-", "−");
+  }
+
+  function count(x) {
+    for (const [size, sign] of [[1e9, "G"], [1e6, "M"], [1e3, "k"]]) {
+      if (x >= size) return `${+(x / size).toPrecision(3)} ${sign}`;
+    }
+    return String(+x.toPrecision(3));
+  }
+
+  /** Multiples of a round step between two numbers, about so many. */
+  function ticks(low, high, wanted = 4) {
+    const rough = (high - low) / wanted;
+    if (!(rough > 0) || !Number.isFinite(rough)) return { step: 1, at: [low] };
+    const power = 10 ** Math.floor(Math.log10(rough));
+    const step = power * ([1, 2, 5, 10].find((x) => x * power >= 0.7 * rough) ?? 10);
+    const at = [];
+    for (let i = Math.ceil(low / step - 1e-6); i * step <= high + 1e-6 * step; i++) at.push(i * step);
+    return { step, at };
+  }
+
+  const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
+  const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
+
+  /** "theta_dot" or "psi''" as on paper. */
+  function symbol(name) {
+    const base = name.replace(/(_d+ot|')+$/, "");
+    const dots = (name.match(/'/g) ?? []).length + (/_ddot$/.test(name) ? 2 : /_dot$/.test(name) ? 1 : 0);
+    return (GREEK[base] ?? base) + ["", "\u0307", "\u0308"][Math.min(dots, 2)];
+  }
+
+  // --- scenes ----------------------------------------------------------------------------------------------
+  // The same shapes as Python's `Task.shapes`, in metres, x to the right and y up: [what, ..., role].
+
+  const polar = ([x, y], radius, angle) => [x + radius * Math.cos(angle), y + radius * Math.sin(angle)];
+  const remainder = (angle) => angle - TURN * Math.round(angle / TURN);
+  const withSign = (size, sign) => (sign < 0 || Object.is(sign, -0) ? -size : size);
+
+  function arc(centre, radius, start, end) {
+    const n = 1 + Math.ceil(Math.abs(end - start) / 0.1);
+    return Array.from({ length: n + 1 }, (_, i) => polar(centre, radius, start + ((end - start) * i) / n));
+  }
+
+  function roller(centre, radius, angle, ratio) {
+    const hollow = Math.min(Math.sqrt(Math.max(2 * ratio - 1, 0)), 0.95) * radius;
+    const mark = (from) => ["polygon", [centre, ...arc(centre, radius, from, from + Math.PI / 2)], "mark"];
+    return [
+      ["circle", centre, radius, "body"],
+      mark(angle),
+      mark(angle + Math.PI),
+      ["circle", centre, Math.max(hollow, 0.1 * radius), "hole"],
+    ];
+  }
+
+  function roundLength(length) {
+    const power = 10 ** Math.floor(Math.log10(length));
+    return power * [5, 2, 1].find((step) => step === 1 || step * power <= 1.000001 * length);
+  }
+
+  function multiples(low, high, step) {
+    const found = [];
+    for (let i = Math.ceil(low / step - 1e-6); i <= Math.floor(high / step + 1e-6); i++) found.push(i * step);
+    return found;
+  }
+
+  function outline(g, s, theta) {
+    const half = 0.035 * g.reach;
+    const [sin, cos] = [Math.sin(theta), Math.cos(theta)];
+    const corners = [[g.near - half, -half], [g.reach, -half], [g.reach, half], [g.near - half, half]];
+    return corners.map(([a, b]) => [s + a * sin + b * cos, -a * cos + b * sin]);
+  }
+
+  function bar(g, { state, share }) {
+    const s = g.track === null ? 0 : state[0];
+    const theta = state[state.length - 2];
+    const [wide, high, size] = [0.11 * g.reach, 0.05 * g.reach, 0.035 * g.reach];
+    const com = [s + g.com * Math.sin(theta), -g.com * Math.cos(theta)];
+    const edge = s + withSign(wide, share);
+    const rail = [];
+    if (g.track === null) {
+      rail.push(["line", [[-2 * g.reach, 0], [2 * g.reach, 0]], "guide"]);
+    } else {
+      const step = roundLength(0.2 * g.track);
+      rail.push(...multiples(-g.track, g.track, step).map((x) => ["line", [[x, 0], [x, -size]], "ground"]));
+      rail.push(["line", [[-g.track, 0], [g.track, 0]], "frame"]);
+      rail.push(...[-g.track, g.track].map((x) => ["line", [[x, -2 * size], [x, 2 * size]], "limit"]));
+    }
+    const down = -Math.PI / 2;
+    const shapes = [
+      ["polygon", outline(g, s, Math.PI), "target"],
+      ...rail,
+      ["line", [[s, 0], [s, -0.4 * g.reach]], "guide"],
+      ["line", arc([s, 0], 0.25 * g.reach, down, remainder(theta) + down), "guide"],
+      ["polygon", [[s - wide, -high], [s + wide, -high], [s + wide, high], [s - wide, high]], "frame"],
+      ["line", [[s, 0], com], "body"],
+      ["polygon", outline(g, s, theta), "body"],
+      ["circle", [s, 0], 0.02 * g.reach, "hole"],
+      ["circle", com, 0.022 * g.reach, "mark"],
+      ["arrow", [[edge, 0], [edge + 0.45 * g.reach * share, 0]], "action"],
+    ];
+    if (g.lean !== null) {
+      for (const angle of [Math.PI / 2 - g.lean, Math.PI / 2 + g.lean]) {
+        shapes.push(["line", [0.9, 1.05].map((r) => polar([s, 0], r * g.reach, angle)), "limit"]);
+      }
+    }
+    return shapes;
+  }
+
+  function onPlane(x, height, phi) {
+    const [c, s] = [Math.cos(phi), Math.sin(phi)];
+    return [x * c + height * s, height * c - x * s];
+  }
+
+  function stretch(x) {
+    const start = Math.min(-3.2, x - 0.2);
+    return [start, start + 3.6];
+  }
+
+  function incline(g, { state, share, target }) {
+    const [x, radius] = [state[0], g.radius];
+    const phi = g.control === "damping" ? g.tilt : state[state.length - 1];
+    const cylinder = roller(onPlane(x, radius, phi), radius, Math.PI / 2 - x / radius - phi, g.ratio);
+    const line = (points, role) => ["line", points, role];
+    if (g.control === "damping") {
+      const [low, high] = [stretch(x)[0] - 3, stretch(x)[1] + 3];
+      const [left, right] = [onPlane(low, 0, phi), onPlane(high, 0, phi)];
+      const depth = Math.min(left[1], right[1]) - (high - low);
+      const marks = multiples(low, high, roundLength((high - low) / 15));
+      const tip = x - withSign(8 * radius * share, state[1]);
+      return [
+        ["polygon", [left, right, [right[0], depth], [left[0], depth]], "ground"],
+        ...marks.map((m) => line([onPlane(m, 0, phi), onPlane(m, -0.6 * radius, phi)], "ground")),
+        line([[0, 0], [-24 * radius, 0]], "guide"),
+        line(arc([0, 0], 20 * radius, Math.PI - phi, Math.PI), "guide"),
+        ...cylinder,
+        ["arrow", [onPlane(x, radius, phi), onPlane(tip, radius, phi)], "action"],
+        line([onPlane(0, 0, phi), onPlane(0, 6 * radius, phi)], "target"),
+        ["lens", onPlane(x, radius, phi), 2.2 * radius],
+      ];
+    }
+    const [edge, thick] = [g.edge, 0.04 * g.edge];
+    const [floor, side] = [-9 * thick, 2 * edge];
+    const corners = [[-edge, 0], [edge, 0], [edge, -thick], [-edge, -thick]];
+    return [
+      ["circle", onPlane(target ?? 0, radius, phi), radius, "target"],
+      ["polygon", [[-4 * thick, floor], [0, -0.5 * thick], [4 * thick, floor]], "ground"],
+      ["polygon", [[-side, floor], [side, floor], [side, -side], [-side, -side]], "ground"],
+      line([[-1.3 * edge, 0], [1.3 * edge, 0]], "guide"),
+      ["polygon", corners.map(([a, b]) => onPlane(a, b, phi)), "frame"],
+      ...cylinder,
+      ["arrow", arc([0, 0], 1.15 * edge, -phi, -phi - 0.3 * share), "action"],
+      ...[-edge, edge].map((p) => line([0, 0.8 * radius].map((y) => onPlane(p, y, phi)), "limit")),
+      ...[-1, 1].map((way) =>
+        line([1.03, 1.09].map((r) => polar([0, 0], r * edge, way * g.largest_tilt)), "limit"),
+      ),
+    ];
+  }
+
+  function shell(g, { state, share, target, turned }) {
+    const [up, rim, part, theta] = [Math.PI / 2, 1.1 * g.shell, Math.PI / 12, state[0]];
+    const place = (angle, distance = g.arm) => polar([0, 0], distance, angle - up);
+    const [first, last] = [up + turned - part, up + turned + part];
+    const joints = [3, 5, 7, 9, 11, 13, 15, 17, 19, 21].map((i) => up + turned + part * i);
+    const angle = up + (g.shell * turned - g.arm * theta) / g.radius;
+    const action =
+      g.control === "tilt"
+        ? arc([0, 0], 1.19 * g.shell, up, up + (share * Math.PI) / 3)
+        : [place(theta), polar(place(theta), -withSign(0.6 * g.shell * share, state[1]), theta)];
+    const shapes = [
+      ["circle", [0, 0], rim, "ground"],
+      ...joints.map((a) => ["line", [polar([0, 0], g.shell, a), polar([0, 0], rim, a)], "ground"]),
+      ["polygon", [...arc([0, 0], rim, first, last), ...arc([0, 0], g.shell, last, first)], "frame"],
+      ["circle", [0, 0], g.shell, "hole"],
+      ["line", [[0, 0], [0, -g.shell]], "guide"],
+      ["line", [[0, 0], place(theta)], "guide"],
+      ["line", arc([0, 0], 0.4 * g.arm, -up, remainder(theta) - up), "guide"],
+      ...roller(place(theta), g.radius, angle, g.ratio),
+      ["arrow", action, "action"],
+    ];
+    if (g.largest_angle !== null) {
+      for (const a of [-g.largest_angle, g.largest_angle]) {
+        shapes.push(["line", [place(a, g.shell - g.radius), place(a, g.shell)], "limit"]);
+      }
+    }
+    for (const a of g.marks ?? [target ?? 0]) shapes.push(["circle", place(a), g.radius, "target"]);
+    return shapes;
+  }
+
+  const SCENES = { PivotedBar: bar, Incline: incline, CylinderInCylinder: shell };
+
+  /** What is to be seen: `now` has state, share (of the largest control), target and turned. */
+  function shapesOf(board, now) {
+    return SCENES[board.scene](board.geometry, now);
+  }
+
+  function windowOf(board, now) {
+    const g = board.geometry;
+    if (board.scene !== "Incline" || g.control !== "damping") return g.window;
+    const [start, end] = stretch(now.state[0]).map((x) => onPlane(x, g.radius, g.tilt));
+    return [start[0], end[1], end[0], start[1]];
+  }
+
+  const canDraw = (board) => board.scene in SCENES && board.geometry !== null;
+
+  function shareOf(board, action) {
+    if (!isNumber(action) || !board.control) return 0;
+    const { low, high, limit } = board.control;
+    return mix(low, high, (clamp(action, -1, 1) + 1) / 2) / limit;
+  }
+
+  // --- painting --------------------------------------------------------------------------------------------
+
+  let ink = {};
+
+  /** Read the colours of the style sheet, which depend on the reader's choice of light or dark. */
+  function readColours() {
+    const style = getComputedStyle(document.documentElement);
+    const get = (name) => style.getPropertyValue(`--${name}`).trim();
+    const names = ["paper", "card", "ink", "soft", "line", "accent", "value-low", "value-mid", "value-high"];
+    ink = Object.fromEntries(names.map((name) => [name, get(name)]));
+    ink.series = Array.from({ length: COLOURS }, (_, i) => get(`c${i}`));
+    ink.roles = {
+      body: [get("body-fill"), get("body-edge"), 1.5],
+      mark: [get("body-edge"), get("body-edge"), 0],
+      hole: [get("stage"), get("frame-edge"), 1.2],
+      ground: [get("ground-fill"), get("ground-edge"), 1.2],
+      frame: [get("frame-fill"), get("frame-edge"), 1.5],
+      guide: [null, get("guide"), 1, [4, 4]],
+      target: [null, get("target"), 1.8, [6, 4]],
+      limit: [get("limit"), get("limit"), 2.5],
+      action: [get("accent"), get("accent"), 4],
+    };
+  }
+
+  /** Fit a canvas to its place on the screen; returns its context, width and height in CSS pixels. */
+  function fit(canvas) {
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const ratio = Math.min(window.devicePixelRatio || 1, 3);
+    const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
+    const pen = canvas.getContext("2d");
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    return { pen, width, height };
+  }
+
+  function trace(pen, points, closed) {
+    pen.beginPath();
+    points.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+    if (closed) pen.closePath();
+  }
+
+  function paint(pen, box, view, shapes, only = null) {
+    const [left, bottom, right, top] = view;
+    const scale = Math.min(box.width / (right - left), box.height / (top - bottom));
+    const [x0, y0] = [box.x + box.width / 2, box.y + box.height / 2];
+    const at = ([x, y]) => [x0 + scale * (x - (left + right) / 2), y0 - scale * (y - (bottom + top) / 2)];
+    pen.lineJoin = "round";
+    for (const [what, a, b, c] of shapes) {
+      const role = what === "circle" ? c : b;
+      if (what === "lens") {
+        if (!only) magnify(pen, box, at(a), scale, a, b, shapes);
+        continue;
+      }
+      if (only && !only.includes(role)) continue;
+      const [fill, edge, width, dash = []] = ink.roles[role];
+      pen.lineWidth = width;
+      pen.setLineDash(dash);
+      pen.strokeStyle = edge;
+      pen.fillStyle = fill ?? "transparent";
+      if (what === "arrow") {
+        arrow(pen, a.map(at), width, edge);
+        continue;
+      }
+      if (what === "circle") {
+        const [x, y] = at(a);
+        pen.beginPath();
+        pen.arc(x, y, scale * b, 0, TURN);
+      } else {
+        trace(pen, a.map(at), what === "polygon");
+      }
+      if (fill && what !== "line") pen.fill();
+      if (width) pen.stroke();
+    }
+    pen.setLineDash([]);
+  }
+
+  /** An arrow as long as its points say; a short one is thinner. */
+  function arrow(pen, points, full, colour) {
+    let length = 0;
+    for (let i = 1; i < points.length; i++) {
+      length += Math.hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
+    }
+    if (length < 1.5) return;
+    const width = full * Math.min(1, length / (4 * full));
+    const head = 3 * width;
+    const shaft = [points[0]];
+    let room = length - head;
+    for (let i = 1; i < points.length && room > 0; i++) {
+      const [[ax, ay], [bx, by]] = [points[i - 1], points[i]];
+      const step = Math.hypot(bx - ax, by - ay);
+      const share = Math.min(1, room / step);
+      shaft.push([mix(ax, bx, share), mix(ay, by, share)]);
+      room -= step;
+    }
+    const [tip, end] = [points[points.length - 1], shaft[shaft.length - 1]];
+    const [dx, dy] = [(tip[0] - end[0]) / 2, (tip[1] - end[1]) / 2];
+    pen.lineWidth = width;
+    trace(pen, shaft, false);
+    pen.stroke();
+    pen.fillStyle = colour;
+    trace(pen, [tip, [end[0] - dy, end[1] + dx], [end[0] + dy, end[1] - dx]], true);
+    pen.fill();
+  }
+
+  /** Show a part of the picture once more in its upper right corner. */
+  function magnify(pen, box, small, scale, centre, radius, shapes) {
+    const size = 0.36 * Math.min(box.width, box.height);
+    const middle = [box.x + box.width - size / 2 - 12, box.y + size / 2 + 12];
+    pen.save();
+    pen.beginPath();
+    pen.arc(...middle, size / 2, 0, TURN);
+    pen.fillStyle = ink.roles.hole[0];
+    pen.fill();
+    pen.clip();
+    const [x, y] = centre;
+    const glass = { x: middle[0] - size / 2, y: middle[1] - size / 2, width: size, height: size };
+    const near = shapes.filter((shape) => shape[0] !== "lens");
+    paint(pen, glass, [x - radius, y - radius, x + radius, y + radius], near);
+    pen.restore();
+    pen.strokeStyle = ink.roles.guide[1];
+    pen.lineWidth = 1.2;
+    for (const [at, r] of [[middle, size / 2], [small, radius * scale]]) {
+      pen.beginPath();
+      pen.arc(...at, r, 0, TURN);
+      pen.stroke();
+    }
+  }
+
+  /** Poses of an episode in one picture, as on one photographic plate. */
+  function poster(canvas, board) {
+    const { pen, width, height } = fit(canvas);
+    if (!width || !board.poster || !canDraw(board)) return;
+    pen.clearRect(0, 0, width, height);
+    const { states, target } = board.poster;
+    const nows = states.map((state) => ({ state, share: 0, target, turned: 0 }));
+    const last = nows[nows.length - 1];
+    const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
+    const view = windowOf(board, last);
+    const back = shapesOf(board, last).filter(([what]) => what !== "lens" && what !== "arrow");
+    paint(pen, box, view, back, ["ground", "frame", "guide", "target", "limit", "hole"]);
+    nows.forEach((now, i) => {
+      pen.globalAlpha = i === nows.length - 1 ? 1 : mix(0.1, 0.45, i / nows.length);
+      paint(pen, box, view, shapesOf(board, now), ["body", "mark"]);
+    });
+    pen.globalAlpha = 1;
+  }
+
+  // --- replays ---------------------------------------------------------------------------------------------
+
+  const fetched = new Map();
+  const waiting = new Map();
+
+  /** Called by the files in assets/, each of which holds the episodes of one agent. */
+  function put(replays) {
+    waiting.get(document.currentScript?.getAttribute("src"))?.(replays);
+  }
+
+  /** Load a file as a script, which works from file: where fetch does not. */
+  function load(file) {
+    if (!fetched.has(file)) {
+      const promise = new Promise((resolve, reject) => {
+        waiting.set(file, resolve);
+        const script = make("script", { src: file });
+        script.addEventListener("error", () => {
+          fetched.delete(file);
+          reject(new Error(`${file} cannot be loaded`));
+        });
+        document.head.append(script);
+      });
+      fetched.set(file, promise.then((replays) => replays.map(prepare)));
+    }
+    return fetched.get(file);
+  }
+
+  /** Add what is drawn but not recorded: the return so far, and how far the shell has turned. */
+  function prepare(replay) {
+    const dt = replay.dt || board.dt || 1;
+    const sums = [0];
+    for (const reward of replay.rewards) sums.push(sums[sums.length - 1] + (reward ?? 0));
+    const turned = [0];
+    const rate = board.state_names.indexOf("psi_dot");
+    if (rate >= 0) {
+      for (let i = 1; i < replay.states.length; i++) {
+        const mean = (replay.states[i - 1][rate] + replay.states[i][rate]) / 2;
+        turned.push(turned[i - 1] + dt * mean);
+      }
+    }
+    const end = Math.max(1, Math.min(replay.states.length - 1, replay.actions.length));
+    return { ...replay, dt, sums, turned, end, t0: replay.t0 ?? 0 };
+  }
+
+  // --- player ----------------------------------------------------------------------------------------------
+
+  let board = null;
+
+  function startPlayer() {
+    const root = find("#watch");
+    if (!root) return null;
+    const sides = all(".side", root).map((element, index) => ({
+      index,
+      element,
+      agent: find(".agent", element),
+      episode: find(".episode", element),
+      canvas: find(".scene", element),
+      readout: find(".readout", element),
+      phase: all(".phase", root)[index],
+      row: null,
+      replay: null,
+      asked: 0,
+      cells: null,
+    }));
+    const play = find(".play", root);
+    const range = find(".scrub input", root);
+    const clock = find(".clock", root);
+    const speed = find(".speed select", root);
+    const loop = find(".loop input", root);
+    const said = find("#said", root);
+    const traces = find(".traces canvas", root);
+    const pair = find(".pair select", root);
+    const pairs = pairsOf(board);
+    let time = 0;
+    let playing = false;
+    let before = 0;
+    let saying = 0;
+    let soon = 0;
+
+    const step = () => Math.min(...sides.map((side) => side.replay?.dt ?? Infinity), 1);
+    const end = () => Math.max(0, ...sides.map((side) => (side.replay ? side.replay.end * side.replay.dt : 0)));
+
+    /** The moment of a side: its frame, and the state between frames while playing slowly. */
+    function momentOf({ replay }) {
+      const exact = Math.min(time / replay.dt, replay.end);
+      const frame = Math.min(Math.floor(exact + 1e-6), replay.end);
+      const share = clamp(exact - frame, 0, 1);
+      const next = Math.min(frame + 1, replay.end);
+      const between = (values) => mix(values[frame], values[next], share);
+      const state = replay.states[frame].map((x, i) => mix(x, replay.states[next][i], share));
+      const action = frame > 0 ? replay.actions[frame - 1] : null;
+      return {
+        frame,
+        state,
+        action,
+        reward: frame > 0 ? replay.rewards[frame - 1] : null,
+        total: replay.sums[frame],
+        time: frame * replay.dt,
+        target: replay.target,
+        share: shareOf(board, action),
+        turned: replay.turned.length > 1 ? between(replay.turned) : 0,
+      };
+    }
+
+    function show() {
+      soon = 0;
+      for (const side of sides) showSide(side);
+      const dt = step();
+      range.max = Math.max(1, Math.round(end() / dt));
+      range.value = Math.round(time / dt - (playing ? 0.5 : 0));
+      range.setAttribute("aria-valuetext", `${time.toFixed(2)} of ${end().toFixed(2)} seconds`);
+      root.style.setProperty("--done", `${end() ? (100 * time) / end() : 0}%`);
+      clock.textContent = `${time.toFixed(2)} / ${end().toFixed(2)} s`;
+      drawTraces(traces, sides, time, end());
+    }
+
+    function later() {
+      soon ||= requestAnimationFrame(show);
+    }
+
+    function showSide(side) {
+      const { pen, width, height } = fit(side.canvas);
+      pen.clearRect(0, 0, width, height);
+      if (!side.replay) {
+        side.readout.replaceChildren();
+        side.cells = null;
+        clearPhase(side.phase);
+        return;
+      }
+      const now = momentOf(side);
+      if (width && canDraw(board) && now.state.length === board.state_names.length) {
+        const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
+        paint(pen, box, windowOf(board, now), shapesOf(board, now));
+      }
+      const over = now.frame >= side.replay.end;
+      fill(side, [
+        ["Time", `${text(now.time, 2)} s${over ? ", end" : ""}`],
+        ["Action", text(now.action)],
+        ["Reward", text(now.reward)],
+        ["Return", text(now.total, 2)],
+        ...board.state_names.map((name, i) => {
+          return [symbol(name), `${text(now.state[i], 2)} ${board.state_units[i] ?? ""}`];
+        }),
+      ]);
+      const chosen = pairs[pair.value] ?? pairs[0];
+      if (chosen) drawPhase(side, chosen, now, board, sides);
+    }
+
+    /** Write the read-out; its elements stay, so that nothing moves sixty times a second. */
+    function fill(side, entries) {
+      if (side.cells?.length !== entries.length) {
+        side.cells = entries.map(([name]) => {
+          const value = make("dd");
+          side.readout.append(make("div", {}, make("dt", {}, name), value));
+          return value;
+        });
+        side.readout.replaceChildren(...side.cells.map((cell) => cell.parentElement));
+      }
+      entries.forEach(([, value], i) => {
+        if (side.cells[i].textContent !== value) side.cells[i].textContent = value;
+      });
+    }
+
+    /** Tell what is to be seen to those who do not see it, when it has come to rest. */
+    function say(prefix = "") {
+      clearTimeout(saying);
+      saying = setTimeout(() => {
+        const parts = sides.filter((side) => side.replay).map((side) => {
+          const now = momentOf(side);
+          const states = board.state_names.map((n, i) => `${n.replace("_", " ")} ${text(now.state[i], 2)}`);
+          const words = `${"AB"[side.index]}, ${board.rows[side.row].name}, at ${text(now.time, 2)} seconds: ` +
+            `action ${text(now.action, 2)}, reward ${text(now.reward, 2)}, return ${text(now.total, 1)}, ` +
+            states.join(", ");
+          side.canvas.setAttribute("aria-label", words);
+          return words;
+        });
+        said.textContent = prefix + parts.join(". ");
+      }, 250);
+    }
+
+    function tick(now) {
+      if (!playing) return;
+      // The first frame may bear a time from before the click.
+      time += (Math.max(0, now - before) / 1000) * Number(speed.value);
+      before = now;
+      if (time >= end()) {
+        if (loop.checked && end() > 0) time = 0;
+        else {
+          time = end();
+          setPlaying(false);
+        }
+      }
+      show();
+      if (playing) requestAnimationFrame(tick);
+    }
+
+    function setPlaying(on) {
+      if (on && !sides.some((side) => side.replay)) return;
+      if (on && time >= end() - 1e-9) time = 0;
+      playing = on;
+      root.classList.toggle("playing", on);
+      play.setAttribute("aria-label", on ? "Pause" : "Play");
+      before = performance.now();
+      if (on) requestAnimationFrame(tick);
+      else {
+        // Rest on a recorded state, not between two.
+        time = Math.min(Math.round(time / step()) * step(), end());
+        later();
+        say();
+      }
+    }
+
+    function seek(to) {
+      if (playing) setPlaying(false);
+      time = clamp(to, 0, end());
+      later();
+      say();
+    }
+
+    const frames = (by) => seek((Math.round(time / step()) + by) * step());
+
+    async function choose(side, row, episode = 0) {
+      const asked = ++side.asked;
+      side.agent.value = row === null ? "" : String(row);
+      side.episode.replaceChildren();
+      side.episode.disabled = row === null;
+      if (row === null) {
+        [side.row, side.replay] = [null, null];
+        side.canvas.setAttribute("aria-label", "No agent");
+      } else {
+        let replays = [];
+        try {
+          replays = await load(board.rows[row].file);
+        } catch (error) {
+          said.textContent = String(error.message);
+          return;
+        }
+        // Another choice was made meanwhile.
+        if (asked !== side.asked) return;
+        [side.row, side.replay] = [row, replays[episode] ?? replays[0]];
+        side.episode.replaceChildren(...replays.map((replay, i) => {
+          const label = replay.label ? String(replay.label) : "episode";
+          const words = `${label[0].toUpperCase()}${label.slice(1)}, return ${text(replay.return, 2)}`;
+          return make("option", { value: i }, words);
+        }));
+        side.episode.value = String(replays[episode] ? episode : 0);
+      }
+      side.element.dataset.colour = row === null ? "" : row % COLOURS;
+      side.background = null;
+      time = Math.min(time, end());
+      for (const button of all(".pick")) {
+        const mine = sides[button.dataset.side];
+        const pressed = mine.row === Number(button.closest("tr").dataset.row);
+        button.setAttribute("aria-pressed", String(pressed && mine.row !== null));
+      }
+      later();
+      say();
+    }
+
+    for (const side of sides) {
+      side.agent.addEventListener("change", () => {
+        choose(side, side.agent.value === "" ? null : Number(side.agent.value));
+      });
+      side.episode.addEventListener("change", () => choose(side, side.row, Number(side.episode.value)));
+      side.canvas.addEventListener("click", () => setPlaying(!playing));
+    }
+    play.addEventListener("click", () => setPlaying(!playing));
+    for (const button of all(".step", root)) {
+      button.addEventListener("click", () => frames(Number(button.dataset.step)));
+    }
+    range.addEventListener("input", () => seek(Number(range.value) * step()));
+    pair.addEventListener("change", () => {
+      for (const side of sides) side.background = null;
+      later();
+    });
+    traces.addEventListener("pointerdown", (event) => {
+      const box = traces.getBoundingClientRect();
+      const { left, right } = lanes(box.width);
+      const share = (event.clientX - box.left - left) / (box.width - left - right);
+      seek(Math.round((clamp(share, 0, 1) * end()) / step()) * step());
+    });
+
+    root.addEventListener("keydown", (event) => {
+      const { key, target } = event;
+      if (event.ctrlKey || event.altKey || event.metaKey || target.matches("select")) return;
+      // A button or a box does with the space bar what it always does.
+      if (key === " " && !target.matches("button, [type=checkbox]")) setPlaying(!playing);
+      else if (key === "ArrowLeft" || key === "ArrowDown") frames(event.shiftKey ? -10 : -1);
+      else if (key === "ArrowRight" || key === "ArrowUp") frames(event.shiftKey ? 10 : 1);
+      else if (key === "Home") seek(0);
+      else if (key === "End") seek(end());
+      else return;
+      // Up and down scroll the page, unless they move the slider.
+      if (target === range || !key.match(/^Arrow(Up|Down)$/)) event.preventDefault();
+    });
+
+    pair.replaceChildren(...pairs.map((p, i) => make("option", { value: i }, `${p.labels[0]}, ${p.labels[1]}`)));
+    pair.closest("label").hidden = pairs.length < 2;
+    find(".phases", root).hidden = pairs.length === 0;
+    for (const button of all(".pick")) {
+      button.addEventListener("click", async () => {
+        await choose(sides[button.dataset.side], Number(button.closest("tr").dataset.row));
+        root.scrollIntoView({ behavior: calm.matches ? "auto" : "smooth" });
+      });
+    }
+
+    const ready = board.rows.map((row, i) => (row.file ? i : -1)).filter((i) => i >= 0);
+    const other = ready.find((i) => board.rows[i].kind !== board.rows[ready[0]].kind) ?? ready[1];
+    choose(sides[0], ready[0]);
+    choose(sides[1], other ?? null);
+    return () => {
+      for (const side of sides) side.background = null;
+      show();
+    };
+  }
+
+  const lanes = (width) => ({ left: width < 500 ? 8 : 64, right: 8 });
+
+  /** Action and reward over time, of both sides, with the present as a line. */
+  function drawTraces(canvas, sides, time, end) {
+    const { pen, width, height } = fit(canvas);
+    pen.clearRect(0, 0, width, height);
+    if (!width || !end) return;
+    const { left, right } = lanes(width);
+    const x = (t) => left + ((width - left - right) * t) / end;
+    const gap = 14;
+    const lane = (height - gap) / 2;
+    pen.font = `12px ${getComputedStyle(canvas).fontFamily}`;
+    ["actions", "rewards"].forEach((what, i) => {
+      const values = sides.flatMap((side) => (side.replay ? side.replay[what] : [])).filter(isNumber);
+      let [low, high] = what === "actions" ? [-1, 1] : [0, 0];
+      for (const v of values) [low, high] = [Math.min(low, v), Math.max(high, v)];
+      // One large last reward, such as a penalty, must not flatten all others.
+      if (what === "rewards" && values.length > 20) {
+        const sorted = [...values].sort((a, b) => a - b);
+        const [a, b] = [sorted[Math.floor(0.01 * values.length)], sorted[Math.ceil(0.99 * values.length) - 1]];
+        [low, high] = [Math.max(low, Math.min(0, a - (b - a))), Math.min(high, Math.max(0, b + (b - a)))];
+      }
+      if (!(high > low)) high = low + 1;
+      const top = i * (lane + gap);
+      const y = (v) => top + 2 + (lane - 4) * (1 - (clamp(v, low, high) - low) / (high - low));
+      pen.strokeStyle = ink.line;
+      pen.lineWidth = 1;
+      for (const v of new Set([low, 0, high])) {
+        trace(pen, [[left, y(v)], [width - right, y(v)]], false);
+        pen.stroke();
+      }
+      if (left > 20) {
+        pen.fillStyle = ink.soft;
+        pen.textBaseline = "middle";
+        pen.textAlign = "left";
+        pen.fillText(what === "actions" ? "Action" : "Reward", 0, top + lane / 2);
+      }
+      pen.save();
+      pen.beginPath();
+      pen.rect(left, top - 2, width - left - right, lane + 4);
+      pen.clip();
+      for (const side of sides) {
+        if (!side.replay) continue;
+        const points = [];
+        side.replay[what].forEach((v, j) => {
+          if (isNumber(v)) points.push([x(j * side.replay.dt), y(v)], [x((j + 1) * side.replay.dt), y(v)]);
+        });
+        pen.strokeStyle = ink.series[side.row % COLOURS];
+        pen.lineWidth = 1.4;
+        pen.setLineDash(side.index ? [4, 2] : []);
+        trace(pen, points, false);
+        pen.stroke();
+      }
+      pen.restore();
+    });
+    pen.strokeStyle = ink.ink;
+    pen.lineWidth = 1.5;
+    trace(pen, [[x(Math.min(time, end)), 0], [x(Math.min(time, end)), height]], false);
+    pen.stroke();
+  }
+
+  // --- phase portraits -------------------------------------------------------------------------------------
+
+  /** Which coordinates have a rate in the state; first the pair that the value function is of. */
+  function pairsOf({ state_names: names, state_units: units, value }) {
+    const found = [];
+    names.forEach((name, i) => {
+      // Where the plane turns, the state has w = x' + R phi' in place of the rate of x.
+      const j = names.indexOf(name === "x" && !names.includes("x_dot") ? "w" : `${name}_dot`);
+      if (j >= 0) found.push([i, j]);
+    });
+    // InclineTilt's plane and the shell's rate: what is left is drawn against the first coordinate.
+    const labels = (value?.axes ?? []).map((axis) => String(axis.label).replace(/\s*[[(].*$/, ""));
+    const own = labels.map((label) => names.findIndex((name) => name === label || symbol(name) === label));
+    if (own.length === 2 && own.every((i) => i >= 0) && !found.some(([i, j]) => i === own[0] && j === own[1])) {
+      found.push(own);
+    }
+    const shaded = ([i, j]) => i === own[0] && j === own[1];
+    const angle = ([i]) => names[i] === "theta";
+    found.sort((a, b) => shaded(b) - shaded(a) || angle(b) - angle(a));
+    return found.map((pair) => ({
+      x: pair[0],
+      y: pair[1],
+      labels: pair.map((i) => (units[i] ? `${symbol(names[i])} [${units[i]}]` : symbol(names[i]))),
+      value: shaded(pair) ? value : null,
+      // A bar's angle is drawn within one turn, where the value function has just that.
+      wraps: shaded(pair) && Math.abs(value.axes[0].high - value.axes[0].low - TURN) < 0.05,
+    }));
+  }
+
+  function clearPhase(canvas) {
+    const { pen, width, height } = fit(canvas);
+    pen.clearRect(0, 0, width, height);
+  }
+
+  function rangeOf(values) {
+    let [low, high] = [Infinity, -Infinity];
+    for (const v of values) if (isNumber(v)) [low, high] = [Math.min(low, v), Math.max(high, v)];
+    if (!(high > low)) [low, high] = [low - 1, low + 1];
+    const pad = 0.06 * (high - low);
+    return [low - pad, high + pad];
+  }
+
+  /** The span of an axis, or the part of it where the paths are if that is much smaller. */
+  function nearer([low, high], axis) {
+    if (high - low > 0.6 * (axis.high - axis.low)) return [axis.low, axis.high];
+    const more = 0.2 * (high - low);
+    return [Math.max(low - more, axis.low), Math.min(high + more, axis.high)];
+  }
+
+  function drawPhase(side, pair, now, board, sides) {
+    const { pen, width, height } = fit(side.phase);
+    if (!width) return;
+    const box = { left: 46, top: 10, width: width - 56, height: height - 50 };
+    const wrap = pair.wraps
+      ? (x) => pair.value.axes[0].low + ((((x - pair.value.axes[0].low) % TURN) + TURN) % TURN)
+      : (x) => x;
+    // Axes, shading and path change with the choice only; what moves is the ring.
+    const same = ["width", "height"].every((size) => side.background?.[size] === side.phase[size]);
+    if (!same) {
+      const shown = sides.filter((s) => s.replay).flatMap((s) => s.replay.states);
+      let spanX = rangeOf(shown.map((s) => wrap(s[pair.x])));
+      let spanY = rangeOf(shown.map((s) => s[pair.y]));
+      if (pair.value) {
+        const [first, second] = pair.value.axes;
+        spanX = pair.wraps ? [first.low, first.high] : nearer(spanX, first);
+        spanY = nearer(spanY, second);
+      }
+      side.background = Object.assign(document.createElement("canvas"), {
+        width: side.phase.width,
+        height: side.phase.height,
+      });
+      const back = side.background.getContext("2d");
+      back.setTransform(pen.getTransform());
+      const x = (v) => box.left + (box.width * (v - spanX[0])) / (spanX[1] - spanX[0]);
+      const y = (v) => box.top + box.height * (1 - (v - spanY[0]) / (spanY[1] - spanY[0]));
+      Object.assign(side.background, { x, y });
+      back.save();
+      back.beginPath();
+      back.rect(box.left, box.top, box.width, box.height);
+      back.clip();
+      if (pair.value) shade(back, box, pair.value, x, y);
+      back.restore();
+      axes(back, box, spanX, spanY, pair.labels, x, y, getComputedStyle(side.phase).fontFamily);
+      back.save();
+      back.beginPath();
+      back.rect(box.left, box.top, box.width, box.height);
+      back.clip();
+      back.lineJoin = "round";
+      const { states } = side.replay;
+      // A light line below the coloured one keeps it readable on any shade.
+      for (const [colour, wide] of [[ink.card, 4.5], [ink.series[side.row % COLOURS], 2]]) {
+        back.strokeStyle = colour;
+        back.lineWidth = wide;
+        back.beginPath();
+        states.forEach((s, i) => {
+          const [px, py] = [x(wrap(s[pair.x])), y(s[pair.y])];
+          const jump = i && Math.abs(wrap(s[pair.x]) - wrap(states[i - 1][pair.x])) > Math.PI && pair.wraps;
+          if (!i || jump) back.moveTo(px, py);
+          else back.lineTo(px, py);
+        });
+        back.stroke();
+      }
+      back.restore();
+    }
+    pen.clearRect(0, 0, width, height);
+    pen.drawImage(side.background, 0, 0, width, height);
+    const { x, y } = side.background;
+    const px = clamp(x(wrap(now.state[pair.x])), box.left, box.left + box.width);
+    const py = clamp(y(now.state[pair.y]), box.top, box.top + box.height);
+    pen.beginPath();
+    pen.arc(px, py, 6, 0, TURN);
+    pen.fillStyle = ink.card;
+    pen.fill();
+    pen.lineWidth = 3;
+    pen.strokeStyle = ink.accent;
+    pen.stroke();
+    const name = `${pair.labels[0]} against ${pair.labels[1]} of ${board.rows[side.row].name}` +
+      (pair.value ? ", over the value function" : "");
+    if (side.phase.getAttribute("aria-label") !== name) side.phase.setAttribute("aria-label", name);
+  }
+
+  const channels = (colour) => [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
+
+  /** The value function as shades: values[i][j] at the i-th place of the first axis, j-th of the second. */
+  function shade(pen, box, { axes: [across, up], values }, x, y) {
+    const [nx, ny] = [values.length, values[0].length];
+    const columns = values.map((_, i) => x(mix(across.low, across.high, i / (nx - 1))));
+    const rows = values[0].map((_, j) => y(mix(up.low, up.high, j / (ny - 1))));
+    const within = (at, start, size) => at >= start - 1 && at <= start + size + 1;
+    // The shades are shared out among what is shown.
+    let [low, high] = [Infinity, -Infinity];
+    values.forEach((column, i) => {
+      if (!within(columns[i], box.left, box.width)) return;
+      column.forEach((v, j) => {
+        if (isNumber(v) && within(rows[j], box.top, box.height)) [low, high] = [Math.min(low, v), Math.max(high, v)];
+      });
+    });
+    if (high < low) return;
+    const stops = ["value-low", "value-mid", "value-high"].map((name) => channels(ink[name]));
+    const small = Object.assign(document.createElement("canvas"), { width: nx, height: ny });
+    const part = small.getContext("2d");
+    const image = part.createImageData(nx, ny);
+    for (let i = 0; i < nx; i++) {
+      for (let j = 0; j < ny; j++) {
+        const v = values[i][j];
+        if (!isNumber(v)) continue;
+        const share = high > low ? clamp((2 * (v - low)) / (high - low), 0, 2) : 1;
+        const [a, b] = share < 1 ? [stops[0], stops[1]] : [stops[1], stops[2]];
+        const at = 4 * ((ny - 1 - j) * nx + i);
+        for (let k = 0; k < 3; k++) image.data[at + k] = mix(a[k], b[k], share < 1 ? share : share - 1);
+        image.data[at + 3] = 255;
+      }
+    }
+    part.putImageData(image, 0, 0);
+    pen.imageSmoothingEnabled = true;
+    pen.imageSmoothingQuality = "high";
+    // Values are at the nodes, so the outer half of the outermost pixels lies outside.
+    const [left, top] = [x(across.low), y(up.high)];
+    const size = [x(across.high) - left, y(up.low) - top];
+    pen.drawImage(small, 0.5, 0.5, Math.max(nx - 1, 1), Math.max(ny - 1, 1), left, top, ...size);
+  }
+
+  function axes(pen, box, spanX, spanY, labels, x, y, family) {
+    const [right, bottom] = [box.left + box.width, box.top + box.height];
+    pen.font = `12px ${family}`;
+    pen.fillStyle = ink.soft;
+    pen.strokeStyle = ink.soft;
+    pen.lineWidth = 1;
+    pen.textAlign = "center";
+    pen.textBaseline = "top";
+    const across = ticks(...spanX, Math.max(2, Math.round(box.width / 80)));
+    for (const v of across.at) {
+      trace(pen, [[x(v), bottom], [x(v), bottom + 4]], false);
+      pen.stroke();
+      pen.fillText(text(v, digitsOf(across.step)), x(v), bottom + 7);
+    }
+    pen.textAlign = "right";
+    pen.textBaseline = "middle";
+    const up = ticks(...spanY, 4);
+    for (const v of up.at) {
+      trace(pen, [[box.left - 4, y(v)], [box.left, y(v)]], false);
+      pen.stroke();
+      pen.fillText(text(v, digitsOf(up.step)), box.left - 8, y(v));
+    }
+    pen.strokeRect(box.left, box.top, box.width, box.height);
+    pen.textAlign = "center";
+    pen.textBaseline = "bottom";
+    pen.fillText(`${labels[0]} across, ${labels[1]} up`, box.left + box.width / 2, bottom + 40);
+  }
+
+  // --- ranking ---------------------------------------------------------------------------------------------
+
+  /** The mark of a kind, which does not rest on colour alone: a dot, a square, a diamond. */
+  function mark(kind, size = 4.5) {
+    if (kind === "controller") {
+      return draw("rect", { x: -size, y: -size, width: 2 * size, height: 2 * size, class: "dot" });
+    }
+    if (kind === "optimal") {
+      const r = 1.35 * size;
+      return draw("path", { d: `M0 ${-r}L${r} 0L0 ${r}L${-r} 0Z`, class: "dot" });
+    }
+    return draw("circle", { r: size, class: "dot" });
+  }
+
+  function spanOf(rows, optimum, near) {
+    const scored = rows.filter((row) => isNumber(row.score)).sort((a, b) => b.score - a.score);
+    const chosen = near ? scored.slice(0, Math.max(1, Math.ceil(scored.length / 2))) : scored;
+    const low = chosen.map((row) => row.interval?.[0] ?? row.score);
+    const high = chosen.map((row) => row.interval?.[1] ?? row.score);
+    const ends = near
+      ? [Math.min(...low), Math.max(...high, 1)]
+      : [Math.min(0, ...low.map((x) => Math.max(x, -0.3))), Math.max(1, ...high.map((x) => Math.min(x, 1.3)))];
+    if (near && isNumber(optimum)) ends[1] = Math.max(ends[1], Math.min(optimum, ends[1] + (ends[1] - ends[0])));
+    const pad = 0.05 * Math.max(ends[1] - ends[0], 1e-6);
+    return [ends[0] - pad, ends[1] + pad];
+  }
+
+  const percent = (v, [low, high]) => `${((100 * (v - low)) / (high - low)).toFixed(3)}%`;
+
+  /** Score and interval of a row as a bar on a common axis. */
+  function scorePicture(row, span, optimum, marks) {
+    const svg = draw("svg", { class: "bar", "aria-hidden": "true", width: "100%", height: "100%" });
+    const tick = (v, name) => {
+      if (v > span[0] && v < span[1]) {
+        svg.append(draw("line", { x1: percent(v, span), x2: percent(v, span), y1: "0", y2: "100%", class: name }));
+      }
+    };
+    svg.append(draw("line", { x1: "0", x2: "100%", y1: "50%", y2: "50%", class: "grid" }));
+    for (const v of marks) tick(v, "grid");
+    if (isNumber(optimum)) tick(optimum, "optimum");
+    if (!isNumber(row.score)) return svg;
+    const inside = (v) => clamp(v, ...span);
+    if (row.interval && row.interval[1] > span[0]) {
+      const [x1, x2] = row.interval.map((v) => percent(inside(v), span));
+      svg.append(draw("line", { x1, x2, y1: "50%", y2: "50%", class: "interval" }));
+    }
+    const place = { x: percent(inside(row.score), span), y: "50%", overflow: "visible" };
+    if (row.score >= span[0]) svg.append(draw("svg", place, mark(row.kind)));
+    else svg.append(draw("svg", { ...place, x: "0%" }, draw("path", { d: "M8 -5L1 0L8 5Z", class: "dot" })));
+    return svg;
+  }
+
+  function startRanking() {
+    const table = find(".ranking");
+    if (!table) return;
+    const rows = all("tbody tr", table).map((element) => ({ element, data: board.rows[element.dataset.row] }));
+    const body = find("tbody", table);
+    const form = find(".filter");
+    const order = find("[name=order]", form);
+    const status = find(".status");
+    const head = find("th.score", table);
+    const axis = make("span", { class: "axis", "aria-hidden": "true" });
+    head.append(axis);
+    rows.forEach(({ element, data }, i) => {
+      element.dataset.colour = i % COLOURS;
+      const swatch = draw("svg", { viewBox: "-8 -8 16 16", "aria-hidden": "true" }, mark(data.kind, 5));
+      find(".swatch", element).append(swatch);
+    });
+
+    function valueOf(data, key) {
+      const value = data[key];
+      if (key === "name") return String(value).toLowerCase();
+      if (key === "success" && value && typeof value === "object") return value.rate ?? null;
+      if (value && typeof value === "object") {
+        const numbers = Object.values(value).filter(isNumber);
+        return numbers.length ? Math.min(...numbers) : null;
+      }
+      return value ?? null;
+    }
+
+    function sort(key, rising) {
+      const way = rising ? 1 : -1;
+      rows.sort((p, q) => {
+        const [a, b] = [valueOf(p.data, key), valueOf(q.data, key)];
+        // What was not measured comes last, either way.
+        if (a === null || b === null) return (a === null) - (b === null);
+        const less = typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b;
+        return way * less || p.element.dataset.row - q.element.dataset.row;
+      });
+      body.append(...rows.map((row) => row.element));
+      for (const th of all("th[aria-sort]", table)) {
+        const mine = find("button", th).dataset.key === key;
+        th.setAttribute("aria-sort", mine ? (rising ? "ascending" : "descending") : "none");
+      }
+      order.value = key;
+    }
+
+    for (const th of all("th[aria-sort]", table)) {
+      const button = find("button", th);
+      button.addEventListener("click", () => {
+        const now = th.getAttribute("aria-sort");
+        const best = button.dataset.rising === "true";
+        const rising = now === "none" ? best : now !== "ascending";
+        sort(button.dataset.key, rising);
+        status.textContent = `Sorted by ${button.textContent}, ${rising ? "ascending" : "descending"}`;
+      });
+    }
+    order.addEventListener("change", () => {
+      const button = find(`th button[data-key="${CSS.escape(order.value)}"]`, table);
+      sort(order.value, button.dataset.rising === "true");
+    });
+
+    function filter() {
+      const words = form.elements.text.value.toLowerCase().split(/\s+/).filter(Boolean);
+      const kind = form.elements.kind.value;
+      let shown = 0;
+      for (const { element, data } of rows) {
+        const fits = (!kind || data.kind === kind) && words.every((word) => data.find.includes(word));
+        element.hidden = !fits;
+        shown += fits;
+      }
+      find(".none").hidden = shown > 0;
+      const total = `${rows.length} agent${rows.length === 1 ? "" : "s"}`;
+      status.textContent = shown === rows.length ? total : `${shown} of ${total}`;
+    }
+
+    function pictures() {
+      const span = spanOf(board.rows, board.optimum, form.elements.axis.value === "near");
+      const { at, step } = ticks(...span, 2);
+      for (const { element, data } of rows) {
+        find(".picture", element).replaceChildren(scorePicture(data, span, board.optimum, at));
+      }
+      axis.replaceChildren(...at.map((v) => {
+        const label = make("span", {}, text(v, digitsOf(step)));
+        label.style.left = percent(v, span);
+        return label;
+      }));
+    }
+
+    form.addEventListener("submit", (event) => event.preventDefault());
+    form.addEventListener("input", filter);
+    for (const input of all("[name=axis]", form)) input.addEventListener("change", pictures);
+    pictures();
+    // A browser that goes back to the page fills in what was there.
+    filter();
+  }
+
+  // --- charts ----------------------------------------------------------------------------------------------
+
+  const chosen = new Set();
+
+  function startCharts() {
+    const legend = find(".legend");
+    if (!legend) return null;
+    board.rows.slice(0, 5).forEach((_, i) => chosen.add(i));
+    board.rows.forEach((row, i) => {
+      const key = draw("svg", { viewBox: "-12 -8 24 16", "aria-hidden": "true" });
+      key.append(draw("line", { x1: -12, x2: 12, y1: 0, y2: 0, class: "curve" }), mark(row.kind, 4));
+      const name = make("bdi", {}, String(row.name));
+      const state = { type: "button", "data-colour": i % COLOURS, "aria-pressed": chosen.has(i) };
+      const chip = make("button", state, key, name);
+      chip.addEventListener("click", () => {
+        if (!chosen.delete(i)) chosen.add(i);
+        chip.setAttribute("aria-pressed", String(chosen.has(i)));
+        charts();
+      });
+      for (const [event, on] of [["pointerenter", 1], ["focus", 1], ["pointerleave", 0], ["blur", 0]]) {
+        chip.addEventListener(event, () => {
+          for (const line of all(`.charts [data-line="${i}"]`)) line.classList.toggle("strong", Boolean(on));
+        });
+      }
+      legend.append(chip);
+    });
+    return charts;
+  }
+
+  function charts() {
+    const profiles = board.rows.map((row, i) => ({ i, lines: row.profile.length ? [row.profile] : [] }));
+    const taus = profiles.flatMap(({ lines }) => lines.flat()).map(([tau]) => tau);
+    chart(find("#profile"), profiles, {
+      label: "Performance profile",
+      x: "τ, normalised score",
+      y: "share above τ",
+      spanX: taus.length ? [Math.max(-0.5, Math.min(...taus)), Math.min(1.2, Math.max(...taus))] : [0, 1],
+      spanY: [0, 1],
+      tell: (line) => `half of them above ${text(line.find((p) => p[1] <= 0.5)?.[0], 2)}`,
+    });
+    const curves = board.rows.map((row, i) => {
+      const seeds = row.curves.map(({ steps, scores }) => steps.map((x, j) => [x, scores[j]]));
+      return { i, lines: seeds.length ? [meanOf(seeds)] : [], faint: seeds.length > 1 ? seeds : [] };
+    });
+    const points = curves.flatMap(({ lines }) => lines.flat()).filter((p) => isNumber(p[1]));
+    const scores = points.map((p) => p[1]);
+    chart(find("#curves"), curves, {
+      label: "Learning curves",
+      x: "environment steps",
+      y: "score",
+      spanX: [0, points.reduce((most, p) => Math.max(most, p[0]), 1)],
+      spanY: [
+        scores.reduce((least, score) => Math.min(least, Math.max(score, -0.5)), 0),
+        scores.reduce((most, score) => Math.max(most, Math.min(score, 1.2)), 1),
+      ],
+      format: count,
+      tell: (line) => `${text(line[line.length - 1][1], 2)} in the end`,
+      empty: "No submission here states a learning curve.",
+    });
+  }
+
+  /** The mean over seeds, at the first seed's steps, as far as all go. */
+  function meanOf(seeds) {
+    const at = (line, x) => {
+      const k = line.findIndex((p) => p[0] >= x);
+      if (k < 0) return null;
+      if (k === 0 || line[k][0] === x) return line[k][1];
+      const [[ax, ay], [bx, by]] = [line[k - 1], line[k]];
+      return mix(ay, by, (x - ax) / (bx - ax));
+    };
+    return seeds[0].map(([x]) => {
+      const values = seeds.map((line) => at(line, x)).filter(isNumber);
+      return [x, values.length === seeds.length ? values.reduce((a, b) => a + b) / values.length : null];
+    }).filter((p) => isNumber(p[1]));
+  }
+
+  function chart(place, series, { label, x: nameX, y: nameY, spanX, spanY, format, tell, empty }) {
+    const width = place.clientWidth;
+    if (!width) return;
+    if (!series.some(({ lines }) => lines.length)) {
+      place.replaceChildren(make("p", { class: "note" }, empty ?? "Nothing was measured."));
+      return;
+    }
+    const height = clamp(Math.round(0.62 * width), 220, 360);
+    const box = { left: 40, right: width - 20, top: 22, bottom: height - 40 };
+    const x = (v) => mix(box.left, box.right, (v - spanX[0]) / (spanX[1] - spanX[0]));
+    const y = (v) => mix(box.bottom, box.top, (v - spanY[0]) / (spanY[1] - spanY[0]));
+    const told = series.filter(({ i, lines }) => chosen.has(i) && lines.length);
+    const words = told.map(({ i, lines }) => `${board.rows[i].name}, ${tell(lines[0])}`).join("; ");
+    const name = `${label}: ${words || "all in grey"}`;
+    const svg = draw("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": name });
+    const across = ticks(...spanX, Math.max(2, Math.round(width / 110)));
+    for (const v of across.at) {
+      svg.append(draw("line", { x1: x(v), x2: x(v), y1: box.top, y2: box.bottom, class: "grid" }));
+      const words = format ? format(v) : text(v, digitsOf(across.step));
+      svg.append(draw("text", { x: x(v), y: box.bottom + 18, "text-anchor": "middle" }, words));
+    }
+    const up = ticks(...spanY, 4);
+    for (const v of up.at) {
+      svg.append(draw("line", { x1: box.left, x2: box.right, y1: y(v), y2: y(v), class: v === 0 ? "zero" : "grid" }));
+      svg.append(draw("text", { x: box.left - 8, y: y(v) + 4, "text-anchor": "end" }, text(v, digitsOf(up.step))));
+    }
+    svg.append(draw("text", { x: box.right, y: height - 4, "text-anchor": "end" }, nameX));
+    svg.append(draw("text", { x: 0, y: 12 }, nameY));
+    const path = (line) => {
+      let d = "";
+      for (const [a, b] of line) {
+        if (!isNumber(a) || !isNumber(b) || a < spanX[0] || a > spanX[1]) continue;
+        d += `${d ? "L" : "M"}${x(a).toFixed(1)} ${clamp(y(b), box.top - 4, box.bottom + 4).toFixed(1)}`;
+      }
+      return d;
+    };
+    // Grey ones first, so that they lie below.
+    const ordered = [...series].sort((a, b) => chosen.has(a.i) - chosen.has(b.i) || b.i - a.i);
+    for (const { i, lines, faint = [] } of ordered) {
+      const look = chosen.has(i) ? "chosen" : "other";
+      const group = draw("g", { "data-line": i, "data-colour": i % COLOURS, class: look });
+      if (i >= COLOURS) group.classList.add("dashed");
+      for (const line of chosen.has(i) ? faint : []) group.append(draw("path", { d: path(line), class: "faint" }));
+      for (const line of lines) group.append(draw("path", { d: path(line), class: "curve" }));
+      svg.append(group);
+    }
+    const hint = draw("text", { x: box.right, y: 12, "text-anchor": "end", class: "hint" });
+    svg.append(hint);
+    svg.addEventListener("pointermove", (event) => {
+      const at = svg.getBoundingClientRect();
+      const [px, py] = [event.clientX - at.left, event.clientY - at.top];
+      let best = null;
+      for (const { i, lines } of series) {
+        for (const line of lines) {
+          for (const [a, b] of line) {
+            const away = Math.abs(x(a) - px) + Math.abs(y(b) - py);
+            if (isNumber(b) && away < 40 && !(away >= best?.away)) best = { i, away, a, b };
+          }
+        }
+      }
+      for (const group of all("g", svg)) group.classList.toggle("strong", Number(group.dataset.line) === best?.i);
+      hint.textContent = best ? `${board.rows[best.i].name}: ${text(best.b)}` : "";
+    });
+    svg.addEventListener("pointerleave", () => {
+      hint.textContent = "";
+      for (const group of all("g", svg)) group.classList.remove("strong");
+    });
+    place.replaceChildren(svg);
+  }
+
+  // --- overview --------------------------------------------------------------------------------------------
+
+  function strip(place, { rows, optimum }) {
+    const span = spanOf(rows, optimum, false);
+    const svg = draw("svg", { class: "bar", width: "100%", height: "100%", "aria-hidden": "true" });
+    svg.append(draw("line", { x1: "0", x2: "100%", y1: "50%", y2: "50%", class: "grid" }));
+    for (const v of [0, 0.5, 1]) {
+      svg.append(draw("line", { x1: percent(v, span), x2: percent(v, span), y1: "15%", y2: "85%", class: "grid" }));
+      if (v !== 0.5) svg.append(draw("text", { x: percent(v, span), y: "36", "text-anchor": "middle" }, String(v)));
+    }
+    for (const row of [...rows].reverse()) {
+      if (!isNumber(row.score)) continue;
+      const at = { x: percent(clamp(row.score, ...span), span), y: "50%", overflow: "visible" };
+      svg.append(draw("svg", at, mark(row.kind, 4)));
+    }
+    place.append(svg);
+  }
+
+  // --- start -----------------------------------------------------------------------------------------------
+
+  window.lagEnvs = { put, shapesOf, windowOf };
+  const data = JSON.parse(find("#data").textContent);
+  document.documentElement.classList.add("js");
+  readColours();
+  const redraw = [];
+  if (Array.isArray(data)) {
+    for (const place of all("[data-strip]")) strip(place, data[place.dataset.strip]);
+    redraw.push(() => {
+      for (const canvas of all("[data-poster]")) poster(canvas, data[canvas.dataset.poster]);
+    });
+  } else {
+    board = data;
+    startRanking();
+    redraw.push(startPlayer(), startCharts(), () => {
+      for (const canvas of all("[data-poster]")) poster(canvas, board);
+    });
+  }
+  const again = () => redraw.forEach((each) => each?.());
+  again();
+  let width = 0;
+  new ResizeObserver(() => {
+    if (document.body.clientWidth === width) return;
+    width = document.body.clientWidth;
+    requestAnimationFrame(again);
+  }).observe(document.body);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+    readColours();
+    again();
+  });
+  // Keep the present environment in sight where the list of them is scrolled.
+  const here = find(".top nav [aria-current]");
+  if (here) here.closest("ul").scrollLeft = here.offsetLeft - 24;
+})();

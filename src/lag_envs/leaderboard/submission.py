@@ -1,0 +1,452 @@
+"""Read and write a submission: a folder with ``submission.toml`` and arrays. Nothing in it is ever run.
+
+Reading goes from the outside inward: which files there are and how large, then the text, then the header of
+each file of arrays, and only then the arrays. What is refused is refused before more is read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.fields import Fields, shown
+from lag_envs.leaderboard.policies import Architecture, Controller, Policy, architecture
+from lag_envs.leaderboard.protocol import Refused
+
+__all__ = ["KINDS", "Refused", "Submission", "load", "write"]
+
+TOML = "submission.toml"
+KINDS = ("learned", "controller", "optimal")
+#: Training seeds lie below this.
+MOST_SEED = 10**9
+POLICY = re.compile(r"policy_(0|[1-9][0-9]{0,8})\.safetensors")
+DTYPES = {"F32": 4, "F64": 8}
+
+
+@dataclass(frozen=True)
+class Submission:
+    """A submission whose every byte has been checked.
+
+    Parameters
+    ----------
+    env, name, license, kind : str
+        As in ``submission.toml``; `kind` is "learned", "controller" or "optimal".
+    authors : tuple of str
+        Who made it.
+    policies : tuple of (int, Policy)
+        Training seed and policy, by growing seed.
+    digest : str
+        SHA-256 of names and contents of the folder's files.
+    folder : Path
+        Where it was read.
+    code, description : str
+        Empty where not given.
+    training : mapping
+        ``{"env_steps", "seconds", "hardware", "curves": [{"seed", "steps": [...], "returns": [...]}]}``;
+        empty where not given. All of it is claimed, not verified.
+    """
+
+    env: str
+    name: str
+    authors: tuple[str, ...]
+    license: str
+    kind: str
+    policies: tuple[tuple[int, Policy], ...]
+    digest: str
+    folder: Path
+    code: str = ""
+    description: str = ""
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+def load(folder: Path | str) -> Submission:
+    """Read a submission.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+
+    Raises
+    ------
+    Refused
+        For anything that is not as it should be; the text says what.
+    """
+    folder = Path(folder)
+    files = _read_files(folder)
+    top = Fields("", _parse(files[TOML]))
+    top.where = TOML
+    for key, ours in (("schema", protocol.SCHEMA), ("protocol", protocol.PROTOCOL)):
+        if (value := top.any(key)) != ours or type(value) is not int:
+            raise Refused(f"{TOML}: {key} must be {ours}, the only one accepted here, got {shown(value)}")
+    env = top.choice("env", protocol.GOALS)
+    kind = top.choice("kind", KINDS)
+    about: dict[str, Any] = {
+        "name": top.text("name", 60, pattern=r".*[A-Za-z0-9].*"),
+        "authors": top.texts("authors", 1, 20, 80, r".*\S.*"),
+        "license": top.text("license", 60, pattern=r"[A-Za-z0-9][A-Za-z0-9.+() -]*"),
+        "code": top.text("code", 200, "", r"(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?"),
+        "description": top.text("description", 500, ""),
+    }
+    made = architecture(env, top.table("policy"))
+    found = sorted(int(match[1]) for name in files if (match := POLICY.fullmatch(name)))
+    training = _training(top, kind, found)
+    top.done()
+    _check_kind(kind, made, found)
+    if kind == "learned":
+        _check_different(files, found)
+    policies = []
+    for seed in found if made.arrays else [0]:
+        name = f"policy_{seed}.safetensors"
+        arrays = _arrays(name, files[name], made) if made.arrays else {}
+        policy = Policy(made, arrays)
+        try:
+            policy.agent()
+        except Refused as error:
+            raise Refused(f"{name}: {error}" if made.arrays else f"{TOML}: {error}") from error
+        policies.append((seed, policy))
+    return Submission(
+        env, **about, kind=kind, policies=tuple(policies), digest=_digest(files), folder=folder,
+        training=training,
+    )  # fmt: skip
+
+
+def _read_files(folder: Path) -> dict[str, bytes]:
+    """Return the files' contents by name; nothing but plain files with the right names is opened."""
+    try:
+        if not stat.S_ISDIR(os.lstat(folder).st_mode):
+            raise Refused(f"{shown(str(folder))} is no folder (links are not followed)")
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry, _ in zip(entries, range(protocol.MOST_POLICIES + 2), strict=False)]
+    except OSError as error:
+        raise Refused(f"{shown(str(folder))} cannot be read: {error.strerror}") from error
+    for name in sorted(names):
+        if name != TOML and not POLICY.fullmatch(name):
+            raise Refused(
+                f"unknown file {shown(name)}: only {TOML} and policy_<seed>.safetensors belong here"
+            )
+    if len(names) > protocol.MOST_POLICIES + 1:
+        raise Refused(f"there are more than {protocol.MOST_POLICIES} policies")
+    if TOML not in names:
+        raise Refused(f"there is no {TOML}")
+    sizes = {}
+    for name in sorted(names):
+        about = os.lstat(folder / name)
+        if not stat.S_ISREG(about.st_mode):
+            raise Refused(f"{name} is no plain file; links, folders and devices are refused")
+        most = protocol.TOML_BYTES if name == TOML else protocol.POLICY_BYTES
+        if about.st_size > most:
+            raise Refused(f"{name} has {about.st_size} bytes, at most {most} are accepted")
+        sizes[name] = about.st_size
+    if sum(sizes.values()) > protocol.FOLDER_BYTES:
+        raise Refused(
+            f"the files have {sum(sizes.values())} bytes, at most {protocol.FOLDER_BYTES} are accepted"
+        )
+    return {name: _read(folder / name, size) for name, size in sizes.items()}
+
+
+def _read(file: Path, size: int) -> bytes:
+    """Return a file's content; refuse one that has been exchanged since it was looked at."""
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        with os.fdopen(os.open(file, flags | getattr(os, "O_BINARY", 0)), "rb") as opened:
+            content = opened.read(size + 1) if stat.S_ISREG(os.fstat(opened.fileno()).st_mode) else b""
+    except OSError as error:
+        raise Refused(f"{file.name} cannot be read: {error.strerror}") from error
+    if len(content) != size:
+        raise Refused(f"{file.name} changed while it was read")
+    return content
+
+
+def _parse(content: bytes) -> dict[str, Any]:
+    """Return what a TOML file holds."""
+    import tomllib
+
+    try:
+        text = content.decode()
+    except UnicodeDecodeError as error:
+        raise Refused(f"{TOML} is no UTF-8 text (byte {error.start})") from error
+    # Reading keys of many parts takes time in proportion to the square of their number.
+    if any(len(line) > protocol.LINE for line in text.split("\n")):
+        raise Refused(f"{TOML} has a line of more than {protocol.LINE} characters; break it")
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise Refused(f"{TOML} is nested too deep") from error
+    except Exception as error:  # not only TOMLDecodeError: numbers of too many digits, dates
+        raise Refused(f"{TOML} is no TOML: {shown(str(error))}") from error
+
+
+def _training(top: Fields, kind: str, found: list[int]) -> dict[str, Any]:
+    """Return the table ``[training]``; `found` are the seeds of which there are policies."""
+    if "training" not in top:
+        if kind == "learned":
+            raise Refused(f"{TOML}: [training] is missing; learned policies need it")
+        return {}
+    table = top.table("training")
+    seeds = table.wholes("seeds", 0, protocol.MOST_POLICIES, 0, MOST_SEED - 1, [])
+    if sorted(seeds) != found:
+        raise Refused(f"{table.where}: seeds must be those of the policy files, {found}; got {sorted(seeds)}")
+    result: dict[str, Any] = {
+        "env_steps": table.whole("env_steps", 0, 10**15),
+        "seconds": table.number("seconds", 0.0, 1e12),
+        "hardware": table.text("hardware", 200),
+        "curves": [],
+    }
+    for curve in table.tables("curves", protocol.MOST_POLICIES):
+        seed = curve.whole("seed", 0, MOST_SEED - 1)
+        steps = curve.numbers("steps", 1, protocol.CURVE, 0.0, 1e15)
+        returns = curve.numbers("returns", 1, protocol.CURVE, -1e9, 1e9)
+        curve.done()
+        if seed not in found or any(c["seed"] == seed for c in result["curves"]):
+            raise Refused(f"{curve.where}: seed must be one of {found}, each at most once, got {seed}")
+        if len(steps) != len(returns) or any(b <= a for a, b in pairwise(steps)):
+            raise Refused(f"{curve.where}: steps must grow, and be as many as the returns")
+        result["curves"].append({"seed": seed, "steps": list(steps), "returns": list(returns)})
+    table.done()
+    return result
+
+
+def _check_kind(kind: str, made: Architecture, found: list[int]) -> None:
+    """Refuse the wrong number of policies for a kind and an architecture."""
+    if isinstance(made, Controller) and kind != "controller":
+        raise Refused(f'a built-in controller must be submitted as kind "controller", got "{kind}"')
+    if not made.arrays:
+        if found:
+            raise Refused(f"policy_{found[0]}.safetensors: a built-in controller has no arrays; remove it")
+        return
+    least = protocol.LEARNED_POLICIES if kind == "learned" else 1
+    if len(found) < least:
+        raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
+
+
+def _check_different(files: Mapping[str, bytes], found: list[int]) -> None:
+    """Refuse one learned policy under two seeds."""
+    first: dict[bytes, int] = {}
+    for seed in found:
+        content = files[f"policy_{seed}.safetensors"]
+        if (other := first.setdefault(content, seed)) != seed:
+            raise Refused(
+                f"the policies of seeds {other} and {seed} are the same; each needs its own training"
+            )
+
+
+def _digest(files: Mapping[str, bytes]) -> str:
+    total = hashlib.sha256()
+    for name in sorted(files):
+        total.update(f"{name}\n{len(files[name])}\n".encode() + files[name])
+    return total.hexdigest()
+
+
+# --- arrays -------------------------------------------------------------------------------------------------
+
+
+def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of a file, which must be the ones that the architecture asks for."""
+    _check_shapes(name, _header(name, content), made)
+    from safetensors import SafetensorError
+    from safetensors.numpy import load as read
+
+    try:
+        found = read(content)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise Refused(f"{name} is no safetensors file: {shown(str(error))}") from error
+    arrays = {}
+    for key, array in found.items():
+        if not np.isfinite(array).all():
+            raise Refused(f"{name}: {key} has entries that are not finite")
+        arrays[key] = np.ascontiguousarray(array, np.float64)
+        arrays[key].flags.writeable = False
+    return arrays
+
+
+def _header(name: str, content: bytes) -> dict[str, tuple[int, ...]]:
+    """Return the shapes that a safetensors file's header tells, checked against the file's size."""
+
+    def refuse(why: str) -> Refused:
+        return Refused(f"{name} is no safetensors file as needed here: {why}")
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(dict(pairs)) < len(pairs):
+            raise ValueError("a key occurs twice")
+        return dict(pairs)
+
+    size = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or size > protocol.HEADER_BYTES or 8 + size > len(content):
+        raise refuse(f"its header must end within the file and have at most {protocol.HEADER_BYTES} bytes")
+    try:
+        header = json.loads(content[8 : 8 + size].decode(), object_pairs_hook=once)
+    except (ValueError, RecursionError) as error:
+        raise refuse(f"its header is no JSON ({shown(str(error))})") from error
+    if not isinstance(header, dict) or not header:
+        raise refuse("its header must be an object with an entry for each array")
+    shapes, ranges = {}, []
+    for key, entry in header.items():
+        if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
+            raise refuse(f"the entry {shown(key)} must have dtype, shape and data_offsets and nothing else")
+        dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+        if not isinstance(dtype, str) or dtype not in DTYPES:
+            raise refuse(f"{shown(key)} must be of F32 or F64, got {shown(dtype)}")
+        for what, numbers, most in (("shape", shape, 8), ("data_offsets", offsets, 2)):
+            if (
+                not isinstance(numbers, list)
+                or len(numbers) > most
+                or any(type(n) is not int or not 0 <= n <= len(content) for n in numbers)
+            ):
+                raise refuse(f"{shown(key)}: {what} must be whole numbers that fit the file")
+        count = 1
+        for n in shape:
+            count *= n
+        if len(offsets) != 2 or offsets[1] - offsets[0] != count * DTYPES[dtype]:
+            raise refuse(f"{shown(key)}: data_offsets do not fit the shape")
+        shapes[key] = tuple(shape)
+        ranges.append(tuple(offsets))
+    end = 0
+    for first, last in sorted(ranges):
+        if first != end:
+            raise refuse("its arrays overlap, or leave gaps")
+        end = last
+    if 8 + size + end != len(content):
+        raise refuse("its arrays do not fill the file")
+    return shapes
+
+
+def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Architecture) -> None:
+    """Refuse arrays that are not the architecture's."""
+    if set(shapes) != set(made.arrays):
+        odd = sorted(set(shapes) ^ set(made.arrays))[0]
+        what = "is missing" if odd in made.arrays else "is not known"
+        raise Refused(f"{name}: array {shown(odd)} {what}; needed are {', '.join(made.arrays)}")
+    lengths: dict[str, int] = {}
+    for key, needed in made.arrays.items():
+        shape = shapes[key]
+        if len(shape) != len(needed):
+            raise Refused(f"{name}: {key} must have {len(needed)} axes, got the shape {shape}")
+        for n, wanted in zip(shape, needed, strict=True):
+            if isinstance(wanted, str):
+                wanted = lengths.setdefault(wanted, max(n, 2))
+            if n != wanted:
+                raise Refused(f"{name}: {key} must have the shape {_told(needed, lengths)}, got {shape}")
+
+
+def _told(shape: tuple[int | str, ...], lengths: Mapping[str, int]) -> str:
+    return "(" + ", ".join(str(lengths.get(n, n) if isinstance(n, str) else n) for n in shape) + ")"
+
+
+# --- writing ------------------------------------------------------------------------------------------------
+
+
+def write(
+    folder: Path | str,
+    *,
+    env: str,
+    name: str,
+    authors: list[str] | tuple[str, ...],
+    license: str,
+    kind: str,
+    policy: Mapping[str, Any],
+    arrays: Mapping[int, Mapping[str, NDArray[Any]]] | None = None,
+    training: Mapping[str, Any] | None = None,
+    code: str = "",
+    description: str = "",
+) -> Submission:
+    """Write a submission into a new folder, whole or not at all, and return it as `load` reads it.
+
+    Parameters
+    ----------
+    folder : Path
+        Must not exist.
+    env, name, authors, license, kind, code, description
+        See `Submission`.
+    policy : mapping
+        The table ``[policy]``.
+    arrays : mapping of int to mapping of str to ndarray
+        For each training seed the arrays, of float32 or float64; none for a built-in controller.
+    training : mapping, optional
+        The table ``[training]``, without ``seeds``.
+
+    Raises
+    ------
+    Refused
+        For what `load` would refuse.
+    FileExistsError
+        For a folder that is there.
+    """
+    from safetensors.numpy import save
+
+    folder, arrays = Path(folder), arrays or {}
+    if os.path.lexists(folder):
+        raise FileExistsError(f"{folder} is there already")
+    about: dict[str, Any] = {
+        "schema": protocol.SCHEMA, "protocol": protocol.PROTOCOL, "env": env, "name": name,
+        "authors": list(authors), "license": license, "kind": kind,
+    }  # fmt: skip
+    about |= {key: text for key, text in (("code", code), ("description", description)) if text}
+    if training:
+        about["training"] = {"seeds": sorted(arrays), **training}
+    about["policy"] = dict(policy)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        part.chmod(0o755)
+        (part / TOML).write_text("\n".join(_toml(about)) + "\n", encoding="utf-8", newline="\n")
+        for seed, content in arrays.items():
+            found = {key: np.ascontiguousarray(array) for key, array in content.items()}
+            (part / f"policy_{seed}.safetensors").write_bytes(save(found))
+        load(part)
+        part.rename(folder)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return load(folder)
+
+
+def _toml(table: Mapping[str, Any], path: str = "") -> list[str]:
+    """Return the lines of a TOML table; its own values first, then the tables in it."""
+    lines = [f"{key} = {_value(v)}" for key, v in table.items() if not _is_table(v)]
+    for key, value in table.items():
+        name = f"{path}{key}"
+        if isinstance(value, Mapping):
+            lines += ["", f"[{name}]", *_toml(value, f"{name}.")]
+        elif _is_table(value):
+            for row in value:
+                lines += ["", f"[[{name}]]", *_toml(row, f"{name}.")]
+    return lines
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, Mapping) or (
+        isinstance(value, list | tuple) and len(value) > 0 and isinstance(value[0], Mapping)
+    )
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        parts = [_value(v) for v in value]
+        if sum(map(len, parts)) < 90:
+            return f"[{', '.join(parts)}]"
+        return "[\n" + "".join(f"  {part},\n" for part in parts) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)  # a JSON string is one of TOML
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | np.integer):
+        return str(int(value))
+    return repr(float(value))

@@ -1,0 +1,378 @@
+"""Recompute the scores of a submission: 1,000 episodes of each policy, and how it bears disturbances."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import itertools
+import json
+import math
+import platform
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs import __version__
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.policies import Policy
+from lag_envs.leaderboard.submission import Refused, Submission, load
+
+Array = NDArray[np.float64]
+#: Libraries on which the bits of a trajectory depend.
+PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "safetensors")
+#: Given at each step: controls, actions, rewards, terminations, truncations, and which episodes still run.
+Watch = Callable[[Any, Array, Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]], Any]
+
+
+def verify(
+    submission: Submission,
+    nonce: str,
+    episodes: int = protocol.EPISODES,
+    progress: Callable[[int, int], Any] | None = None,
+) -> dict[str, Any]:
+    """Return what a submission's policies get, all of it recomputed.
+
+    Parameters
+    ----------
+    submission : Submission
+        The submission.
+    nonce : str
+        Decides the episodes together with the submission's digest, see `protocol.first_seed`.
+    episodes : int
+        Episodes of each policy; under disturbances at most `protocol.DISTURBED_EPISODES`.
+    progress : callable, optional
+        Called now and then with the steps taken, and the steps that there are at most.
+
+    Returns
+    -------
+    dict
+        Of JSON types: protocol, env, digest, nonce, episodes, policies, robustness, often, seconds, machine,
+        versions. ``policies`` has for each one its seed, the episodes' returns, successes, times [s] (None
+        where the goal was not reached) and efforts (mean of (u/U)²), and a hash of all actions, rewards and
+        ends. ``robustness`` maps disturbances to the policies' mean returns; ``often`` has those for acting
+        ten times as often, None for an agent that counts steps and cannot.
+
+    Raises
+    ------
+    Refused
+        Where a policy fails, or returns what is no action.
+    """
+    if not 1 <= episodes <= 100_000:
+        raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
+    started = time.perf_counter()
+    env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
+    conditions = protocol.disturbances(env)
+    faster = protocol.often(env)
+    limit = int(protocol.make_task(env).limit)
+    runs = [limit * episodes, *[limit * few] * len(conditions), 10 * limit * few]
+    work = sum(runs) * len(submission.policies)
+    done, through = 0, 0
+
+    def tick(n: int) -> None:
+        nonlocal done
+        done += n
+        if progress is not None:
+            progress(done, work)
+
+    def skip() -> None:
+        """Count a run that ended early, or was left out, as run to its end."""
+        nonlocal through
+        through += runs[next(order)]
+        tick(through - done)
+
+    policies: list[dict[str, Any]] = []
+    robustness: dict[str, list[float]] = {name: [] for name in conditions}
+    often: list[float | None] = []
+    for number, (seed, policy) in enumerate(submission.policies):
+        order = itertools.count()
+        first = protocol.first_seed(submission.digest, nonce, number)
+        record = _Record(env, episodes)
+        try:
+            returns = _play(env, policy, first, episodes, watch=record, tick=tick)
+            skip()
+            for name, options in conditions.items():
+                robustness[name].append(float(_play(env, policy, first, few, tick=tick, **options).mean()))
+                skip()
+            agent = policy.agent()
+            able = hasattr(agent, "pace") or type(agent).__name__ != "ILQR"
+            mean = _play(env, policy, first, few, tick=tick, **faster).mean() if able else None
+            often.append(None if mean is None else float(mean))
+            skip()
+        except Refused as error:
+            raise Refused(f"policy of seed {seed}: {error}") from error
+        policies.append({"seed": seed, "returns": returns.tolist(), **record.result()})
+    return {
+        "protocol": protocol.PROTOCOL,
+        "env": env,
+        "digest": submission.digest,
+        "nonce": nonce,
+        "episodes": episodes,
+        "policies": policies,
+        "robustness": robustness,
+        "often": often,
+        "seconds": round(time.perf_counter() - started, 2),
+        "machine": _machine(),
+        "versions": {"python": platform.python_version(), "lag-envs": __version__}
+        | {name: version(name) for name in PACKAGES},
+    }
+
+
+def _machine() -> dict[str, Any]:
+    from lag_envs.benchmark import machine
+
+    return machine()
+
+
+def _play(
+    env_id: str,
+    policy: Policy,
+    seed: int,
+    episodes: int,
+    *,
+    watch: Watch | None = None,
+    tick: Callable[[int], Any] = lambda n: None,
+    **options: Any,
+) -> Array:
+    """Return a policy's returns (episodes,) in episodes with reset seeds from `seed` on, stepped together."""
+    import gymnasium as gym
+
+    agent = policy.agent()
+    # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
+    envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep", **options)
+    bare: Any = envs.unwrapped
+    if hasattr(agent, "pace"):
+        agent.pace = bare.task.dt / bare.task.interval
+    observation, _ = envs.reset(seed=seed)
+    state, returns, running = None, np.zeros(episodes), np.ones(episodes, np.bool_)
+    if watch is not None:
+        watch(bare, returns[:0], returns[:0], running[:0], running[:0], running[:0])
+    start = running.copy()
+    while running.any():
+        action, state = _act(agent, observation, state, start)
+        observation, reward, terminated, truncated, _ = envs.step(action)
+        returns += np.where(running, reward, 0.0)
+        if watch is not None:
+            watch(bare, action[:, 0], reward, terminated, truncated, running)
+        running &= ~(terminated | truncated)
+        start = np.zeros(episodes, np.bool_)
+        tick(episodes)
+    envs.close()
+    return returns
+
+
+def _act(agent: Any, observation: Any, state: Any, start: NDArray[np.bool_]) -> tuple[Any, Any]:
+    try:
+        with np.errstate(all="ignore"):
+            action, state = agent.predict(observation, state, start, deterministic=True)
+    except Exception as error:  # whatever senseless numbers lead to
+        raise Refused(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
+    if action.shape != (len(observation), 1) or not np.isfinite(action).all():
+        raise Refused("it returned an action that is not a finite number")
+    return action, state
+
+
+class _Record:
+    """Watches episodes: when the goal is reached, the effort, and a hash of all that happens."""
+
+    def __init__(self, env_id: str, episodes: int) -> None:
+        self.goal = protocol.GOALS[env_id]
+        self.hash = hashlib.sha256()
+        self.effort, self.steps = np.zeros(episodes), np.zeros(episodes)
+        #: Step after which the goal holds for the first time, and without a break; 0 and inf: never.
+        self.first, self.last = np.full(episodes, math.inf), np.zeros(episodes)
+        self.ended = np.zeros(episodes, np.bool_)
+
+    def __call__(
+        self, bare: Any, action: Array, reward: Array, terminated: Any, truncated: Any, running: Any
+    ) -> None:
+        self.task, targets = bare.task, bare.target
+        states = bare.state
+        inside = self.goal.inside(self.task, states, np.zeros(len(states)) if targets is None else targets)
+        if len(running) == 0:  # the start
+            self.first[inside] = 0.0
+            self.last[~inside] = 1.0
+            return
+        self.steps += running
+        self.effort += np.where(running, (bare.control / self.task.limit_control) ** 2, 0.0)
+        self.first = np.where(running & inside, np.minimum(self.first, self.steps), self.first)
+        self.last = np.where(running & ~inside, self.steps + 1.0, self.last)
+        self.ended |= running & terminated
+        for array in (np.asarray(action, "<f4"), np.asarray(reward, "<f8"), terminated, truncated):
+            self.hash.update(np.where(running, array, array.dtype.type(0)).tobytes())
+
+    def result(self) -> dict[str, Any]:
+        """Return success, time, effort and the hash."""
+        goal, dt = self.goal, self.task.dt
+        if goal.hold is None:
+            reached = np.where(np.isfinite(self.first), self.first * dt, math.nan)
+        else:
+            holds = (self.last + goal.hold / dt <= self.steps + 1e-6) & (self.ended == bool(goal.terminated))
+            reached = np.where(holds, self.last * dt, math.nan)
+        if goal.terminated is None:
+            success = ~self.ended
+        else:
+            success = np.isfinite(reached) & (self.ended == goal.terminated)
+        return {
+            "success": success.tolist(),
+            "settle": [None if math.isnan(t) else round(t, 9) for t in reached],
+            "effort": (self.effort / self.steps).tolist(),
+            "trajectory": self.hash.hexdigest(),
+        }
+
+
+def episode(submission: Submission, policy: int, seed: int) -> dict[str, Any]:
+    """Return a recorded episode for replay, in JSON types.
+
+    Networks and linear feedback go through the same numbers as in the verification, bit for bit; other agents
+    may differ in the last digit, as the libraries under them round differently for another number of rows.
+
+    Parameters
+    ----------
+    submission : Submission
+        The submission.
+    policy : int
+        Number of the policy, from 0.
+    seed : int
+        Reset seed; episode i of a verification has ``protocol.first_seed(digest, nonce, policy) + i``.
+
+    Returns
+    -------
+    dict
+        ``seed`` (of the training), ``reset_seed``, ``return``, ``dt`` [s], ``states`` (steps + 1 of them, in
+        SI units), ``actions`` and ``rewards`` (steps), ``target`` (or None); rounded to 6 digits.
+    """
+    training_seed, chosen = submission.policies[policy]
+    states, actions, rewards = [], [], []
+    dt, target = 0.0, None
+
+    def watch(bare: Any, action: Array, reward: Array, *ends: Any) -> None:
+        nonlocal dt, target
+        dt, target = bare.task.dt, None if bare.target is None else float(bare.target[0])
+        states.append([_rounded(x) for x in bare.state[0]])
+        if len(action):
+            actions.append(_rounded(action[0]))
+            rewards.append(_rounded(reward[0]))
+
+    total = _play(submission.env, chosen, seed, 1, watch=watch)[0]
+    return {
+        "seed": training_seed, "reset_seed": seed, "return": float(total), "dt": dt, "states": states,
+        "actions": actions, "rewards": rewards, "target": None if target is None else _rounded(target),
+    }  # fmt: skip
+
+
+def _rounded(x: Any) -> float:
+    return float(f"{x:.6g}")
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+def verify_folder(
+    folder: Path,
+    nonce: str = "",
+    episodes: int = protocol.EPISODES,
+    progress: Callable[[int, int], Any] | None = None,
+) -> dict[str, Any]:
+    """Return the result of `verify` for a folder, or ``{"refused": reason}``."""
+    try:
+        return verify(load(folder), nonce, episodes, progress)
+    except Refused as error:
+        return {"refused": str(error)}
+
+
+def declare_verify(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``verify``."""
+    parser.add_argument("folders", metavar="FOLDER", nargs="+", help="a submission")
+    parser.add_argument("--nonce", default="", help="decides the episodes (default: none)")
+    parser.add_argument(
+        "--episodes", metavar="N", type=int, default=protocol.EPISODES,
+        help="episodes of each policy (default: %(default)s, what the board asks for)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--jobs", metavar="N", type=int, default=1, help="submissions side by side (default: 1)"
+    )
+    parser.add_argument("--ray", metavar="ADDRESS", help='spread them over a Ray cluster; "local" starts one')
+    parser.add_argument("--json", metavar="FILE", help="write all results to this file")
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    """Verify submissions and print what they get; return 1 where one was refused."""
+    from lag_envs.cli import UserError
+
+    if not 1 <= args.episodes <= 100_000:
+        raise UserError(f"--episodes must lie between 1 and 100000, got {args.episodes}")
+    if args.jobs < 1:
+        raise UserError(f"--jobs must be at least 1, got {args.jobs}")
+    if args.json and not Path(args.json).absolute().parent.is_dir():
+        raise UserError(f"--json: there is no folder {Path(args.json).absolute().parent}")
+    folders = [Path(folder) for folder in args.folders]
+    results = []
+    for folder, result in _results(folders, args):
+        if isinstance(result, Exception):
+            raise result
+        results.append({"folder": str(folder)} | result)
+        print("\n".join(table(results[-1])), flush=True)
+    if args.json:
+        Path(args.json).write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
+    return 1 if any("refused" in result for result in results) else 0
+
+
+def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
+    """Verify here, with a progress bar, or where it was asked for."""
+    from lag_envs.cli import UserError
+    from lag_envs.leaderboard.spread import SpreadError, map_submissions
+
+    if args.jobs == 1 and args.ray is None:
+        for folder in folders:
+            yield folder, _with_bar(folder, args.nonce, args.episodes)
+        return
+    function = partial(verify_folder, nonce=args.nonce, episodes=args.episodes)
+    try:
+        yield from map_submissions(function, folders, args.jobs, args.ray)
+    except SpreadError as error:
+        raise UserError(str(error)) from error
+
+
+def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
+    from tqdm import tqdm
+
+    with tqdm(desc=folder.name, unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5) as bar:
+
+        def show(done: int, work: int) -> None:
+            bar.total = work
+            bar.update(done - bar.n)
+
+        return verify_folder(folder, nonce, episodes, show)
+
+
+def table(result: dict[str, Any]) -> list[str]:
+    """Return a result as lines of text."""
+    from lag_envs.scores import score
+
+    if "refused" in result:
+        return [f"{result['folder']}: refused: {result['refused']}"]
+    env = result["env"]
+    lines = [
+        f"{result['folder']}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
+        f"  {'seed':>6}  {'return':>12}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
+    ]
+    for policy in result["policies"]:
+        mean = float(np.mean(policy["returns"]))
+        times = [t for t in policy["settle"] if t is not None]
+        part = score(env, mean)
+        lines.append(
+            f"  {policy['seed']:>6}  {mean:12.5g}  {'' if part is None else f'{part:.4f}':>7}"
+            f"  {np.mean(policy['success']):7.1%}  {f'{np.median(times):.2f} s' if times else '-':>7}"
+            f"  {np.mean(policy['effort']):6.3f}"
+        )
+    worst = min(result["robustness"], key=lambda name: np.mean(result["robustness"][name]))
+    lines.append(f"  worst disturbance: {worst}, mean return {np.mean(result['robustness'][worst]):.5g}")
+    if None not in result["often"]:
+        lines.append(f"  acting ten times as often: mean return {np.mean(result['often']):.5g}")
+    return [*lines, f"  digest {result['digest']}"]

@@ -1,0 +1,346 @@
+"""The command ``lag-envs leaderboard``, the tables that follow from the board, and CI's recipe."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+
+import fake_submissions
+import pytest
+from fake_submissions import ENV, write
+
+from lag_envs import cli
+from lag_envs.leaderboard import docs, protocol
+from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.log import STATES
+from lag_envs.leaderboard.ranking import LEVEL, RESAMPLES
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Give a function that runs the command in a folder of its own and returns status and output."""
+    fake_submissions.install(monkeypatch.setattr)
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # another process would have the real ones
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        status = cli.main(["leaderboard", *map(str, arguments)])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
+
+    return call
+
+
+def ids():
+    return list(Board("leaderboard").read().entries)
+
+
+# --- add, nonce, list, show, withdraw ---
+
+
+def test_from_adding_to_the_ranking(run):
+    write("a", "PPO", score=0.8)
+    status, out, _ = run("add", "a")
+    (id,) = ids()
+    assert status == 0
+    assert out == f"{id}: pending, until a nonce is published: `lag-envs leaderboard nonce`\n"
+    assert run("nonce", "drand-1234") == (0, f"nonce: drand-1234\n{id}: verified\n", "")
+    assert run("add", "a")[1] == f"{id}: is there already, verified\n"
+    status, out, _ = run("list")
+    assert status == 0 and re.search(rf"1 +0\.\d{{4}} +0\.\d+ to 0\.\d+ +100\.0 % +learned +PPO +{id}", out)
+    assert run("list", ENV)[1] == out
+    status, out, _ = run("show", id)
+    assert status == 0
+    assert re.search(r"^state +verified$", out, re.MULTILINE) and re.search(r"nonce +drand-1234\n", out)
+    told = json.loads(run("show", id, "--json")[1])
+    assert told["rank"] == 1 and len(told["replays"]) == 3 and told["curves"]
+
+
+def test_add_with_a_nonce(run):
+    folders = [write(name, name) for name in ("a", "b")]
+    status, out, _ = run("add", *folders, "--nonce", "test-1")
+    assert status == 0 and out == "".join(f"{id}: verified\n" for id in ids())
+
+
+def test_what_is_refused_is_told_and_costs_the_others_nothing(run):
+    write("good")
+    write("bad", refuse="policy_0.safetensors: holds NaN")
+    status, out, err = run("add", "bad", "good", "none", "--nonce", "n")
+    assert status == 1 and "verified" in out
+    assert (
+        err.splitlines()
+        == [
+            "bad: refused: policy_0.safetensors: holds NaN",
+            "none: refused: submission.toml: cannot be read",
+        ]
+        or "none: refused" in err
+    )
+    assert len(ids()) == 1
+
+
+def test_rejected_in_verification(run):
+    write("bad", reject="it returned an action that is not a finite number")
+    write("weak", name="weak", fail="no memory")
+    status, out, _ = run("add", "bad", "weak", "--nonce", "n")
+    assert status == 1  # for the one that stays pending
+    assert "rejected: it returned an action that is not a finite number" in out
+    assert "could not be verified (MemoryError: no memory); it stays pending" in out
+    out = run("list")[1]
+    assert re.search(r"ppo-\w+ rejected: it returned", out) and re.search(r"weak-\w+ pending\n", out)
+    assert run("show", ids()[0])[0] == 0
+
+
+def test_the_same_command_goes_on_after_a_kill(run):
+    write("a")
+    run("add", "a")
+    Board("leaderboard").publish("n")  # and killed here
+    assert run("add", "a", "--nonce", "n") == (0, f"{ids()[0]}: verified\n", "")
+    assert run("add", "a", "--nonce", "n")[:2] == (0, f"{ids()[0]}: is there already, verified\n")
+
+
+def test_add_without_a_folder_goes_on(run):
+    write("a")
+    run("add", "a")
+    Board("leaderboard").publish("n")  # and killed here
+    assert run("add")[1] == f"{ids()[0]}: verified\n"
+    assert run("add") == (0, "", "")
+
+
+def test_withdraw(run):
+    write("a")
+    run("add", "a", "--nonce", "n")
+    (id,) = ids()
+    assert run("withdraw", id, "--reason", "wrong\x1b[2J numbers")[0] == 0
+    assert f"{id} withdrawn: wrong?[2J numbers" in run("list")[1]  # and nothing reaches the terminal
+    assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")
+
+
+def test_mistakes(run):
+    for arguments in (["list"], ["show", "x"], ["--help"], ["add", "--jobs", "0"], []):
+        if arguments in (["list"], ["show", "x"]):
+            status, _, err = run(*arguments)
+            assert status == 2 and "leaderboard has no submissions; `lag-envs leaderboard add" in err
+        else:
+            with pytest.raises(SystemExit) as left:
+                run(*arguments)
+            assert left.value.code == (0 if arguments == ["--help"] else 2)
+    status, _, err = run("nonce")
+    assert status == 2 and "nothing is pending" in err
+    write("a")
+    run("add", "a", "--nonce", "n")
+    assert (
+        "the board has nothing of 'InclineTilt-v0'; it has PivotedBar-v0" in run("list", "InclineTilt-v0")[2]
+    )
+    assert "there is no 'x' on the board" in run("show", "x")[2]
+    assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
+    Path("leaderboard/board.jsonl").write_text("<<<<<<< HEAD\n")
+    assert "line 1 is no event" in run("list")[2]
+
+
+def test_missing_packages_are_named(run, monkeypatch):
+    monkeypatch.setattr("lag_envs.cli.find_spec", lambda name: None if name == "safetensors" else 1)
+    assert 'safetensors is missing: pip install "lag-envs[leaderboard]"' in run("list")[2]
+    assert cli.main(["list"]) == 0  # others don't need it
+
+
+def test_other_commands_do_not_load_the_leaderboard():
+    script = "import sys; from lag_envs import cli; cli.main(['list'])\n"
+    script += "assert not [m for m in sys.modules if m.startswith('lag_envs.leaderboard')]"
+    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+# --- build, serve ---
+
+
+def test_build(run):
+    write("a", "An agent")
+    run("add", "a", "--nonce", "n")
+    status, out, _ = run("build", "page")
+    assert status == 0 and out == f"{Path('page/index.html')}\n"
+    assert any("An agent" in path.read_text(encoding="utf-8") for path in Path("page").glob("*.html"))
+    Path("other").mkdir()
+    Path("other/index.html").write_text("mine")
+    assert run("build", "other")[0] == 2 and Path("other/index.html").read_text() == "mine"
+
+
+def test_serve(run):
+    write("a", "An agent")
+    run("add", "a", "--nonce", "n")
+    command = [sys.executable, "-m", "lag_envs.cli", "leaderboard", "serve", "--port", "0"]
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    stop = threading.Timer(60, server.kill)
+    stop.start()
+    try:
+        address = server.stdout.readline().split()[0]
+        assert address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(address, timeout=30) as answer:
+            assert "Leaderboard" in answer.read().decode()
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(f"{address}/../leaderboard/board.jsonl", timeout=30)
+        refused.value.close()
+        server.send_signal(signal.SIGINT)
+        assert server.wait(30) == 130
+    finally:
+        stop.cancel()
+        server.kill()
+        server.wait()
+        server.stdout.close()
+
+
+# --- tables in README and docs ---
+
+
+def test_generated_parts_are_as_generated():
+    for path, text in docs.generated(ROOT).items():
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: `python -m lag_envs.leaderboard.docs` writes it anew"
+        )
+
+
+def test_top_of_each_board(run):
+    for number in range(4):
+        write(f"{number}", f"agent {number}", score=0.2 * number)
+    write("other", "x | <b>[y](z)</b>", env="InclineTilt-v0", kind="controller")
+    run("add", *range(4), "other", "--nonce", "n")
+    lines = docs.top(board_data(Board("leaderboard"))).splitlines()
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    assert [row[:3] for row in cells[2:]] == [
+        [ENV, "1", "agent 3, learned"],
+        ["", "2", "agent 2, learned"],
+        ["", "3", "agent 1, learned"],
+        ["InclineTilt-v0", "1", r"x \| &lt;b&gt;\[y\]\(z\)&lt;/b&gt;, controller"],
+    ]
+    assert {len(row) for row in cells} == {6}
+
+
+def page():
+    return (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
+
+
+def test_the_page_states_the_protocols_numbers():
+    text = " ".join(page().split())
+    stated = [
+        f"Each policy plays {protocol.EPISODES:,} episodes",
+        f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes with one",
+        f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes when acting",
+        f"Percentile bootstrap, {100 * LEVEL:.0f} %, {RESAMPLES:,} samples",
+        f"mean scores agree within {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),
+    ]
+    assert [phrase for phrase in stated if phrase not in text] == []
+    assert protocol.LEARNED_POLICIES == 5 and "at least five training seeds" in text
+    assert [state for state in STATES if f"| {state} |" not in text] == []
+
+
+def test_links():
+    text = page()
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert target.startswith("https://") or (ROOT / "docs" / target).exists(), target
+
+
+def test_the_recipe_of_the_docs_computes_a_rank(run, capsys):
+    write("a", score=0.6)
+    write("b", "b")
+    run("add", "a", "b", "--nonce", "n")
+    (recipe,) = re.findall(r"```python\n(.*?)```", page(), re.DOTALL)
+    exec(recipe, dict(zip(("ID_ABOVE", "ID_BELOW"), ids(), strict=True)))
+    assert capsys.readouterr().out.startswith("Chance(value=1.0, low=1.0, high=1.0)")
+
+
+# --- CI's recipe ---
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """Give CI's recipe, in a repository with a board, and a function that commits what lies there."""
+    if shutil.which("git") is None:
+        pytest.skip("needs git")
+    loader = SourceFileLoader("submissions", str(ROOT / ".ci" / "submissions"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    recipe = importlib.util.module_from_spec(importlib.util.spec_from_loader("submissions", loader))
+    loader.exec_module(recipe)
+    home = tmp_path / "repository"
+    (home / "leaderboard").mkdir(parents=True)
+    (home / "leaderboard" / "board.jsonl").write_text("")
+    for name in ("GIT_AUTHOR", "GIT_COMMITTER"):
+        monkeypatch.setenv(f"{name}_NAME", "A")
+        monkeypatch.setenv(f"{name}_EMAIL", "a@example.org")
+    monkeypatch.chdir(home)
+    recipe.git("init", "--quiet")
+
+    def commit():
+        recipe.git("add", "--all", "--force")
+        recipe.git("-c", "commit.gpgsign=false", "commit", "--quiet", "--allow-empty", "-m", "change")
+        return recipe.git("rev-parse", "HEAD").decode().strip()
+
+    return recipe, commit
+
+
+def test_recipe_takes_the_changed_submissions_as_data(repository, tmp_path):
+    recipe, commit = repository
+    write("leaderboard/inbox/before")
+    base = commit()
+    folder = write("leaderboard/inbox/mine", "PPO")
+    Path("setup.py").write_text("raise SystemExit('never run')")
+    change = commit()
+    assert recipe.changed(base, change) == ["mine"]
+    assert recipe.write(change, "mine", tmp_path / "out")
+    for path in folder.iterdir():
+        assert (tmp_path / "out" / path.name).read_bytes() == path.read_bytes()
+    shutil.rmtree(folder)
+    assert recipe.changed(change, commit()) == ["mine"]
+    assert not recipe.write("HEAD", "mine", tmp_path / "gone")
+
+
+def test_recipe_refuses_what_is_not_a_submission(repository, tmp_path):
+    recipe, commit = repository
+    base = commit()
+    Path("leaderboard/board.jsonl").write_text("{}\n")
+    with pytest.raises(SystemExit, match="only maintainers change the board"):
+        recipe.changed(base, commit())
+    kinds = {
+        "link": lambda folder: (folder / "policy_1.safetensors").symlink_to("/etc/passwd"),
+        "nested": lambda folder: write(folder / "deeper"),
+        "program": lambda folder: os.chmod(folder / "submission.toml", 0o755),
+    }
+    for name, spoil in kinds.items():
+        spoil(write(f"leaderboard/inbox/{name}"))
+        with pytest.raises(SystemExit, match="a submission is a folder of plain files"):
+            recipe.write(commit(), name, tmp_path / name)
+        assert not (tmp_path / name).exists()
+    with (write("leaderboard/inbox/large") / "more").open("wb") as out:
+        out.truncate(recipe.BYTES)
+    with pytest.raises(SystemExit, match="'large': more than"):
+        recipe.write(commit(), "large", tmp_path / "large")
+
+
+def test_recipe_verifies_with_the_code_that_it_stands_in(repository, monkeypatch):
+    recipe, commit = repository
+    base = commit()
+    write("leaderboard/inbox/mine")
+    change = commit()
+    seen = []
+    real = subprocess.run
+
+    def run(command, **options):
+        if command[0] == "git":
+            return real(command, **options)
+        seen.append((command, json.loads((Path(command[-1]) / "submission.toml").read_text())["name"]))
+        return subprocess.CompletedProcess(command, 1)
+
+    monkeypatch.setattr(recipe.subprocess, "run", run)
+    monkeypatch.setattr(sys, "argv", ["submissions", base, change])
+    assert recipe.main() == 1
+    ((command, name),) = seen
+    assert command[:-1] == [sys.executable, "-m", "lag_envs.cli", "verify", "--nonce", change]
+    assert name == "PPO"

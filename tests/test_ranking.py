@@ -1,0 +1,260 @@
+"""Statistics of the leaderboard: by hand, against rliable, and what intervals promise."""
+
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+from lag_envs.leaderboard.ranking import (
+    RESAMPLES,
+    THRESHOLDS,
+    columns,
+    compare,
+    ends,
+    improvement,
+    iqm,
+    median_time,
+    normalised,
+    optimality_gap,
+    profile,
+    ranked,
+    redrawn,
+    wilson,
+)
+from lag_envs.scores import KNOWN_RETURNS
+
+ENV = "InclineBrake-v0"
+KNOWN = KNOWN_RETURNS[ENV]
+
+
+def rliable(part):
+    """Return a part of rliable; all but its metrics do not import beside every pandas."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return pytest.importorskip(f"rliable.{part}")
+        except TypeError as error:
+            pytest.skip(f"rliable.{part} does not import here: {error}")
+
+
+def returns(scores):
+    """Return the returns that have these scores."""
+    return (KNOWN.random + np.asarray(scores) * (KNOWN.best - KNOWN.random)).tolist()
+
+
+def board(**rows):
+    """Return the places of rows, whose scores are given for each policy and episode."""
+    scores = {id: np.atleast_2d(table) for id, table in rows.items()}
+    return ranked(scores, {id: redrawn(id, table) for id, table in scores.items()})
+
+
+def policies(*means, episodes=4):
+    """Return scores of policies with these means."""
+    return [[mean - 0.01, mean + 0.01] * (episodes // 2) for mean in means]
+
+
+# --- by hand ---
+
+
+def test_scale_is_that_of_the_scores():
+    assert normalised(ENV, [KNOWN.random, KNOWN.best]).tolist() == [0.0, 1.0]
+    assert normalised(ENV, returns([[0.5, 2.0]])) == pytest.approx(np.array([[0.5, 2.0]]))
+    with pytest.raises(ValueError, match="Unknown-v0 has no scale"):
+        normalised("Unknown-v0", [0.0])
+
+
+def test_interquartile_mean():
+    assert iqm([0.0, 1.0, 2.0, 3.0, 100.0]) == 2.0  # five seeds: the middle three
+    assert iqm([3.0]) == 3.0 and iqm([0.0, 6.0, 3.0]) == 3.0
+    np.testing.assert_array_equal(iqm([[0.0, 1.0, 2.0, 90.0], [4.0, 4.0, 4.0, 4.0]]), [1.5, 4.0])
+
+
+def test_optimality_gap_profile_and_times():
+    assert optimality_gap([0.5, 1.5, 0.9]) == pytest.approx(0.2)
+    shares = dict(zip(THRESHOLDS.round(3).tolist(), profile([[0.0, 0.5], [0.5, 1.0]]), strict=True))
+    # Above, not at: a score of 0.5 is not above 0.5.
+    assert (shares[-0.025], shares[0.0], shares[0.475], shares[0.5], shares[1.0]) == (
+        1.0,
+        0.75,
+        0.75,
+        0.25,
+        0,
+    )
+    assert median_time([3.0, None, 1.0]) == 3.0 and median_time([None, 1.0]) is None
+    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # as in any table
+    assert wilson(10, 10) == pytest.approx((10 / (10 + 1.959964**2), 1.0))
+
+
+def test_probability_of_improvement():
+    assert improvement([1.0, 3.0], [0.0, 1.0]) == 0.875  # three pairs of four, and a tie
+    assert improvement([[1.0, 2.0], [0.0, 0.0]], [[0.0, 1.5], [1.0, 1.0]]).tolist() == [0.75, 0.0]
+    assert improvement([2.0], [2.0]) == 0.5
+
+
+def test_intervals_of_two_policies():
+    """Two seeds a < b give means a, b and their middle with 1/4, 1/4, 1/2, so the interval is [a, b]."""
+    drawn = redrawn("any", policies(0.2, 0.4))
+    assert drawn.shape == (RESAMPLES, 2)
+    assert ends(iqm(drawn)) == pytest.approx((0.2, 0.4))
+    share = np.mean(np.isclose(iqm(drawn), 0.3))
+    assert share == pytest.approx(0.5, abs=0.05)
+    # Against one that lies in between, all of 0, 1/2 and 1 may come out.
+    chance = compare(policies(0.2, 0.4), policies(0.3, 0.3), drawn, redrawn("other", policies(0.3, 0.3)))
+    assert chance == (0.5, 0.0, 1.0) and chance.undecided
+
+
+def test_a_single_policy_is_drawn_anew_by_episodes():
+    scores = np.random.default_rng(0).normal(0.8, 0.3, (1, 1000))
+    drawn = redrawn("single", scores)
+    assert drawn.shape == (RESAMPLES, 1)
+    low, high = ends(iqm(drawn))
+    error = 1.96 * scores.std() / np.sqrt(1000)
+    assert (low, high) == pytest.approx((scores.mean() - error, scores.mean() + error), abs=0.15 * error)
+
+
+# --- ranks ---
+
+
+def test_clearly_different_rows_have_ranks_of_their_own():
+    places = board(
+        c=policies(0.1, 0.11, 0.12, 0.13, 0.14),
+        a=policies(0.9, 0.91, 0.92, 0.93, 0.94),
+        b=policies(0.5, 0.51, 0.52, 0.53, 0.54),
+    )
+    assert [(p.id, p.rank) for p in places] == [("a", 1), ("b", 2), ("c", 3)]
+    assert places[0].above is None
+    assert places[1].above == (1.0, 1.0, 1.0)  # each policy of the one above is better than each of this
+
+
+def test_rows_that_cannot_be_told_apart_share_a_rank_and_the_next_one_counts_them():
+    places = board(
+        a=policies(0.5, 0.6, 0.7, 0.8, 0.9),
+        b=policies(0.48, 0.58, 0.68, 0.78, 0.88),
+        c=policies(0.1, 0.1, 0.1, 0.1, 0.1),
+    )
+    assert [(p.id, p.rank) for p in places] == [("a", 1), ("b", 1), ("c", 3)]
+    # 15 of 25 pairs: each policy of a beats those of b at and below its place.
+    assert places[1].above.value == pytest.approx(15 / 25) and places[1].above.undecided
+
+
+def test_a_rank_follows_from_the_interval_that_is_told():
+    rng = np.random.default_rng(1)
+    rows = {f"row{i}": rng.normal(rng.uniform(0, 1), 0.2, (rng.choice([1, 5, 10]), 50)) for i in range(30)}
+    places = board(**rows)
+    assert sorted(p.id for p in places) == sorted(rows)
+    values = [float(iqm(rows[p.id].mean(axis=1))) for p in places]
+    assert values == sorted(values, reverse=True)
+    expected = 1
+    for number, place in enumerate(places, 1):
+        if place.above is not None and not place.above.low <= 0.5 <= place.above.high:
+            expected = number
+        assert place.rank == expected
+    assert 1 < len({p.rank for p in places}) < len(places)
+
+
+def test_equal_rows_share_a_rank():
+    same = np.random.default_rng(2).normal(size=(1, 100))
+    assert [p.rank for p in board(a=same, b=same)] == [1, 1]
+    assert [p.rank for p in board(a=[[1.0, 1.0]], b=[[1.0, 1.0]])] == [1, 1]
+
+
+def test_two_controllers_are_told_apart_by_their_episodes():
+    rng = np.random.default_rng(3)
+    close, far = rng.normal(0.8, 0.3, (1, 1000)), rng.normal(0.7, 0.3, (1, 1000))
+    assert [p.rank for p in board(a=close, b=far)] == [1, 2]
+    assert [p.rank for p in board(a=close, b=rng.normal(0.8, 0.3, (1, 1000)))] == [1, 1]
+
+
+def test_numbers_are_the_same_each_time_and_whoever_else_is_there():
+    rng = np.random.default_rng(4)
+    a, b, c = (rng.normal(m, 0.3, (5, 20)) for m in (0.6, 0.55, 0.5))
+    first, second = board(a=a, b=b), board(a=a, b=b, c=c)
+    assert first == second[:2]
+    np.testing.assert_array_equal(redrawn("a", a), redrawn("a", a))
+    assert (redrawn("a", a) != redrawn("b", a)).any()
+
+
+def test_columns_of_a_row():
+    rng = np.random.default_rng(5)
+    scores = rng.normal(0.8, 0.1, (5, 40))
+    results = [
+        {
+            "seed": seed, "returns": returns(row), "success": [True] * 30 + [False] * 10,
+            "settle": [2.0] * 30 + [None] * 10, "effort": [0.25] * 40, "trajectory": "",
+        }
+        for seed, row in enumerate(scores)
+    ]  # fmt: skip
+    result = {
+        "policies": results,
+        "robustness": {"mass +20 %": returns(np.arange(5.0)), "late": [None] * 5},
+        "often": returns([0.5] * 5),
+    }
+    row = columns(ENV, result, redrawn("a", scores))
+    assert row["score"] == pytest.approx(np.sort(scores.mean(axis=1))[1:-1].mean())
+    assert row["interval"][0] <= row["score"] <= row["interval"][1]
+    assert row["return"] == pytest.approx(np.mean(returns(scores)))
+    assert row["gap"] == pytest.approx(1.0 - scores.mean())
+    assert row["success"]["rate"] == 0.75 and row["success"]["low"] < 0.75 < row["success"]["high"]
+    assert (row["settle"], row["effort"]) == (2.0, 0.25)
+    assert row["robustness"] == {"mass +20 %": pytest.approx(2.0)} and row["often"] == pytest.approx(0.5)
+    assert len(row["profile"]) == len(THRESHOLDS)
+    # What is not measured is None, as for an agent that cannot act more often.
+    bare = {"policies": [{"returns": returns(row)} for row in scores], "often": [None] * 5}
+    row = columns(ENV, bare, redrawn("a", scores))
+    assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
+
+
+# --- against rliable ---
+
+
+def test_point_estimates_are_those_of_rliable():
+    metrics = rliable("metrics")
+    rng = np.random.default_rng(6)
+    for n, m in ((5, 5), (10, 7), (20, 1)):
+        x, y = rng.normal(0.9, 0.2, (n, 30)), rng.normal(0.8, 0.2, (m, 30))
+        runs_x, runs_y = x.mean(axis=1)[:, None], y.mean(axis=1)[:, None]
+        assert iqm(x.mean(axis=1)) == pytest.approx(metrics.aggregate_iqm(runs_x), rel=1e-12)
+        assert optimality_gap(x.mean(axis=1)) == pytest.approx(
+            metrics.aggregate_optimality_gap(runs_x), rel=1e-12
+        )
+        expected = metrics.probability_of_improvement(runs_x, runs_y)
+        assert improvement(runs_x[:, 0], runs_y[:, 0]) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning")  # of arch, which rliable calls
+def test_intervals_and_profile_are_those_of_rliable():
+    library, metrics = rliable("library"), rliable("metrics")
+    rng = np.random.default_rng(7)
+    x, y = rng.normal(0.9, 0.2, (10, 5)), rng.normal(0.85, 0.2, (8, 5))
+    runs_x, runs_y = x.mean(axis=1)[:, None], y.mean(axis=1)[:, None]
+    state = np.random.RandomState(0)
+
+    def theirs(data, statistic):
+        found = library.get_interval_estimates({"a": data}, statistic, reps=2000, random_state=state)
+        return found[1]["a"].ravel()
+
+    assert ends(iqm(redrawn("x", x))) == pytest.approx(theirs(runs_x, metrics.aggregate_iqm), abs=0.01)
+    chance = compare(x, y, redrawn("x", x), redrawn("y", y))
+    expected = theirs((runs_x, runs_y), metrics.probability_of_improvement)
+    assert chance[1:] == pytest.approx(expected, abs=0.04)
+    shares, _ = library.create_performance_profile({"a": x.reshape(-1, 1)}, THRESHOLDS, reps=2)
+    np.testing.assert_allclose(profile(x), shares["a"])
+
+
+# --- what intervals promise, and the time it takes ---
+
+
+def test_intervals_cover_as_often_as_they_say():
+    rng = np.random.default_rng(8)
+    samples = rng.normal(0.5, 0.2, (80, 20))
+    found = [ends(iqm(redrawn(str(i), np.stack([s, s], axis=1)))) for i, s in enumerate(samples)]
+    assert 0.85 <= np.mean([low < 0.5 < high for low, high in found]) <= 1.0
+
+
+def test_a_full_board_is_ranked_in_seconds():
+    rng = np.random.default_rng(9)
+    rows = {f"row{i}": rng.normal(i / 60, 0.3, (5 if i % 3 else 1, 1000)) for i in range(60)}
+    started = time.perf_counter()
+    assert len(board(**rows)) == 60
+    assert time.perf_counter() - started < 20.0  # a second or two, on a machine that has nothing else to do

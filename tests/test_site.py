@@ -1,0 +1,575 @@
+"""The leaderboard's page: what is written, and how it behaves in a real browser."""
+
+import http.server
+import itertools
+import json
+import math
+import os
+import re
+import threading
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lag_envs.leaderboard.site import build as site
+from lag_envs.leaderboard.site.build import build, render
+from lag_envs.leaderboard.site.scenery import describe
+from lag_envs.scenes.shapes import Arrow, Circle, Lens, Line, Moment, Polygon
+from lag_envs.tasks import TASKS, load_task
+from tests import board_pages, chromium
+
+HOSTILE = (
+    "</script><script>window.hacked = 1</script>",
+    "<img src=x onerror='window.hacked = 1'>",
+    '" onmouseover="window.hacked = 1" x=\'',
+    "{{ 7 * 7 }}{% raw %}${window.hacked = 1}`",
+    "<!--<script>\u2028\u2029\u202eevil\u0000",
+    "javascript:window.hacked=1",
+    "Ω" * 300,
+    "constructor",
+)
+MISSING = (
+    "THERE IS NO CHROMIUM, SO NO TEST OF THE LEADERBOARD'S PAGE IN A BROWSER WAS RUN: install chromium, or "
+    "name one in the variable CHROMIUM"
+)
+#: Roles of what must have a name for those who do not see it.
+NAMED = {"button", "combobox", "slider", "searchbox", "radio", "checkbox", "link", "image", "img", "region"}
+# So that the warning below is shown and no error.
+pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
+
+
+@pytest.fixture(scope="module")
+def data():
+    return board_pages.data()
+
+
+@pytest.fixture(scope="module")
+def hostile():
+    found = board_pages.data(
+        ("PivotedBar-v0",), [(n, "learned", 0.9 - 0.1 * i) for i, n in enumerate(HOSTILE)]
+    )
+    for board in found["environments"]:
+        for row, text in zip(board["rows"], HOSTILE, strict=True):
+            row |= dict.fromkeys(("description", "license", "hardware", "code", "id"), text) | {
+                "authors": [text]
+            }
+            row["robustness"] = {text: 0.5}
+            row["replays"][0] = row["replays"][0] | {"label": text}
+        board["rows"][0]["kind"] = HOSTILE[2]
+        board["other"] = [{"id": t, "name": t, "state": "rejected", "reason": t} for t in HOSTILE]
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("site")
+    build(data, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    binary = chromium.find()
+    if binary is None:
+        warnings.warn(MISSING, stacklevel=1)
+        pytest.skip(MISSING)
+    found = chromium.Browser(binary, tmp_path_factory.mktemp("profile"))
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def open_page(browser, folder):
+    """Open a page; in the end it must have met no error and asked nobody else for anything."""
+    pages = []
+
+    def open_it(name="PivotedBar-v0", root=None, **options):
+        root = root or folder.as_uri()
+        page = browser.open(f"{root}/{name}.html", **options)
+        pages.append((page, root))
+        if options.get("script", True) and name != "index":
+            page.until("document.querySelectorAll('.episode option').length >= 2")
+        return page
+
+    yield open_it
+    for page, root in pages:
+        errors, foreign = page.errors, [u for u in page.requests if not u.startswith((root, "data:"))]
+        page.close()
+        assert not errors
+        assert not foreign
+
+
+def clean(text):
+    return text.replace("\0", "\ufffd")
+
+
+def colours(page, selector):
+    """Return how many colours a canvas shows."""
+    return page.js(f"""(() => {{
+        const c = document.querySelector({json.dumps(selector)});
+        const copy = new OffscreenCanvas(c.width, c.height);
+        const pen = copy.getContext("2d", {{willReadFrequently: true}});
+        pen.drawImage(c, 0, 0);
+        return new Set(new Uint32Array(pen.getImageData(0, 0, c.width, c.height).data.buffer)).size;
+    }})()""")
+
+
+def column(page, selector):
+    """Return the texts of a column of the ranking, from top to bottom, of the rows that are shown."""
+    return page.js(
+        f"[...document.querySelectorAll('.ranking tbody tr:not([hidden]) {selector}')].map(e => e.innerText)"
+    )
+
+
+def clock(page):
+    return float(page.js("document.querySelector('.clock').textContent").split(" /")[0])
+
+
+def reading(page, side, name):
+    return page.js(
+        f"[...document.querySelectorAll('.side')[{side}].querySelectorAll('.readout div')]"
+        f".find(d => d.firstChild.textContent === {json.dumps(name)}).lastChild.textContent"
+    ).replace("−", "-")
+
+
+# --- what is written ---
+
+
+def test_what_comes_from_submissions_is_escaped(hostile):
+    pages, files = render(hostile)
+    for name, text in (pages | files).items():
+        if "/site-" in name:
+            continue
+        for bad in HOSTILE[:3]:
+            assert bad not in text, name
+        assert 'href="javascript' not in text and "49{%" not in text
+    scripts = re.findall(r"<script[^>]*>(.*?)</script>", pages["PivotedBar-v0.html"], re.DOTALL)
+    assert len(scripts) == 2 and not re.search(r"[<>&]", scripts[1])
+    assert [row["name"] for row in json.loads(scripts[1])["rows"]] == [clean(name) for name in HOSTILE]
+    assert all("script-src 'self' file:;" in text and "unsafe" not in text for text in pages.values())
+
+
+@pytest.mark.parametrize(
+    "url", ["javascript:alert(1)", "data:text/html,x", "//example.org", "https://", "https://a b", "file:///etc",
+            "https://x\n.org", 'https://x.org/"', " https://x.org", None, 3, "https://[x", "HTTPS//x"],
+)  # fmt: skip
+def test_addresses_that_are_no_links(url):
+    assert site.safe_url(url) is None
+
+
+def test_numbers_that_json_does_not_have_are_left_out():
+    found = board_pages.data(("InclineTilt-v0",), board_pages.AGENTS[:2])
+    found["environments"][0]["rows"][0] |= {
+        "score": math.nan,
+        "interval": [math.nan, math.inf],
+        "settle": None,
+    }
+    pages, _ = render(found)
+    row = json.loads(re.findall(r'id="data">(.*?)<', pages["InclineTilt-v0.html"])[0])["rows"][0]
+    assert row["score"] is None and row["interval"] == [None, None]
+
+
+def test_little_is_enough():
+    boards = [
+        {"id": "Gone-v0", "rows": [], "protocol": 1, "frozen": True},
+        {"id": "Gone-v0", "rows": [{"name": "A"}], "protocol": 0, "frozen": True},
+        {"id": "../../index", "rows": []},
+        {"id": "index", "rows": []},
+    ]
+    pages, _ = render({"protocol": 1, "made": "today", "environments": boards})
+    names = ["-index.html", "Gone-v0-protocol-0.html", "Gone-v0.html", "index-2.html", "index.html"]
+    assert sorted(pages) == names
+    assert "No agent is ranked yet" in pages["Gone-v0.html"]
+    assert "protocol 0" in pages["Gone-v0-protocol-0.html"]
+
+
+def files_of(folder):
+    return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
+
+
+def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path):
+    build(data, tmp_path)
+    (tmp_path / "CNAME").write_text("example.org")
+    first = files_of(tmp_path)
+    build(data, tmp_path)
+    assert files_of(tmp_path).keys() == first.keys()
+    assert all(t == first[n] for n, t in files_of(tmp_path).items() if n.startswith("assets/"))
+    build({**data, "environments": data["environments"][:1]}, tmp_path)
+    left = files_of(tmp_path)
+    assert "InclineBrake-v0.html" not in left and "CNAME" in left
+    assert sum(name.startswith("assets/") for name in left) == 2 + len(board_pages.AGENTS)
+
+
+def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
+    (tmp_path / "index.html").write_text("mine")
+    with pytest.raises(FileExistsError, match="not a leaderboard's"):
+        build(data, tmp_path)
+    (tmp_path / "site.json").write_text("{")
+    with pytest.raises(FileExistsError, match="cannot be read"):
+        build(data, tmp_path)
+    (tmp_path / "site.json").write_text('{"files": ["../precious.html", "index.html"]}')
+    (tmp_path.parent / "precious.html").write_text("mine")
+    build(data, tmp_path)
+    assert (tmp_path.parent / "precious.html").exists()
+
+
+def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
+    small = board_pages.data(("PivotedBar-v0", "InclineBrake-v0"), board_pages.AGENTS[:1])
+    other = board_pages.data(("InclineBrake-v0", "CylinderInCylinderTilt-v0"), board_pages.AGENTS[1:2])
+    real = os.replace
+    for moment in itertools.count():
+        out = tmp_path / str(moment)
+        build(small, out)
+        left = moment
+
+        def replace(*names):
+            nonlocal left
+            if left == 0:
+                raise KeyboardInterrupt
+            left -= 1
+            real(*names)
+
+        monkeypatch.setattr(os, "replace", replace)
+        try:
+            build(other, out)
+            finished = True
+        except KeyboardInterrupt:
+            finished = False
+        monkeypatch.setattr(os, "replace", real)
+        for page in out.glob("*.html"):
+            text = page.read_text("utf-8")
+            assert text.endswith("</html>")
+            for name in re.findall(r"assets/[\w-]+\.(?:js|css)", text):
+                assert (out / name).exists(), (moment, page.name, name)
+        build(other, out)
+        assert not list(out.rglob("*.new"))
+        assert len(list(out.rglob("*.js"))) == 1 + 2, "what a killed build left is removed by the next"
+        if finished:
+            break
+    assert moment > 5
+
+
+def test_nothing_in_the_page_is_from_elsewhere():
+    for path in site.STATIC.iterdir():
+        found = re.findall(r"https?://[^\s\"')]+|@import|url\(", path.read_text("utf-8"))
+        assert set(found) <= {"http://www.w3.org/2000/svg"}, path
+
+
+def luminance(colour):
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in parts]
+    return np.dot([0.2126, 0.7152, 0.0722], linear)
+
+
+@pytest.mark.parametrize("theme", [0, 1], ids=["light", "dark"])
+def test_contrast(theme):
+    text = (site.STATIC / "site.css").read_text("utf-8")
+    blocks = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
+    colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", blocks[theme]))
+
+    def contrast(a, b):
+        high, low = sorted((luminance(colours[a]), luminance(colours[b])), reverse=True)
+        return (high + 0.05) / (low + 0.05)
+
+    for back in ("paper", "card", "hair"):
+        for name in ("ink", "soft", "link", "accent"):
+            assert contrast(name, back) >= 4.5, (name, back)
+        for i in range(8):
+            assert contrast(f"c{i}", back) >= 3.0, (i, back)
+    for name in ("body-edge", "target", "limit", "accent", "frame-edge"):
+        assert contrast(name, "stage") >= 3.0, name
+    for i in range(8):
+        assert contrast(f"c{i}", "paper") >= 4.5, f"letters on c{i}"
+
+
+# --- in the browser ---
+
+
+def test_overview(open_page, data):
+    page = open_page("index")
+    assert page.js("document.querySelectorAll('.card').length") == 3
+    assert page.js("document.querySelectorAll('.card .strip .dot').length") == 3 * len(board_pages.AGENTS)
+    for i in range(3):
+        assert colours(page, f".card:nth-child({i + 1}) canvas") > 50
+    page.click(".card:nth-child(2) .whole")
+    page.until("location.pathname.endsWith('InclineBrake-v0.html') && document.readyState === 'complete'")
+    assert page.js("document.querySelector('nav [aria-current]').textContent") == "InclineBrake-v0"
+
+
+def flat(shape):
+    """Return a shape as the script has it."""
+    match shape:
+        case Line(points, role):
+            return ["line", np.array(points), role]
+        case Polygon(points, role):
+            return ["polygon", np.array(points), role]
+        case Arrow(points, role):
+            return ["arrow", np.array(points), role]
+        case Circle(centre, radius, role):
+            return ["circle", np.array([*centre, radius]), role]
+        case Lens(centre, radius):
+            return ["lens", np.array([*centre, radius]), None]
+
+
+def test_scenes_are_drawn_as_python_draws_them(open_page):
+    page = open_page()
+    rng = np.random.default_rng(0)
+    for env_id, (place, fixed) in TASKS.items():
+        task, board = load_task(place)(**fixed), describe(env_id)
+        for _ in range(3):
+            state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.start).tolist()
+            share = float(rng.uniform(0 if board["control"]["low"] == 0 else -1, 1))
+            target, turned = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
+            now = Moment(state, share * task.limit_control, share, target, turned)
+            given = json.dumps({"state": state, "share": share, "target": target, "turned": turned})
+            board_text = json.dumps(board)
+            assert page.js(f"lagEnvs.windowOf({board_text}, {given})") == pytest.approx(task.window(now))
+            found = page.js(f"lagEnvs.shapesOf({board_text}, {given})")
+            wanted = [flat(shape) for shape in task.shapes(now)]
+            assert [s[0] for s in found] == [w[0] for w in wanted], env_id
+            for shape, (what, points, role) in zip(found, wanted, strict=True):
+                round_one = what in ("circle", "lens")
+                assert (shape[3] if what == "circle" else shape[2] if what != "lens" else None) == role
+                own = [*shape[1], shape[2]] if round_one else shape[1]
+                np.testing.assert_allclose(own, points, atol=1e-12)
+
+
+def test_sorting_by_mouse_and_keyboard(open_page, data):
+    page, rows = open_page(), data["environments"][0]["rows"]
+
+    def names(key, rising):
+        present = [r for r in rows if r[key] is not None]
+        ordered = sorted(present, key=lambda r: r[key] if rising else -r[key])
+        return [r["name"] for r in (*ordered, *(r for r in rows if r[key] is None))]
+
+    def sorted_by():
+        return page.js(
+            "[...document.querySelectorAll('th[aria-sort]:not([aria-sort=none])')]"
+            ".map(t => t.querySelector('button').textContent + ' ' + t.getAttribute('aria-sort'))"
+        )
+
+    assert sorted_by() == ["Rank ascending"]
+    page.click("[data-key=settle]")
+    assert column(page, "summary bdi") == names("settle", True)
+    assert sorted_by() == ["Settle ascending"]
+    page.click("[data-key=settle]")
+    assert column(page, "summary bdi") == names("settle", False)
+    assert "descending" in page.js("document.querySelector('.status').textContent")
+    page.js("document.querySelector('[data-key=effort]').focus()")
+    page.key("Enter")
+    assert column(page, "summary bdi") == names("effort", True)
+    page.key(" ")
+    assert sorted_by() == ["Effort descending"]
+    page.click("[data-key=name]")
+    assert column(page, "summary bdi") == sorted((r["name"] for r in rows), key=str.casefold)
+    page.click("[data-key=rank]")
+    assert column(page, "summary bdi") == [r["name"] for r in rows]
+
+
+def test_filtering(open_page, data):
+    page, rows = open_page(), data["environments"][0]["rows"]
+    page.click(".filter [value=controller]")
+    assert column(page, "summary bdi") == [r["name"] for r in rows if r["kind"] == "controller"]
+    assert page.js("document.querySelector('.status').textContent") == "3 of 10 agents"
+    page.key("ArrowRight")
+    assert column(page, "summary bdi") == ["Value iteration, 81 nodes"]
+    page.click(".filter [value='']")
+    page.click(".find input")
+    page.type("pUmPing lqr")
+    assert column(page, "summary bdi") == ["Energy pumping + LQR"]
+    page.type(" nothing like it")
+    assert column(page, "summary bdi") == []
+    assert page.js("document.querySelector('.none').hidden") is False
+    page.js("document.querySelector('.find input').select()")
+    page.type(" ")
+    assert len(column(page, "summary bdi")) == 10
+
+
+def test_intervals_as_pictures(open_page, data):
+    page = open_page()
+    place = "document.querySelectorAll('.ranking tbody tr')[4].querySelector('.interval')"
+    low, high = (float(page.js(f"{place}.getAttribute('{end}')").rstrip("%")) for end in ("x1", "x2"))
+    row = data["environments"][0]["rows"][4]
+    assert page.js("document.querySelectorAll('.ranking .picture .dot').length") == 10
+    width = row["interval"][1] - row["interval"][0]
+    assert high - low == pytest.approx(100 * width / 1.1, rel=0.15)
+    page.click(".filter [value=near]")
+    wide = float(page.js(f"{place}.getAttribute('x2')").rstrip("%")) - float(
+        page.js(f"{place}.getAttribute('x1')").rstrip("%")
+    )
+    assert wide > 5 * (high - low)
+
+
+def test_player(open_page, data):
+    page, rows = open_page(), data["environments"][0]["rows"]
+    first, second = (rows[i]["replays"][0] for i in (0, 1))
+    assert clock(page) == 0.0
+    before = page.js("document.querySelector('.scene').toDataURL()")
+    page.click(".play")
+    assert page.js("document.querySelector('.play').getAttribute('aria-label')") == "Pause"
+    page.until("parseFloat(document.querySelector('.clock').textContent) > 0.3")
+    page.key(" ")  # the button has the focus
+    stopped = clock(page)
+    assert (
+        0.3 < stopped < 8.0
+        and page.js("document.querySelector('.play').getAttribute('aria-label')") == "Play"
+    )
+    assert page.js("document.querySelector('.scene').toDataURL()") != before
+
+    # Scrubbing sets the time, for both.
+    page.js("""(() => { const r = document.querySelector('.scrub input'); r.focus(); r.value = 120;
+        r.dispatchEvent(new Event('input', {bubbles: true})); })()""")
+    page.until("document.querySelector('.clock').textContent.startsWith('2.40 ')")
+    for side, replay in enumerate((first, second)):
+        assert reading(page, side, "Time") == "2.40 s"
+        assert float(reading(page, side, "Action")) == pytest.approx(replay["actions"][119], abs=1e-3)
+        assert float(reading(page, side, "Reward")) == pytest.approx(replay["rewards"][119], abs=1e-3)
+        assert float(reading(page, side, "Return")) == pytest.approx(sum(replay["rewards"][:120]), abs=1e-2)
+        assert float(reading(page, side, "θ").split()[0]) == pytest.approx(replay["states"][120][2], abs=1e-2)
+
+    # By keyboard.
+    for key, shift, time in (("ArrowRight", False, 2.42), ("ArrowLeft", True, 2.22), ("End", False, 10.0),
+                             ("ArrowRight", False, 10.0), ("Home", False, 0.0)):  # fmt: skip
+        page.key(key, shift)
+        page.until(f"document.querySelector('.clock').textContent.startsWith('{time:.2f} ')")
+    page.key(" ")
+    page.until("!!document.querySelector('.playing')")
+    page.key(" ")
+    assert not page.js("!!document.querySelector('.playing')")
+    page.until("document.querySelector('#said').textContent.includes('B, iLQR, at ')")
+
+    # Another agent on the right, another episode on the left.
+    page.click("tr[data-row='5'] .pick[data-side='1']")
+    page.until("document.querySelector(\"tr[data-row='5'] .pick\").nextSibling.ariaPressed === 'true'")
+    pressed = page.js("[...document.querySelectorAll('.pick[aria-pressed=true]')].map(p => p.ariaLabel)")
+    assert pressed == ["Watch Value iteration, 81 nodes as A", "Watch Energy pumping + LQR as B"]
+    page.js("""(() => { const e = document.querySelector('.episode'); e.value = '1';
+        e.dispatchEvent(new Event('change')); })()""")
+    page.js("document.querySelector('.scrub input').focus()")
+    page.key("End")
+    total = f"{rows[0]['replays'][1]['return']:.2f}".replace("-", "−")
+    page.until(f"document.querySelector('.readout').textContent.includes('{total}')")
+
+
+def test_speed_and_loop(open_page):
+    page = open_page("InclineBrake-v0")
+    page.js("""(() => { const s = document.querySelector('.speed select'); s.value = '4';
+        document.querySelector('.loop input').click(); })()""")
+    page.click(".play")
+    page.until("parseFloat(document.querySelector('.clock').textContent) > 1.5")
+    page.until("parseFloat(document.querySelector('.clock').textContent) < 1.0")
+    assert page.js("!!document.querySelector('.playing')")
+
+
+def test_pictures_of_the_ranking(open_page):
+    page = open_page()
+    assert page.js("document.querySelectorAll('#profile .curve').length") == 10
+    assert page.js("document.querySelectorAll('#profile .chosen').length") == 5
+    assert page.js("document.querySelectorAll('#curves .curve').length") == 6
+    assert "SAC, half of them above 0.96" in page.js("document.querySelector('#profile svg').ariaLabel")
+    page.click(".legend button:nth-child(6)")
+    assert page.js("document.querySelectorAll('#profile .chosen').length") == 6
+    # The value function and the path over it, which another pair of coordinates does not have.
+    page.until("document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
+    shaded = colours(page, ".phase")
+    page.js("""(() => { const s = document.querySelector('.pair select'); s.value = '1';
+        s.dispatchEvent(new Event('change')); })()""")
+    page.until("document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
+    assert 100 < colours(page, ".phase") < shaded
+
+
+def test_hostile_names_stay_names(open_page, hostile, tmp_path):
+    build(hostile, tmp_path)
+    page = open_page(root=tmp_path.as_uri())
+    names = page.js("[...document.querySelectorAll('.ranking summary bdi')].map(e => e.textContent)")
+    wanted = [clean(name) for name in HOSTILE]
+    assert names == wanted
+    assert page.js("[...document.querySelectorAll('.legend bdi')].map(e => e.textContent)") == wanted
+    assert page.js("[...document.querySelectorAll('.agent')[0].options].map(e => e.text).length") == len(
+        HOSTILE
+    )
+    page.click(".play")
+    page.until("parseFloat(document.querySelector('.clock').textContent) > 0.1")
+    page.js("document.querySelectorAll('details').forEach(d => d.open = true)")
+    assert page.js("document.querySelectorAll('.more a, .ranking img').length") == 0
+    for width in (320, 1280):
+        page.resize(width, 800)
+        assert page.js("document.documentElement.scrollWidth") <= width
+    assert page.js("window.hacked") is None
+    page = open_page("index", root=tmp_path.as_uri())
+    assert page.js("window.hacked") is None
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_narrow_screen(open_page, scheme):
+    for name in ("index", "PivotedBar-v0", "CylinderInCylinderTilt-v0"):
+        page = open_page(name, width=320, height=640, media=[("prefers-color-scheme", scheme)])
+        assert page.js("document.documentElement.scrollWidth") == 320
+    # Cards instead of columns; what would be lost with the heads is sorted by a list.
+    page.js("""(() => { const s = document.querySelector('.order select'); s.value = 'effort';
+        s.dispatchEvent(new Event('change', {bubbles: true})); })()""")
+    efforts = [float(x.split()[-1]) for x in column(page, "[data-label=Effort]")]
+    assert efforts == sorted(efforts)
+    for button in (".play", ".step", ".pick"):
+        size = page.js(f"Math.min(...['width', 'height'].map("
+                       f"k => document.querySelector('{button}').getBoundingClientRect()[k]))")  # fmt: skip
+        assert size >= 32, button
+    page.resize(1280, 800)
+    page.until("getComputedStyle(document.querySelector('.ranking thead')).display !== 'none'")
+
+
+def test_what_a_screen_reader_meets(open_page):
+    page = open_page()
+    nodes = [n for n in page.send("Accessibility.getFullAXTree")["nodes"] if not n["ignored"]]
+    roles = [n["role"]["value"] for n in nodes]
+    for role in ("banner", "navigation", "main", "search", "contentinfo", "status", "slider"):
+        assert role in roles, role
+    for node in nodes:
+        role = node["role"]["value"]
+        if role in NAMED:
+            assert node["name"]["value"].strip(), node
+    assert roles.count("row") == 11 + 3 and roles.count("columnheader") == 13 + 3
+    levels = [int(x) for x in page.js("[...document.querySelectorAll('h1, h2, h3')].map(e => e.tagName[1])")]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(b - a <= 1 for a, b in itertools.pairwise(levels))
+    ids = page.js("[...document.querySelectorAll('[id]')].map(e => e.id)")
+    assert len(ids) == len(set(ids))
+    # The first stop skips what is the same on all pages, and every stop is seen.
+    page.key("Tab")
+    assert page.js("document.activeElement.className") == "skip"
+    page.key("Enter")
+    page.until("location.hash === '#main'")
+    for _ in range(4):
+        page.key("Tab")
+        assert page.js("(e => (e.matches('.choice input') ? getComputedStyle(e.nextElementSibling) :"
+                       "getComputedStyle(e)).outlineStyle)(document.activeElement)") != "none"  # fmt: skip
+
+
+def test_reduced_motion(open_page):
+    page = open_page(media=[("prefers-reduced-motion", "reduce")])
+    page.js("window.asked = []; Element.prototype.scrollIntoView = function (o) { asked.push(o.behavior); }")
+    page.js("document.querySelector(\"tr[data-row='2'] .pick\").click()")
+    assert page.until("window.asked.length && window.asked") == ["auto"]
+    assert page.js("getComputedStyle(document.querySelector('.legend button')).transitionDuration") == "0s"
+    assert not page.js("!!document.querySelector('.playing')"), "nothing moves that was not asked to"
+
+
+def test_without_script_the_tables_remain(open_page):
+    page = open_page(script=False)
+    assert page.js("document.querySelector('.ranking').innerText").count("\n") > 20
+    assert page.js("getComputedStyle(document.querySelector('#watch')).display") == "none"
+
+
+def test_served(open_page, folder):
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *args):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        page = open_page(root=f"http://127.0.0.1:{server.server_port}")
+        page.until("document.querySelectorAll('.readout dd').length > 6")
+        page.send("Page.stopLoading")
+        server.shutdown()

@@ -1,0 +1,277 @@
+"""Verification: scores recomputed, the same bits again, and the numbers that the board shows."""
+
+import argparse
+import json
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from test_submission import ENV, NET, built_in, learned, linear, net
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.submission import Refused, load, write
+from lag_envs.leaderboard.verify import declare_verify, episode, run_verify, verify
+from lag_envs.tasks import TASKS
+
+#: Behind the mark the plane is tilted back; near it, against the speed.
+GAINS = {"gain": np.array([-63.0, -55.5, -43.4, 63.0]), "offset": np.zeros(1)}
+ABOUT = {"name": "x", "authors": ["A"], "license": "MIT"}
+
+
+def feedback(folder):
+    return linear(folder, arrays={0: GAINS})
+
+
+@pytest.fixture(scope="module")
+def submission(tmp_path_factory):
+    return feedback(tmp_path_factory.mktemp("verify") / "linear")
+
+
+@pytest.fixture(scope="module")
+def result(submission):
+    return verify(submission, "nonce", 12)
+
+
+# --- seeds --------------------------------------------------------------------------------------------------
+
+
+def test_seeds_follow_from_bytes_and_nonce():
+    first = protocol.first_seed("a", "b", 0)
+    assert first == protocol.first_seed("a", "b", 0)
+    others = [protocol.first_seed(*given) for given in (("b", "b", 0), ("a", "c", 0), ("a", "b", 1))]
+    assert len({first, *others}) == 4
+    assert all(2**40 <= seed < 2**63 for seed in (first, *others))
+
+
+# --- what is measured ---------------------------------------------------------------------------------------
+
+
+def test_result_is_of_json_types_and_complete(result, submission):
+    again = json.loads(json.dumps(result, allow_nan=False))
+    assert again == result
+    assert (result["protocol"], result["env"], result["nonce"]) == (protocol.PROTOCOL, ENV, "nonce")
+    assert result["digest"] == submission.digest and result["episodes"] == 12
+    (policy,) = result["policies"]
+    assert policy["seed"] == 0 and len(policy["trajectory"]) == 64
+    assert {len(policy[name]) for name in ("returns", "success", "settle", "effort")} == {12}
+    assert set(result["robustness"]) == set(protocol.disturbances(ENV))
+    assert all(len(means) == 1 for means in result["robustness"].values())
+    assert len(result["often"]) == 1
+
+
+def test_numbers_are_those_of_single_episodes(result, submission):
+    """Returns, success, time and effort, from the single environment and in another way."""
+    agent = submission.policies[0][1].agent()
+    policy, env = result["policies"][0], gym.make(ENV)
+    first = protocol.first_seed(submission.digest, "nonce", 0)
+    for i in range(12):
+        observation, _ = env.reset(seed=first + i)
+        total, efforts, near, over = 0.0, [], [], False
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(agent.predict(observation)[0])
+            total += reward
+            efforts.append((env.unwrapped.control / 0.3) ** 2)
+            near.append(abs(env.unwrapped.state[0] - env.unwrapped.target) <= 0.05)
+            over = terminated or truncated
+        assert policy["returns"][i] == total
+        assert policy["effort"][i] == pytest.approx(np.mean(efforts), rel=1e-12)
+        outside = np.flatnonzero(~np.array(near))
+        settled = (outside[-1] + 1 if len(outside) else 0) * 0.05
+        success = not terminated and settled <= 9.0
+        assert policy["success"][i] == success
+        assert policy["settle"][i] == (
+            pytest.approx(settled + 0.05 * bool(len(outside))) if success else None
+        )
+    assert any(policy["success"])
+
+
+def test_same_bits_again_and_others_with_another_nonce(result, submission):
+    again, other = verify(submission, "nonce", 12), verify(submission, "other", 12)
+    for name in ("policies", "robustness", "often"):
+        assert again[name] == result[name]
+        assert other[name] != result[name]
+
+
+def test_replay_goes_through_the_same_bits(tmp_path):
+    made = learned(tmp_path / "a")
+    few = verify(made, "n", 3)
+    for policy in (0, 4):
+        returns = few["policies"][policy]["returns"]
+        for i in (0, 2):
+            seed = protocol.first_seed(made.digest, "n", policy) + i
+            found = episode(made, policy, seed)
+            assert found["return"] == returns[i]
+            assert found["seed"] == policy and found["reset_seed"] == seed and found["dt"] == 0.05
+            steps = len(found["actions"])
+            assert len(found["states"]) == steps + 1 == len(found["rewards"]) + 1
+            assert sum(found["rewards"]) == pytest.approx(found["return"], abs=1e-4)
+            assert abs(found["target"]) <= 0.3
+            json.dumps(found, allow_nan=False)
+
+
+def test_disturbances_and_acting_often_are_what_they_say(result, submission):
+    agent = submission.policies[0][1].agent()
+    first = protocol.first_seed(submission.digest, "nonce", 0)
+    for options, found in (
+        ({"mass": 1.2}, result["robustness"]["mass +20 %"]),
+        ({"gravity": 0.8 * 9.81}, result["robustness"]["gravity -20 %"]),
+        ({"dt": 0.005}, result["often"]),
+    ):
+        env, returns = gym.make(ENV, **options), []
+        for i in range(12):
+            observation, _ = env.reset(seed=first + i)
+            total, over = 0.0, False
+            while not over:
+                observation, reward, terminated, truncated, _ = env.step(agent.predict(observation)[0])
+                total, over = total + reward, terminated or truncated
+            returns.append(total)
+        assert found == [pytest.approx(np.mean(returns), rel=1e-12)]
+
+
+def test_progress_reaches_its_end(submission):
+    calls = []
+    verify(submission, "", 1, lambda done, work: calls.append((done, work)))
+    done, work = zip(*calls, strict=True)
+    assert len(set(work)) == 1 and done[-1] == work[0]
+    assert all(b >= a for a, b in pairwise(done))
+
+
+def test_every_environment_has_a_goal_and_disturbances():
+    assert set(protocol.GOALS) == set(TASKS)
+    for env in TASKS:
+        names = protocol.disturbances(env)
+        assert len(names) >= 8 and all(name.endswith("20 %") for name in names)
+        goal, task = protocol.GOALS[env], protocol.make_task(env)
+        states = np.array([task.centre, np.array(task.centre) + 0.9 * np.array(task.start)])
+        inside = goal.inside(task, states, np.zeros(2))
+        assert inside.shape == (2,) and inside.dtype == np.bool_
+
+
+@pytest.mark.parametrize(
+    ("env", "name", "success"),
+    [
+        ("PivotedBarFree-v0", "energy shaping + LQR", 1.0),
+        ("PivotedBarFree-v0", "zero", 0.0),
+        ("PivotedBarBalance-v0", "zero", 0.0),
+        ("InclineBrake-v0", "switching line", 1.0),
+        ("InclineBrake-v0", "zero", 0.0),
+        ("CylinderInCylinderTilt-v0", "LQR", 1.0),
+        ("CylinderInCylinderPump-v0", "energy pump", 1.0),
+        ("CylinderInCylinderDamping-v0", "switching line", 1.0),
+    ],
+)
+def test_success_is_what_one_would_call_so(env, name, success, tmp_path):
+    from lag_envs.leaderboard.verify import _play, _Record
+
+    policy = {"architecture": "controller", "name": name}
+    made = write(tmp_path / "a", env=env, kind="controller", policy=policy, **ABOUT)
+    record = _Record(env, 20)
+    _play(env, made.policies[0][1], 1, 20, watch=record)
+    found = record.result()
+    assert np.mean(found["success"]) == success
+    times = [t for t in found["settle"] if t is not None]
+    assert len(times) == (20 * success if protocol.GOALS[env].terminated is not None else len(times))
+    assert all(0.0 <= t < 10.0 for t in times) and all(0.0 <= e <= 1.0 for e in found["effort"])
+
+
+# --- policies that misbehave --------------------------------------------------------------------------------
+
+
+def test_network_that_overflows_is_refused(tmp_path):
+    arrays = net(0, (4, 3, 1))
+    arrays["weight_0"] = np.full((3, 4), 1e308)
+    arrays["weight_1"] = np.array([[1e308, -1e308, 0.0]])
+    arrays["bias_0"], arrays["bias_1"] = np.zeros(3), np.zeros(1)
+    made = linear(tmp_path / "a", policy=NET | {"activation": "relu"}, arrays={7: arrays})
+    with pytest.raises(Refused, match="policy of seed 7: it returned an action that is not a finite number"):
+        verify(made, "", 2)
+
+
+def test_controller_that_fails_on_the_way_is_refused(tmp_path, monkeypatch):
+    made = built_in(tmp_path / "a")
+
+    def predict(*args, **kwargs):
+        raise ZeroDivisionError("\x1b[31mno")
+
+    monkeypatch.setattr("lag_envs.controllers.PD.predict", predict)
+    with pytest.raises(Refused, match="it fails with 'ZeroDivisionError") as caught:
+        verify(made, "", 2)
+    assert str(caught.value).isprintable()
+
+
+def test_random_controller_draws_the_same_numbers_again(tmp_path):
+    made = built_in(tmp_path / "a", name="random")
+    assert verify(made, "", 2)["policies"] == verify(made, "", 2)["policies"]
+
+
+@pytest.mark.slow
+def test_planner_can_be_verified_but_not_act_often(tmp_path):
+    result = verify(built_in(tmp_path / "a", name="iLQR"), "", 2)
+    assert result["often"] == [None] and min(result["policies"][0]["returns"]) > 150.0
+
+
+@pytest.mark.parametrize("episodes", [0, -1, 100_001])
+def test_number_of_episodes_is_checked(submission, episodes):
+    with pytest.raises(ValueError, match="episodes must lie between"):
+        verify(submission, "", episodes)
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+def command(*arguments):
+    parser = argparse.ArgumentParser()
+    declare_verify(parser)
+    return run_verify(parser.parse_args([str(a) for a in arguments]))
+
+
+def test_command_tells_results_and_refusals(tmp_path, capsys, result):
+    feedback(tmp_path / "good")
+    feedback(tmp_path / "bad")
+    (tmp_path / "bad" / "run.py").write_text("")
+    out = tmp_path / "out.json"
+    folders = [tmp_path / "good", tmp_path / "bad"]
+    assert command(*folders, "--nonce", "nonce", "--episodes", 12, "--json", out) == 1
+    text = capsys.readouterr().out
+    assert "worst disturbance" in text and "acting ten times as often" in text
+    assert "bad: refused: unknown file 'run.py'" in text
+    good, bad = json.loads(out.read_text())
+    assert good["policies"] == result["policies"] and good["folder"] == str(folders[0])
+    assert bad == {"folder": str(folders[1]), "refused": bad["refused"]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--episodes", 0], "--episodes must lie"),
+        (["--jobs", 0], "--jobs must be at least 1"),
+        (["--json", "/nowhere/at/all"], "there is no folder"),
+    ],
+)
+def test_command_refuses(tmp_path, arguments, reason):
+    from lag_envs.cli import UserError
+
+    with pytest.raises(UserError, match=reason):
+        command(tmp_path, *arguments)
+
+
+@pytest.mark.slow
+def test_processes_give_the_same(tmp_path, result):
+    for name in ("a", "b"):
+        feedback(tmp_path / name)
+    out = tmp_path / "out.json"
+    assert command(tmp_path / "a", tmp_path / "b", "--jobs", 2, "--nonce", "nonce", "--episodes", 12,
+                   "--json", out) == 0  # fmt: skip
+    assert [r["policies"] for r in json.loads(out.read_text())] == [result["policies"]] * 2
+
+
+def test_command_of_the_package(tmp_path, capsys):
+    from lag_envs.cli import COMMANDS, main
+
+    if "verify" not in [c.name for c in COMMANDS]:
+        pytest.skip("not registered yet")
+    feedback(tmp_path / "a")
+    assert load(tmp_path / "a").digest
+    assert main(["verify", str(tmp_path / "a"), "--episodes", "1"]) == 0
+    assert "1 episodes each" in capsys.readouterr().out
