@@ -12,7 +12,7 @@ OLDEST_GYMNASIUM := 1.2.2
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo baselines test test-slow test-oldest lint types check bench report report-docs format clean
+.PHONY: help setup demo baselines test test-slow test-oldest lint types check bench report report-docs submissions site format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -31,6 +31,7 @@ baselines: setup  ## compute, train and measure all agents (hours; may be broken
 	$(BIN)/python -m agents.results $(ARGS)
 
 test: setup  ## run the tests and doctests, all but the slow ones
+	@sh tools/browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 test-slow: setup  ## run the slow tests
@@ -59,8 +60,14 @@ bench: setup  ## compare the speed with other environments
 report: setup  ## measure errors and write a page about them, into the folder report
 	$(BIN)/lag-envs report $(ARGS)
 
-report-docs:  ## take the folder report over into docs and README
+report-docs: setup  ## take the folder report over into docs and README
 	$(BIN)/python -m lag_envs.report.docs report
+
+submissions: setup  ## make submissions of all our agents, from what `make baselines` left, in runs/submissions
+	$(BIN)/python -m agents.submit runs/submissions $(ARGS)
+
+site: setup  ## build the leaderboard's page, into the folder site
+	$(BIN)/lag-envs leaderboard build $(ARGS)
 
 format: setup  ## format the code and mend what ruff can mend
 	$(BIN)/ruff check --fix

@@ -72,7 +72,7 @@ COARSE = {
     "CylinderInCylinderDamping-v0": Coarse(("theta", "theta_dot"), (4, 4), mirror="theta"),
     "CylinderInCylinderPump-v0": Coarse(("theta", "theta_dot", "psi_dot"), (2, 2, 2), mirror="theta"),
     "InclineTilt-v0": Coarse(
-        ("x - target", "w", "phi"), (1, 1, 1), targets=(0.0, 0.1, 0.2, 0.3), mirror="target"
+        ("x - target", "w", "phi"), (2, 1, 1), targets=(0.0, 0.1, 0.2, 0.3), mirror="target"
     ),
     "CylinderInCylinderTilt-v0": Coarse(
         ("theta - target", "theta_dot", "psi_dot"), (1, 1, 1), targets=(0.0, 0.15, 0.3), mirror="target"
@@ -97,8 +97,6 @@ def tabulate(solution: Solution, coarse: Coarse) -> tuple[dict[str, Any], dict[s
     for axis, level, name in zip(problem.axes, coarse.levels, coarse.axes, strict=True):
         if name.endswith(" - target"):  # so far the target's mirror image may be away
             axis = replace(axis, low=axis.low - max(coarse.targets), centre=0.0)
-        elif axis.centre == "target":
-            axis = replace(axis, scale=None)
         found = axis.nodes(level, None)
         if axis.periodic:  # an angle that is observed by cosine and sine lies within half a turn
             found = found - 0.5 * (found[0] + found[-1])

@@ -6,11 +6,15 @@ import warnings
 import numpy as np
 import pytest
 
+from agents.evaluate import evaluate_batch
+from lag_envs.controllers import make_controller
+from lag_envs.leaderboard.protocol import REFERENCES
 from lag_envs.leaderboard.ranking import (
     RESAMPLES,
     THRESHOLDS,
     columns,
     compare,
+    corrected,
     ends,
     improvement,
     iqm,
@@ -22,7 +26,7 @@ from lag_envs.leaderboard.ranking import (
     redrawn,
     wilson,
 )
-from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.scores import KNOWN_RETURNS, score
 
 ENV = "InclineBrake-v0"
 KNOWN = KNOWN_RETURNS[ENV]
@@ -203,6 +207,41 @@ def test_columns_of_a_row():
     bare = {"policies": [{"returns": returns(row)} for row in scores], "often": [None] * 5}
     row = columns(ENV, bare, redrawn("a", scores))
     assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
+
+
+# --- luck ---
+
+
+def test_luck_is_taken_out():
+    env_id = "PivotedBarBalance-v0"
+    mean = REFERENCES[env_id][1]
+    luck = np.random.default_rng(0).normal(3.0, 50.0, (2, 4000))
+
+    def policies(returns):
+        return [{"returns": r, "reference": mean + x} for r, x in zip(returns, luck, strict=True)]
+
+    # One that is half as lucky as the reference, and one that has nothing to do with it.
+    half = corrected(env_id, policies(400.0 + 0.5 * luck))
+    np.testing.assert_allclose(half, 400.0, rtol=1e-12)
+    other = np.random.default_rng(1).normal(30.0, 1.0, luck.shape)
+    np.testing.assert_allclose(corrected(env_id, policies(other)).mean(axis=1), other.mean(axis=1), atol=0.1)
+    # Where there is no reference, or none was recorded, or it is always the same, returns stay.
+    assert corrected(env_id, [{"returns": [1.0, 2.0]}]).tolist() == [[1.0, 2.0]]
+    assert corrected("PivotedBar-v0", policies(other)).tolist() == other.tolist()
+    still = [{"returns": [1.0, 2.0], "reference": [mean, mean]}]
+    assert corrected(env_id, still).tolist() == [[1.0, 2.0]]
+
+
+@pytest.mark.parametrize("env_id", REFERENCES)
+def test_references_are_controllers_that_are_known_and_help(env_id):
+    name, mean = REFERENCES[env_id]
+    known = KNOWN_RETURNS[env_id]
+    assert 0.9 < score(env_id, mean) <= 1.0005
+    if known.policy == name:
+        assert known.best == pytest.approx(mean, abs=0.05)
+    agent = make_controller(env_id, name)
+    few = evaluate_batch(env_id, agent, 10**10, 500)
+    assert abs(few.mean() - mean) < 5.0 * few.std() / len(few) ** 0.5  # not another controller's mean
 
 
 # --- against rliable ---

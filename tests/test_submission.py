@@ -436,7 +436,7 @@ def test_text_with_something_wrong(folder, old, new, reason):
         ("hidden = [3]", "hidden = 3", "hidden must be a list"),
         ("hidden = [3]", "hidden = [100000]", "hidden must be whole numbers"),
         ("hidden = [3]", f"hidden = [{'3, ' * 9}]", "hidden must be a list of 0 to 8"),
-        ("hidden = [3]", "hidden = [1024, 1024]", "at most 262144"),
+        ("hidden = [3]", "hidden = [1024, 1024]", "at most 131072"),
         ("hidden = [3]", "hidden = [4]", r"weight_0 must have the shape \(4, 4\)"),
         ("hidden = [3]", "hidden = [3, 3]", "array 'bias_2' is missing"),
         ("hidden = [3]", "hidden = []", "array 'bias_1' is not known"),

@@ -11,7 +11,8 @@ from test_submission import ENV, NET, built_in, learned, linear, net
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.submission import Refused, load, write
-from lag_envs.leaderboard.verify import declare_verify, episode, run_verify, verify
+from lag_envs.leaderboard.verify import compare, declare_verify, episode, run_verify, verify
+from lag_envs.scores import KNOWN_RETURNS
 from lag_envs.tasks import TASKS
 
 #: Behind the mark the plane is tilted back; near it, against the speed.
@@ -93,6 +94,18 @@ def test_same_bits_again_and_others_with_another_nonce(result, submission):
         assert other[name] != result[name]
 
 
+def test_results_are_compared(result):
+    other = json.loads(json.dumps(result))
+    assert compare(result, other) == (True, 0.0)
+    other["policies"][0]["trajectory"] = "0" * 64
+    other["policies"][0]["returns"][3] += 12.0
+    same, off = compare(result, other)
+    known = KNOWN_RETURNS[ENV]
+    assert not same and off == pytest.approx(1.0 / (known.best - known.random))
+    with pytest.raises(ValueError, match="differ in nonce: 'nonce' and 'x'"):
+        compare(result, other | {"nonce": "x"})
+
+
 def test_replay_goes_through_the_same_bits(tmp_path):
     made = learned(tmp_path / "a")
     few = verify(made, "n", 3)
@@ -167,7 +180,7 @@ def test_success_is_what_one_would_call_so(env, name, success, tmp_path):
     policy = {"architecture": "controller", "name": name}
     made = write(tmp_path / "a", env=env, kind="controller", policy=policy, **ABOUT)
     record = _Record(env, 20)
-    _play(env, made.policies[0][1], 1, 20, watch=record)
+    _play(env, made.policies[0][1].agent(), 1, 20, watch=record)
     found = record.result()
     assert np.mean(found["success"]) == success
     times = [t for t in found["settle"] if t is not None]
@@ -239,6 +252,19 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     good, bad = json.loads(out.read_text())
     assert good["policies"] == result["policies"] and good["folder"] == str(folders[0])
     assert bad == {"folder": str(folders[1]), "refused": bad["refused"]}
+
+    again = [folders[0], "--nonce", "nonce", "--episodes", 12, "--against", out]
+    assert command(*again) == 0
+    assert "the same, to the bit" in capsys.readouterr().out
+    good["policies"][0]["trajectory"] = "0" * 64
+    good["policies"][0]["returns"] = [r + 0.1 for r in good["policies"][0]["returns"]]
+    out.write_text(json.dumps([good]))
+    assert command(*again) == 0
+    assert "scores differ by" in capsys.readouterr().out
+    good["policies"][0]["returns"][0] += 100.0
+    out.write_text(json.dumps([good]))
+    assert command(*again) == 1
+    assert "more than the tolerance" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

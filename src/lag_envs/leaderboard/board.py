@@ -443,15 +443,13 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
 
 def _environment(board: Board, state: State, env_id: str, protocol: int) -> dict[str, Any]:
     from lag_envs.leaderboard.protocol import GOALS
-    from lag_envs.leaderboard.ranking import columns, normalised, ranked, redrawn
+    from lag_envs.leaderboard.ranking import columns, corrected, normalised, ranked, redrawn
     from lag_envs.leaderboard.site.scenery import describe
     from lag_envs.scores import KNOWN_RETURNS
 
     entries = {e.id: e for e in state.entries.values() if (e.env, e.protocol) == (env_id, protocol)}
     results = {id: board.result(e) for id, e in entries.items() if e.state == "verified"}
-    scores = {
-        id: normalised(env_id, [p["returns"] for p in result["policies"]]) for id, result in results.items()
-    }
+    scores = {id: normalised(env_id, corrected(env_id, result["policies"])) for id, result in results.items()}
     drawn = {id: redrawn(id, table) for id, table in scores.items()}
     rows = []
     for place in ranked(scores, drawn):

@@ -276,7 +276,7 @@ class Table(Architecture):
         if len(set(self.axes)) < len(self.axes):
             raise Refused(f"{table.where}: axes must differ")
         self.kind = table.choice("kind", ("action", "value"))
-        self.actions = table.whole("actions", 3, 51, 11) if self.kind == "value" else 0
+        self.actions = table.whole("actions", 3, 21, 11) if self.kind == "value" else 0
         mirror = table.any("mirror", "")
         if mirror not in ("", *(set(self.axes) - {"time"})):
             raise Refused(f"{table.where}: mirror must be one of the axes and not time, got {shown(mirror)}")
@@ -295,7 +295,7 @@ class Table(Architecture):
         """Return what looks up."""
         axes = [arrays[f"axis_{j}"] for j in range(len(self.axes))]
         for j, axis in enumerate(axes):
-            if not (np.diff(axis) > 0.0).all():
+            if not (axis[1:] > axis[:-1]).all():
                 raise Refused(f"the nodes of axis_{j} must grow")
         return _LookUp(self, axes, arrays["table"])
 

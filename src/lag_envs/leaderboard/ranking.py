@@ -2,7 +2,8 @@
 
 What is drawn anew
 ------------------
-A row holds the scores of its policies in their episodes, shape (policies, episodes). A policy's result is its
+A row holds the scores of its policies in their episodes, shape (policies, episodes), without the luck of the
+episodes (`corrected`). A policy's result is its
 mean over the episodes, and the row's score is the interquartile mean (IQM) over the policies, as rliable has
 it for one task [1]_. Intervals are percentile bootstrap intervals of 95 %:
 
@@ -29,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, trim_mean
 
+from lag_envs.leaderboard.protocol import DISTURBED_EPISODES, REFERENCES
 from lag_envs.scores import score
 
 Array = NDArray[np.float64]
@@ -89,6 +91,30 @@ def normalised(env_id: str, returns: ArrayLike) -> Array:
     if found is None:
         raise ValueError(f"{env_id} has no scale: it needs an entry in lag_envs.scores.KNOWN_RETURNS")
     return cast(Array, found)
+
+
+def corrected(env_id: str, policies: Sequence[Mapping[str, Any]]) -> Array:
+    """Return the returns of verified policies without the luck of their episodes, shape (policies, episodes).
+
+    Every submission has episodes of its own, and in some environments they differ more than agents do. So the
+    environment's reference, whose mean return is known, has played the same ones: what it got above that is
+    taken off, times the slope of the agent's returns over the reference's (a control variate; the mean stays
+    what it is in the long run, and an agent that has nothing in common with the reference keeps its returns).
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    policies : sequence of mapping
+        What was verified of each policy: ``returns`` and, where the environment has one, ``reference``.
+    """
+    returns = np.array([p["returns"] for p in policies], np.float64)
+    if env_id not in REFERENCES or not all("reference" in p for p in policies):
+        return returns
+    luck = np.array([p["reference"] for p in policies], np.float64) - REFERENCES[env_id][1]
+    apart = luck - luck.mean(axis=1, keepdims=True)
+    spread = np.sum(apart * apart)
+    return returns - (np.sum(apart * returns) / spread if spread > 0.0 else 0.0) * luck
 
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Any:
@@ -249,7 +275,8 @@ def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, A
         measured.
     """
     policies = result["policies"]
-    scores = normalised(env_id, [p["returns"] for p in policies])
+    returns = corrected(env_id, policies)
+    scores = normalised(env_id, returns)
     means = scores.mean(axis=1)
     settle, effort = (pooled(policies, name) for name in ("settle", "effort"))
     success = pooled(policies, "success")
@@ -257,17 +284,22 @@ def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, A
     if success:
         low, high = wilson(sum(success), len(success))
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
-    robustness = {name: _score(env_id, each) for name, each in (result.get("robustness") or {}).items()}
+    # Disturbed are the first episodes only: what sets these apart from all is not the disturbance's doing.
+    few = [np.mean(p["returns"][:DISTURBED_EPISODES]) for p in policies]
+    moved = returns.mean(axis=1) - few
+    robustness = {
+        name: _score(env_id, each, moved) for name, each in (result.get("robustness") or {}).items()
+    }
     return {
         "score": float(iqm(means)),
         "interval": list(ends(iqm(drawn))),
-        "return": float(np.mean([p["returns"] for p in policies])),
+        "return": float(returns.mean()),
         "gap": optimality_gap(means),
         "success": counted,
         "settle": median_time(settle) if settle else None,
         "effort": float(np.mean(effort)) if effort else None,
         "robustness": {name: value for name, value in robustness.items() if value is not None},
-        "often": _score(env_id, result.get("often")),
+        "often": _score(env_id, result.get("often"), moved),
         "profile": np.column_stack([THRESHOLDS, profile(scores)]).round(5).tolist(),
     }
 
@@ -277,8 +309,8 @@ def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
     return [value for p in policies for value in (p.get(name) or [])]
 
 
-def _score(env_id: str, returns: Sequence[float | None] | None) -> float | None:
-    """Return the score of policies' mean returns; None where one could not take part."""
+def _score(env_id: str, returns: Sequence[float | None] | None, moved: Array) -> float | None:
+    """Return the score of policies' mean returns, moved; None where one could not take part."""
     if not returns or None in returns:
         return None
-    return float(iqm(normalised(env_id, cast(list[float], returns))))
+    return float(iqm(normalised(env_id, np.array(returns, np.float64) + moved)))

@@ -148,7 +148,10 @@ def _read_files(folder: Path) -> dict[str, bytes]:
         raise Refused(f"there is no {TOML}")
     sizes = {}
     for name in sorted(names):
-        about = os.lstat(folder / name)
+        try:
+            about = os.lstat(folder / name)
+        except OSError as error:
+            raise Refused(f"{name} cannot be read: {error.strerror}") from error
         if not stat.S_ISREG(about.st_mode):
             raise Refused(f"{name} is no plain file; links, folders and devices are refused")
         most = protocol.TOML_BYTES if name == TOML else protocol.POLICY_BYTES

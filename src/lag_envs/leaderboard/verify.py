@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from lag_envs import __version__
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.policies import Policy
 from lag_envs.leaderboard.submission import Refused, Submission, load
 
 Array = NDArray[np.float64]
@@ -54,9 +53,10 @@ def verify(
     dict
         Of JSON types: protocol, env, digest, nonce, episodes, policies, robustness, often, seconds, machine,
         versions. ``policies`` has for each one its seed, the episodes' returns, successes, times [s] (None
-        where the goal was not reached) and efforts (mean of (u/U)²), and a hash of all actions, rewards and
-        ends. ``robustness`` maps disturbances to the policies' mean returns; ``often`` has those for acting
-        ten times as often, None for an agent that counts steps and cannot.
+        where the goal was not reached) and efforts (mean of (u/U)²), a hash of all actions, rewards and ends,
+        and what the environment's ``reference`` got in the same episodes, if it has one. ``robustness`` maps
+        disturbances to the policies' mean returns; ``often`` has those for acting ten times as often, None
+        for an agent that counts steps and cannot.
 
     Raises
     ------
@@ -94,19 +94,22 @@ def verify(
         first = protocol.first_seed(submission.digest, nonce, number)
         record = _Record(env, episodes)
         try:
-            returns = _play(env, policy, first, episodes, watch=record, tick=tick)
+            returns = _play(env, policy.agent(), first, episodes, watch=record, tick=tick)
             skip()
+            reference = _reference(env, first, episodes)
             for name, options in conditions.items():
-                robustness[name].append(float(_play(env, policy, first, few, tick=tick, **options).mean()))
+                robustness[name].append(
+                    float(_play(env, policy.agent(), first, few, tick=tick, **options).mean())
+                )
                 skip()
             agent = policy.agent()
             able = hasattr(agent, "pace") or type(agent).__name__ != "ILQR"
-            mean = _play(env, policy, first, few, tick=tick, **faster).mean() if able else None
+            mean = _play(env, agent, first, few, tick=tick, **faster).mean() if able else None
             often.append(None if mean is None else float(mean))
             skip()
         except Refused as error:
             raise Refused(f"policy of seed {seed}: {error}") from error
-        policies.append({"seed": seed, "returns": returns.tolist(), **record.result()})
+        policies.append({"seed": seed, "returns": returns.tolist(), **reference, **record.result()})
     return {
         "protocol": protocol.PROTOCOL,
         "env": env,
@@ -131,7 +134,7 @@ def _machine() -> dict[str, Any]:
 
 def _play(
     env_id: str,
-    policy: Policy,
+    agent: Any,
     seed: int,
     episodes: int,
     *,
@@ -139,10 +142,9 @@ def _play(
     tick: Callable[[int], Any] = lambda n: None,
     **options: Any,
 ) -> Array:
-    """Return a policy's returns (episodes,) in episodes with reset seeds from `seed` on, stepped together."""
+    """Return an agent's returns (episodes,) in episodes with reset seeds from `seed` on, stepped together."""
     import gymnasium as gym
 
-    agent = policy.agent()
     # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
     envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep", **options)
     bare: Any = envs.unwrapped
@@ -164,6 +166,16 @@ def _play(
         tick(episodes)
     envs.close()
     return returns
+
+
+def _reference(env_id: str, seed: int, episodes: int) -> dict[str, list[float]]:
+    """Return the returns of the environment's reference in the same episodes; nothing where there is none."""
+    if env_id not in protocol.REFERENCES:
+        return {}
+    from lag_envs.controllers import make_controller
+
+    name, _ = protocol.REFERENCES[env_id]
+    return {"reference": _play(env_id, make_controller(env_id, name), seed, episodes).tolist()}
 
 
 def _act(agent: Any, observation: Any, state: Any, start: NDArray[np.bool_]) -> tuple[Any, Any]:
@@ -259,7 +271,7 @@ def episode(submission: Submission, policy: int, seed: int) -> dict[str, Any]:
             actions.append(_rounded(action[0]))
             rewards.append(_rounded(reward[0]))
 
-    total = _play(submission.env, chosen, seed, 1, watch=watch)[0]
+    total = _play(submission.env, chosen.agent(), seed, 1, watch=watch)[0]
     return {
         "seed": training_seed, "reset_seed": seed, "return": float(total), "dt": dt, "states": states,
         "actions": actions, "rewards": rewards, "target": None if target is None else _rounded(target),
@@ -268,6 +280,39 @@ def episode(submission: Submission, policy: int, seed: int) -> dict[str, Any]:
 
 def _rounded(x: Any) -> float:
     return float(f"{x:.6g}")
+
+
+def compare(result: dict[str, Any], other: dict[str, Any]) -> tuple[bool, float]:
+    """Compare two verifications of the same submission with the same nonce and number of episodes.
+
+    Parameters
+    ----------
+    result, other : dict
+        What `verify` returned.
+
+    Returns
+    -------
+    same : bool
+        Whether every action, reward and end was the same, to the bit.
+    difference : float
+        The largest difference of a policy's mean return, relative to the way from random to best known; on
+        two machines `protocol.TOLERANCE` at most.
+
+    Raises
+    ------
+    ValueError
+        Where they are not of the same submission, nonce and episodes.
+    """
+    from lag_envs.scores import KNOWN_RETURNS
+
+    for name in ("protocol", "env", "digest", "nonce", "episodes"):
+        if result[name] != other[name]:
+            raise ValueError(f"the results differ in {name}: {result[name]!r} and {other[name]!r}")
+    pairs = list(zip(result["policies"], other["policies"], strict=True))
+    known = KNOWN_RETURNS[result["env"]]
+    difference = max(abs(np.mean(a["returns"]) - np.mean(b["returns"])) for a, b in pairs)
+    same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
+    return same, float(difference) / (known.best - known.random)
 
 
 # --- the command --------------------------------------------------------------------------------------------
@@ -299,6 +344,10 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ray", metavar="ADDRESS", help='spread them over a Ray cluster; "local" starts one')
     parser.add_argument("--json", metavar="FILE", help="write all results to this file")
+    parser.add_argument(
+        "--against", metavar="FILE",
+        help="compare with results that --json wrote, here or elsewhere, of the same nonce and episodes",
+    )  # fmt: skip
 
 
 def run_verify(args: argparse.Namespace) -> int:
@@ -312,15 +361,47 @@ def run_verify(args: argparse.Namespace) -> int:
     if args.json and not Path(args.json).absolute().parent.is_dir():
         raise UserError(f"--json: there is no folder {Path(args.json).absolute().parent}")
     folders = [Path(folder) for folder in args.folders]
-    results = []
+    before = _read(Path(args.against)) if args.against else None
+    results, far = [], False
     for folder, result in _results(folders, args):
         if isinstance(result, Exception):
             raise result
         results.append({"folder": str(folder)} | result)
         print("\n".join(table(results[-1])), flush=True)
+        if before is not None and "refused" not in result:
+            far |= _report(result, before.get(result["digest"]), args.against)
     if args.json:
         Path(args.json).write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
-    return 1 if any("refused" in result for result in results) else 0
+    return 1 if far or any("refused" in result for result in results) else 0
+
+
+def _read(file: Path) -> dict[str, dict[str, Any]]:
+    """Return results that were written before, by digest."""
+    from lag_envs.cli import UserError
+
+    try:
+        return {r["digest"]: r for r in json.loads(file.read_text(encoding="utf-8")) if "digest" in r}
+    except (OSError, ValueError, TypeError) as error:
+        raise UserError(f"--against: {file} cannot be read: {error}") from error
+
+
+def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> bool:
+    """Tell how a result compares with an earlier one; return whether it is too far from it."""
+    from lag_envs.cli import UserError
+
+    if other is None:
+        print(f"  {file} has nothing about it")
+        return False
+    try:
+        same, off = compare(result, other)
+    except (ValueError, KeyError) as error:
+        raise UserError(f"--against: {file}: {error}") from error
+    far = off > protocol.TOLERANCE
+    print(
+        f"  {'the same, to the bit, as' if same else f'scores differ by {off:.1e} at most from'} {file}"
+        + (f"; more than the tolerance of {protocol.TOLERANCE:g}" if far else "")
+    )
+    return far
 
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
@@ -353,6 +434,7 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> list[str]:
     """Return a result as lines of text."""
+    from lag_envs.leaderboard.ranking import corrected
     from lag_envs.scores import score
 
     if "refused" in result:
@@ -363,7 +445,7 @@ def table(result: dict[str, Any]) -> list[str]:
         f"  {'seed':>6}  {'return':>12}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:
-        mean = float(np.mean(policy["returns"]))
+        mean = float(corrected(env, [policy]).mean())
         times = [t for t in policy["settle"] if t is not None]
         part = score(env, mean)
         lines.append(
