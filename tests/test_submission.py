@@ -886,3 +886,38 @@ def test_all_agents_are_submitted(runs, tmp_path, monkeypatch, capsys):
     assert found == {*CONTROLLERS[ENV], "PPO"}
     assert main(["out", "--envs", ENV]) == 0
     assert main(["out", "--envs", "Nothing"]) == 2
+
+
+# --- the page about the format ------------------------------------------------------------------------------
+
+
+def test_page_shows_submissions_that_are_accepted(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "submissions.md").read_text(encoding="utf-8")
+    first, second = (part.split("```")[0] for part in text.split("```toml\n")[1:])
+    whole, built = tmp_path / "whole", tmp_path / "built-in"
+    for folder, about in (
+        (whole, first),
+        (built, first.replace('"learned"', '"controller"').split("[training]")[0] + second),
+    ):
+        folder.mkdir()
+        (folder / "submission.toml").write_text(about, encoding="utf-8")
+    for seed in range(5):
+        (whole / f"policy_{seed}.safetensors").write_bytes(save(net(seed, (3, 32, 32, 1))))
+    assert len(load(whole).policies) == 5
+    assert load(built).policies[0][1].agent().catch == 5.0
+
+
+def test_page_tells_the_limits():
+    text = (Path(__file__).parents[1] / "docs" / "submissions.md").read_text(encoding="utf-8")
+    p = protocol
+    for told in (
+        f"{p.TOML_BYTES // 1024} KiB, lines of {p.LINE:,} characters",
+        f"{p.POLICY_BYTES // 2**20} MiB, {p.FOLDER_BYTES // 2**20} MiB",
+        f"{p.MOST_POLICIES}; of kind `learned` at least {p.LEARNED_POLICIES}",
+        f"{p.LAYERS} hidden layers of width {p.WIDTH:,}, {p.NUMBERS:,} numbers",
+        f"{p.CURVE} points",
+    ):
+        assert told in text
+    from lag_envs.leaderboard.policies import ACTIVATIONS, ARCHITECTURES
+
+    assert all(f"`{name}`" in text for name in (*ACTIVATIONS, *ARCHITECTURES))

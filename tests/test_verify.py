@@ -31,7 +31,7 @@ def submission(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(submission):
-    return verify(submission, "nonce", 12)
+    return verify(submission, "nonce", 6)
 
 
 # --- seeds --------------------------------------------------------------------------------------------------
@@ -52,10 +52,10 @@ def test_result_is_of_json_types_and_complete(result, submission):
     again = json.loads(json.dumps(result, allow_nan=False))
     assert again == result
     assert (result["protocol"], result["env"], result["nonce"]) == (protocol.PROTOCOL, ENV, "nonce")
-    assert result["digest"] == submission.digest and result["episodes"] == 12
+    assert result["digest"] == submission.digest and result["episodes"] == 6
     (policy,) = result["policies"]
     assert policy["seed"] == 0 and len(policy["trajectory"]) == 64
-    assert {len(policy[name]) for name in ("returns", "success", "settle", "effort")} == {12}
+    assert {len(policy[name]) for name in ("returns", "success", "settle", "effort")} == {6}
     assert set(result["robustness"]) == set(protocol.disturbances(ENV))
     assert all(len(means) == 1 for means in result["robustness"].values())
     assert len(result["often"]) == 1
@@ -66,7 +66,7 @@ def test_numbers_are_those_of_single_episodes(result, submission):
     agent = submission.policies[0][1].agent()
     policy, env = result["policies"][0], gym.make(ENV)
     first = protocol.first_seed(submission.digest, "nonce", 0)
-    for i in range(12):
+    for i in range(6):
         observation, _ = env.reset(seed=first + i)
         total, efforts, near, over = 0.0, [], [], False
         while not over:
@@ -88,7 +88,7 @@ def test_numbers_are_those_of_single_episodes(result, submission):
 
 
 def test_same_bits_again_and_others_with_another_nonce(result, submission):
-    again, other = verify(submission, "nonce", 12), verify(submission, "other", 12)
+    again, other = verify(submission, "nonce", 6), verify(submission, "other", 6)
     for name in ("policies", "robustness", "often"):
         assert again[name] == result[name]
         assert other[name] != result[name]
@@ -132,7 +132,7 @@ def test_disturbances_and_acting_often_are_what_they_say(result, submission):
         ({"dt": 0.005}, result["often"]),
     ):
         env, returns = gym.make(ENV, **options), []
-        for i in range(12):
+        for i in range(6):
             observation, _ = env.reset(seed=first + i)
             total, over = 0.0, False
             while not over:
@@ -245,7 +245,7 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     (tmp_path / "bad" / "run.py").write_text("")
     out = tmp_path / "out.json"
     folders = [tmp_path / "good", tmp_path / "bad"]
-    assert command(*folders, "--nonce", "nonce", "--episodes", 12, "--json", out) == 1
+    assert command(*folders, "--nonce", "nonce", "--episodes", 6, "--json", out) == 1
     text = capsys.readouterr().out
     assert "worst disturbance" in text and "acting ten times as often" in text
     assert "bad: refused: unknown file 'run.py'" in text
@@ -253,7 +253,7 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     assert good["policies"] == result["policies"] and good["folder"] == str(folders[0])
     assert bad == {"folder": str(folders[1]), "refused": bad["refused"]}
 
-    again = [folders[0], "--nonce", "nonce", "--episodes", 12, "--against", out]
+    again = [folders[0], "--nonce", "nonce", "--episodes", 6, "--against", out]
     assert command(*again) == 0
     assert "the same, to the bit" in capsys.readouterr().out
     good["policies"][0]["trajectory"] = "0" * 64
@@ -287,7 +287,7 @@ def test_processes_give_the_same(tmp_path, result):
     for name in ("a", "b"):
         feedback(tmp_path / name)
     out = tmp_path / "out.json"
-    assert command(tmp_path / "a", tmp_path / "b", "--jobs", 2, "--nonce", "nonce", "--episodes", 12,
+    assert command(tmp_path / "a", tmp_path / "b", "--jobs", 2, "--nonce", "nonce", "--episodes", 6,
                    "--json", out) == 0  # fmt: skip
     assert [r["policies"] for r in json.loads(out.read_text())] == [result["policies"]] * 2
 

@@ -450,7 +450,7 @@ class Damping(Task):
 
     ## Optimal Value
 
-    At least 366.9 ± 0.2 (the greedy policy of finite-horizon value iteration gets it) and about 367.4 at most
+    At least 367.1 ± 0.2 (the greedy policy of finite-horizon value iteration gets it) and about 367.6 at most
     (extrapolated to a grid without width: an estimate). Full damping all the time gets 305. Over 4,096
     episodes (mean ± standard error), the last column being full brake away from the bottom, and action = 14.6
     (|θ'| - 6.94 |θ|), clipped to ±1, towards it:

@@ -107,7 +107,7 @@ class Tilt(Task):
 
     ## Optimal Value
 
-    At least 181.5 (a plan by iLQR on the exact model gets it) and about 181.8 at most (finite-horizon value
+    At least 181.6 (a plan by iLQR on the exact model gets it) and about 181.9 at most (finite-horizon value
     iteration on a grid, extrapolated: an estimate), in the mean over the targets. Over 4,096 episodes (mean ±
     standard error), the last column being the cascade φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1,
     action = 43.4 (φ_wanted - φ), clipped to ±1:
