@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import sys
@@ -20,6 +19,7 @@ from agents.analysis import NOMINAL, OFTEN, Data, rounded
 from agents.evaluate import Sensor, evaluate_batch
 from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
 from lag_envs import TASKS, __version__, controllers
+from lag_envs.leaderboard import protocol
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -205,14 +205,8 @@ class Condition:
 
 def conditions(env_id: str) -> list[Condition]:
     """Return the conditions under which agents are measured on an environment."""
-    place, fixed = TASKS[env_id]
-    task = load_task(place)(**fixed)
-    found = [Condition(NOMINAL), Condition(OFTEN, {"dt": task.interval / 10.0})]
-    for parameter in dataclasses.fields(task.scene):
-        value = getattr(task.scene, parameter.name)
-        if isinstance(value, float) and 0.0 < value < np.inf:
-            for share, sign in ((0.8, "-"), (1.2, "+")):
-                found.append(Condition(f"{parameter.name} {sign}20 %", {parameter.name: share * value}))
+    found = [Condition(NOMINAL), Condition(OFTEN, protocol.often(env_id))]
+    found += [Condition(name, options) for name, options in protocol.disturbances(env_id).items()]
     found += [Condition(f"noise {level:.0%}".replace("%", " %"), noise=level) for level in (0.01, 0.05)]
     return [*found, Condition("late", late=True)]
 

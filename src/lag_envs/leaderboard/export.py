@@ -217,7 +217,7 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     """Return the largest difference of a model's actions and an agent's, and the number of observations.
 
     Half of the observations are on the way: of episodes in which the model acts, and of some in which actions
-    are random. The others are random, up to twice as far out.
+    are random. The others are random, as far out as those; beyond, float32 rounds too much.
 
     Where the model chooses between actions and two are worth the same to float32's rounding, either is right.
     """
@@ -240,7 +240,7 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
         observation = envs.step(action)[0]
     envs.close()
     path = rng.permutation(np.concatenate(seen))[:8192]
-    far = 2.0 * np.abs(path).max(axis=0)
+    far = np.abs(path).max(axis=0)
     both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
     theirs, ours = act(both)[:, 0], agent.predict(both)[0][:, 0]
     off = np.abs(theirs.astype(np.float64) - ours)

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, trim_mean
 
-from lag_envs.leaderboard.protocol import DISTURBED_EPISODES, REFERENCES
+from lag_envs.leaderboard.protocol import DISTURBED_EPISODES, REFERENCES, make_task
 from lag_envs.scores import score
 
 Array = NDArray[np.float64]
@@ -299,7 +299,7 @@ def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, A
         "settle": median_time(settle) if settle else None,
         "effort": float(np.mean(effort)) if effort else None,
         "robustness": {name: value for name, value in robustness.items() if value is not None},
-        "often": _score(env_id, result.get("often"), moved),
+        "often": _score(env_id, result.get("often"), 0.0 * moved if make_task(env_id).draws else moved),
         "profile": np.column_stack([THRESHOLDS, profile(scores)]).round(5).tolist(),
     }
 

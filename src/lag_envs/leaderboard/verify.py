@@ -44,7 +44,8 @@ def verify(
     nonce : str
         Decides the episodes together with the submission's digest, see `protocol.first_seed`.
     episodes : int
-        Episodes of each policy; under disturbances at most `protocol.DISTURBED_EPISODES`.
+        Episodes of each policy; under disturbances, and acting often where there are no kicks, at most
+        `protocol.DISTURBED_EPISODES`.
     progress : callable, optional
         Called now and then with the steps taken, and the steps that there are at most.
 
@@ -70,7 +71,9 @@ def verify(
     conditions = protocol.disturbances(env)
     faster = protocol.often(env)
     limit = int(protocol.make_task(env).limit)
-    runs = [limit * episodes, *[limit * few] * len(conditions), 10 * limit * few]
+    # Kicks are others when acting often, and it takes as many episodes again until they make no difference.
+    more = episodes if protocol.make_task(env).draws else few
+    runs = [limit * episodes, *[limit * few] * len(conditions), 10 * limit * more]
     work = sum(runs) * len(submission.policies)
     done, through = 0, 0
 
@@ -104,7 +107,7 @@ def verify(
                 skip()
             agent = policy.agent()
             able = hasattr(agent, "pace") or type(agent).__name__ != "ILQR"
-            mean = _play(env, agent, first, few, tick=tick, **faster).mean() if able else None
+            mean = _play(env, agent, first, more, tick=tick, **faster).mean() if able else None
             often.append(None if mean is None else float(mean))
             skip()
         except Refused as error:
