@@ -11,7 +11,6 @@ import os
 import queue
 import shlex
 import signal
-import socket
 import sys
 import tempfile
 import threading
@@ -27,6 +26,7 @@ from typing import Any
 from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
 from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_env, check_name, write
 from lag_envs import TASKS
+from lag_envs.leaderboard.spread import SpreadError, check_address
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -242,7 +242,10 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callab
     root = Path(__file__).parents[1]
     modules = [str(root / "agents"), str(root / "src" / "lag_envs")]
     options: dict[str, Any] = {"runtime_env": {"py_modules": modules}, "log_to_driver": False}
-    _check_address(address)
+    try:
+        check_address(address)
+    except SpreadError as error:
+        raise UserError(str(error)) from error
     try:
         ray.init(None if address == "local" else address, logging_level="error", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -282,16 +285,6 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callab
         yield poll, stopped.set
     finally:
         ray.shutdown()
-
-
-def _check_address(address: str) -> None:
-    """Raise UserError where nobody listens: Ray itself would try for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host:
-        try:
-            socket.create_connection((host, int(port)), timeout=10.0).close()
-        except (OSError, ValueError, OverflowError) as error:
-            raise UserError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 def _packed(run: Run) -> tuple[dict[str, Any], bytes | None]:

@@ -146,7 +146,7 @@ def _on_ray(function: Work, folders: Sequence[Path], address: str) -> Iterator[t
 
     import lag_envs
 
-    _check_address(address)
+    check_address(address)
     packages = {"py_modules": [str(Path(lag_envs.__file__).parent)]}
     try:
         ray.init(
@@ -175,7 +175,7 @@ def _on_ray(function: Work, folders: Sequence[Path], address: str) -> Iterator[t
         ray.shutdown()
 
 
-def _check_address(address: str) -> None:
+def check_address(address: str) -> None:
     """Raise SpreadError where nobody listens: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host:
