@@ -295,7 +295,9 @@ def test_readme_row(env_id):
     assert len(row["observation"].split(", ")) == len(env.task.observation)
 
 
-@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md", "docs/physics.md", "docs/numerics.md"])
+@pytest.mark.parametrize(
+    "file", ["README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
+)
 def test_links(file):
     path = ROOT / file
     text = path.read_text(encoding="utf-8")
