@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import TASKS
+from lag_envs.errors import UserError
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
@@ -24,10 +25,6 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
-
-
-class UserError(Exception):
-    """A mistake of the user's; its text is shown, without a traceback."""
 
 
 @dataclass

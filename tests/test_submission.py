@@ -791,7 +791,7 @@ def test_command_exports_the_runs_of_a_folder(runs, tmp_path, monkeypatch, capsy
 
 
 def test_command_exports_files(runs, tmp_path):
-    from lag_envs.cli import UserError
+    from lag_envs.errors import UserError
 
     files = [runs / f"seed{s}" / "model.zip" for s in range(5)]
     norms = [file.with_name("vecnormalize.pkl") for file in files]

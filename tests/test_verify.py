@@ -276,7 +276,7 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     ],
 )
 def test_command_refuses(tmp_path, arguments, reason):
-    from lag_envs.cli import UserError
+    from lag_envs.errors import UserError
 
     with pytest.raises(UserError, match=reason):
         command(tmp_path, *arguments)

@@ -21,13 +21,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs import TASKS, __version__
+from lag_envs.errors import UserError
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
-
-
-class UserError(Exception):
-    """A mistake in the command line; its text is shown, without a traceback."""
 
 
 class Command(NamedTuple):
@@ -538,5 +535,4 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 if __name__ == "__main__":
-    # As the module that others import, so that a UserError of theirs is one of ours.
-    sys.exit(import_module("lag_envs.cli").main())
+    sys.exit(main())

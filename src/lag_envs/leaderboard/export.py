@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Fields
 from lag_envs.leaderboard.policies import architecture
@@ -414,8 +415,6 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 def run_export(args: argparse.Namespace) -> int:
     """Turn models into a submission."""
-    from lag_envs.cli import UserError
-
     try:
         import torch
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs import __version__
+from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.submission import Refused, Submission, load
 
@@ -355,8 +356,6 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
 
 def run_verify(args: argparse.Namespace) -> int:
     """Verify submissions and print what they get; return 1 where one was refused."""
-    from lag_envs.cli import UserError
-
     if not 1 <= args.episodes <= 100_000:
         raise UserError(f"--episodes must lie between 1 and 100000, got {args.episodes}")
     if args.jobs < 1:
@@ -380,8 +379,6 @@ def run_verify(args: argparse.Namespace) -> int:
 
 def _read(file: Path) -> dict[str, dict[str, Any]]:
     """Return results that were written before, by digest."""
-    from lag_envs.cli import UserError
-
     try:
         return {r["digest"]: r for r in json.loads(file.read_text(encoding="utf-8")) if "digest" in r}
     except (OSError, ValueError, TypeError) as error:
@@ -390,8 +387,6 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> bool:
     """Tell how a result compares with an earlier one; return whether it is too far from it."""
-    from lag_envs.cli import UserError
-
     if other is None:
         print(f"  {file} has nothing about it")
         return False
@@ -409,7 +404,6 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> 
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
     """Verify here, with a progress bar, or where it was asked for."""
-    from lag_envs.cli import UserError
     from lag_envs.leaderboard.spread import SpreadError, map_submissions
 
     if args.jobs == 1 and args.ray is None:
