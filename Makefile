@@ -28,6 +28,7 @@ baselines: setup  ## compute, train and measure all agents (hours; may be broken
 	$(BIN)/python -m agents.optimum
 	$(BIN)/python -m agents.train all --seeds 5
 	$(BIN)/python -m agents.train all --algo sac td3 tqc dqn --seeds 1
+	$(BIN)/python -m agents.bench --output agents/results/adapter.json
 	$(BIN)/python -m agents.results $(ARGS)
 
 test: setup  ## run the tests and doctests, all but the slow ones
@@ -64,6 +65,7 @@ report-docs: setup  ## take the folder report over into docs and README
 	$(BIN)/python -m lag_envs.report.docs report
 
 submissions: setup  ## make submissions of all our agents, from what `make baselines` left, in runs/submissions
+	$(BIN)/python -m agents.board_values
 	$(BIN)/python -m agents.submit runs/submissions $(ARGS)
 
 site: setup  ## build the leaderboard's page, into the folder site

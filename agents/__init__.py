@@ -1,1 +1,1 @@
-"""Agents for the environments of `lag_envs`: classical controllers and learners."""
+"""Agents for the environments of `lag_envs`: learners, the optimum, and what all agents reach."""

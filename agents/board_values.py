@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from agents.optimum import DEFAULT_FOLDER, PROBLEMS, RELAXATIONS, Solution
-from agents.run import check_env, write
+from agents.run import UserError, check_env, write
 from lag_envs import TASKS
 
 POINTS = 61  #: along each axis
@@ -62,7 +62,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
     args = parser.parse_args(arguments)
-    for env_id in [check_env(name) for name in args.env] or TASKS:
+    try:
+        envs = [check_env(name) for name in args.env] or list(TASKS)
+    except UserError as error:
+        print(f"agents.board_values: error: {error}", file=sys.stderr)
+        return 2
+    for env_id in envs:
         path = args.board / "values" / f"{env_id}.json"
         write(path, json.dumps(coarse(env_id), separators=(",", ":")) + "\n")
         print(path, flush=True)

@@ -160,8 +160,8 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     axes.plot(steps, means, color="tab:blue", label=f"{learner} while training")
     axes.plot(trained, returns[learner].mean(), "o", color="tab:blue", clip_on=False, label="trained")
     others = sorted((r.mean(), name) for name, r in returns.items() if name != learner)
-    for (mean, name), color in zip(reversed(others), ("tab:green", "tab:olive", "tab:brown"), strict=False):
-        axes.axhline(mean, color=color, linestyle=":", label=f"{name} ({mean:.1f})")
+    for number, (mean, name) in enumerate(reversed(others)):
+        axes.axhline(mean, color=f"C{number + 1}", linestyle=":", label=f"{name} ({mean:.1f})")
     best = KNOWN_RETURNS[run.env].best
     axes.axhline(best, color="black", linestyle="--", linewidth=1.0, label=f"best known ({best:g})")
     axes.set(xlabel="environment steps", ylabel="return of an episode", xlim=(0, trained), title=run.env)

@@ -109,7 +109,9 @@ def make_envs(run: Run) -> Any:
     steps = load_task(place)(**(fixed | options)).limit
     bins = factor = None
     for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
-        (name, arguments), *_ = wrapper.items()
+        name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
+        if name in (TIME_LIMIT, DISCRETISE, SCALE) and not arguments:
+            raise UserError(f"wrapper {name} needs its arguments, as in {name}: {{...}}")
         if name == TIME_LIMIT:
             options["max_episode_steps"] = arguments["max_episode_steps"]
             steps = min(steps, options["max_episode_steps"])
@@ -143,8 +145,16 @@ def make_model(run: Run, envs: Any) -> Any:
     arguments = deepcopy({k: v for k, v in run.hyperparameters.items() if k not in own})
     for name in ("learning_rate", "clip_range"):
         if isinstance(arguments.get(name), str):  # "lin_3e-4" falls to zero in the course of the training
-            arguments[name] = LinearSchedule(float(arguments[name].removeprefix("lin_")), 0.0, 1.0)
-    if run.hyperparameters.get("noise_type") == "normal":
+            try:
+                arguments[name] = LinearSchedule(float(arguments[name].removeprefix("lin_")), 0.0, 1.0)
+            except ValueError:
+                raise UserError(f"{name} must be a number or lin_NUMBER, got {arguments[name]!r}") from None
+    noise = run.hyperparameters.get("noise_type")
+    if noise not in (None, "normal"):
+        raise UserError(
+            f"noise_type must be normal, got {noise!r}: others have a memory, and are not resumed"
+        )
+    if noise:
         sigma = np.full(envs.action_space.shape, float(run.hyperparameters["noise_std"]))
         arguments["action_noise"] = NormalActionNoise(np.zeros_like(sigma), sigma)
     try:

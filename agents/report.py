@@ -19,6 +19,8 @@ from lag_envs.scores import KNOWN_RETURNS
 IMAGES = "images"
 NOTES = Path(__file__).with_name("notes.toml")
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
+OPTIMA = Path(__file__).with_name("results") / "optimum"
+DOCS = Path(__file__).parents[1] / "docs"
 
 # --- figures -----------------------------------------------------------------------------------------------
 
@@ -232,6 +234,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     ]
     for env_id, env in envs.items():
         parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else []), _range(env)]
+        parts += _optimum(env_id)
         parts += [_env_table(env, data["episodes"]), *([_problems(env)] if env.get("problems") else [])]
         parts.append(
             _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
@@ -292,8 +295,8 @@ def load_notes() -> dict[str, str]:
 def _reading(data: Data) -> str:
     return (
         "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best policy"
-        " known. Where no range is known, or it is too wide for a percentage to mean anything, the return"
-        " itself stands in its place. Learners: interquartile mean over training seeds, and in brackets its"
+        " known, which need not be the optimum. Where no range is known, the return itself stands there."
+        " Learners: interquartile mean over training seeds, and in brackets its"
         f" {100 * LEVEL:g} % interval by a stratified bootstrap; mean return ± standard error over seeds"
         " (a single run is treated like what follows)."
         " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
@@ -440,6 +443,32 @@ def _about(data: Data) -> str:
         f" {machine['python']}; {data['date']}. {versions}."
     )
     return text + (f"\n\nTrained on:\n\n{trained}" if trained else "")
+
+
+def _optimum(env_id: str) -> list[str]:
+    """Tell what `python -m agents.optimum` found, with its picture."""
+    file = OPTIMA / f"{env_id}.json"
+    if not file.exists():
+        return []
+    found = json.loads(file.read_text(encoding="utf-8"))
+    known = KNOWN_RETURNS.get(env_id)
+    text = f"**Optimum.** By value iteration, over the starts of {found['episodes']:,} episodes: "
+    if found["lower"] is None:
+        text += f"solved is {found['solved']}, which is easier; "
+    else:
+        low, high = found["lower"]["interval"]
+        text += (
+            f"its greedy policy gets {found['lower']['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}); "
+        )
+    text += (
+        f"at most {found['upper_estimate']:.6g}, an estimate, extrapolated linearly to a grid without width"
+        f" ({found['likely']:.6g} by the order of convergence that the grids show). Proved is only that it is"
+        f" at most {found['bound']['value']:.4g}: {found['bound']['why']}."
+    )
+    if known is not None and known.best - known.random < 0.95 * (known.estimate - known.random):
+        text += " **The range is too wide to call a score a percentage of the optimum.**"
+    picture = DOCS / IMAGES / f"value-{env_id}.png"
+    return [text, *([_image(picture.name, f"{env_id}: value function")] if picture.exists() else [])]
 
 
 def adapter() -> str:

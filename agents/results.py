@@ -224,7 +224,8 @@ def summarise(
         found["problems"] = absent
         envs[env_id] = found
     if not envs:
-        raise UserError("no agent could be measured")
+        reasons = [problem for found in fields.values() for problem in [*found.broken, *found.absent]]
+        raise UserError("no agent could be measured" + "".join(f"\n  {reason}" for reason in reasons))
     return {
         "schema": SCHEMA,
         "date": datetime.date.today().isoformat(),

@@ -7,7 +7,6 @@ folder.
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 import pickle
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import TASKS
-from lag_envs.errors import UserError
+from lag_envs.errors import UserError, hint
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
@@ -144,6 +143,8 @@ def read_result(file: Path) -> dict[str, Any]:
             raise ValueError("it was not written by this version")
         if not isinstance(content["evaluation"]["returns"], list):
             raise ValueError("its returns are no list")
+        for name in ("trained", "wall_seconds", "mean_return", "score", "curve", "seed"):
+            content[name]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} cannot be read ({error}); remove it, or start anew with --new") from error
     return content
@@ -168,9 +169,7 @@ def check_env(env_id: str) -> str:
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     """Return a name that is known, or raise a UserError with those that are close."""
-    names = {n.lower(): n for n in known}
-    if name in names.values():
+    known = list(known)
+    if name in known:
         return name
-    close = [names[c] for c in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(names.values())}"
-    raise UserError(f"there is no {kind} {name!r}; {hint}")
+    raise UserError(f"there is no {kind} {name!r}; {hint(name, known)}")

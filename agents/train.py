@@ -106,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def plan(args: argparse.Namespace) -> list[Run]:
     """Return the runs that are asked for, or raise a UserError."""
+    if "all" in args.env and len(args.env) > 1:
+        raise UserError(f"all stands alone, got {' '.join(args.env)}")
     envs = list(TASKS) if args.env == ["all"] else [check_env(name) for name in dict.fromkeys(args.env)]
     algos = [check_name("algorithm", name, ALGORITHMS) for name in dict.fromkeys(args.algo)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
@@ -118,9 +120,19 @@ def plan(args: argparse.Namespace) -> list[Run]:
     runs = []
     for env, algo in product(envs, algos):
         hyper = hyperparameters(algo, env, args.config)
-        steps = args.steps or int(hyper["n_timesteps"])
+        try:
+            steps = args.steps or int(float(hyper["n_timesteps"]))
+        except (KeyError, ValueError, TypeError):
+            steps = 0
+        if steps < 1:
+            raise UserError(f"n_timesteps must be a number of steps, got {hyper.get('n_timesteps')!r}")
         for seed in range(args.first_seed, args.first_seed + args.seeds):
             runs.append(Run(args.output / env / algo / f"seed{seed}", env, algo, seed, steps, hyper))
+    if args.ray:  # before anything is removed
+        try:
+            check_address(args.ray)
+        except SpreadError as error:
+            raise UserError(str(error)) from error
     for run in runs:
         if args.new:
             run.remove()
@@ -242,10 +254,6 @@ def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callab
     root = Path(__file__).parents[1]
     modules = [str(root / "agents"), str(root / "src" / "lag_envs")]
     options: dict[str, Any] = {"runtime_env": {"py_modules": modules}, "log_to_driver": False}
-    try:
-        check_address(address)
-    except SpreadError as error:
-        raise UserError(str(error)) from error
     try:
         ray.init(None if address == "local" else address, logging_level="error", **options)
     except (ConnectionError, ValueError, RuntimeError) as error:

@@ -20,6 +20,7 @@ from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, T
 from lag_envs.controllers.incline import SwitchingLine, TiltCascade
 from lag_envs.controllers.pd import PD
 from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR
+from lag_envs.errors import hint
 from lag_envs.tasks import TASKS, load_task
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
@@ -97,8 +98,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         check_id(args.env)
     except ValueError as error:
-        print(f"tune: error: {error}", file=sys.stderr)
+        print(f"agents.tune: error: {error}", file=sys.stderr)
         return 2
+    if args.only not in (None, *TUNABLE[args.env]):
+        there = hint(args.only, TUNABLE[args.env])
+        print(f"agents.tune: error: nothing of {args.only!r} can be tuned; {there}", file=sys.stderr)
+        return 2
+    for name in ("episodes", "generations"):
+        if getattr(args, name) < 1:
+            print(
+                f"agents.tune: error: --{name} must be at least 1, got {getattr(args, name)}", file=sys.stderr
+            )
+            return 2
     for name in TUNABLE[args.env]:
         if args.only in (None, name):
             numbers, mean = tune(args.env, name, args.episodes, args.generations)

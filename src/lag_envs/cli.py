@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import difflib
 import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from datetime import date
 from importlib import import_module
 from importlib.util import find_spec
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs import TASKS, __version__
-from lag_envs.errors import UserError
+from lag_envs.errors import UserError, hint
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -303,7 +302,7 @@ def run_report(args: argparse.Namespace) -> int:
     names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
     for name in names:
         if name not in SECTIONS:
-            raise UserError(f"there is no section {name!r}; {_hint(name, SECTIONS)}")
+            raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     settings = Settings(args.folder, args.quick, names, args.processes, args.date)
     try:
         return 0 if make_report(settings) else 130
@@ -318,7 +317,7 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
     """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
 
     def call(given: Any) -> Any:
-        for package in ("jinja2", "safetensors", "scipy", "tqdm"):
+        for package in ("jinja2", "safetensors", "scipy", "sympy", "tqdm"):
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
         from lag_envs.leaderboard.board import BoardError
@@ -494,16 +493,7 @@ def _known(id: str) -> str:
     """Return the id, or raise a UserError that names similar ones."""
     if id in TASKS:
         return id
-    raise UserError(f"there is no environment {id!r}; {_hint(id, TASKS, '`lag-envs list` names all')}")
-
-
-def _hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return which of the known names might be meant, or where to find them."""
-    names = {name.lower(): name for name in known}
-    close = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)
-    if close:
-        return f"did you mean {' or '.join(names[c] for c in close)}?"
-    return otherwise or f"there are {', '.join(names.values())}"
+    raise UserError(f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')}")
 
 
 def _task(id: str) -> Task:

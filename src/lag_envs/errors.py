@@ -1,5 +1,32 @@
-"""The error that commands show as they are."""
+"""The error that commands show as they are, and hints for names that do not exist."""
+
+import difflib
+from collections.abc import Iterable
 
 
 class UserError(Exception):
     """A mistake of the user's; its text is shown, without a traceback."""
+
+
+def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
+    """Return which of the known names might be meant, or where to find them.
+
+    Parameters
+    ----------
+    name : str
+        The unknown name.
+    known : iterable of str
+        Those that there are.
+    otherwise : str, optional
+        What to say where none is close; by default all known names.
+
+    Examples
+    --------
+    >>> hint("PivotedBra-v0", ["PivotedBar-v0", "InclineTilt-v0"])
+    'did you mean PivotedBar-v0?'
+    """
+    names = {k.lower(): k for k in known}
+    close = [names[c] for c in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)]
+    if close:
+        return f"did you mean {' or '.join(close)}?"
+    return otherwise or f"there are {', '.join(names.values())}"

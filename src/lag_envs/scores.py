@@ -22,7 +22,8 @@ class Known(NamedTuple):
         Which one that is.
     estimate : float
         What the optimum is at most, as value iteration estimates it: extrapolated to a grid without width,
-        not proved. Where a relaxed task was solved, the optimum is lower.
+        not proved. It too is corrected for luck: what ``agents/results/optimum`` tells is of 1,000 episodes.
+        Where a relaxed task was solved, the optimum is lower.
     """
 
     random: float

@@ -314,10 +314,10 @@ class Balance(SwingUp):
 
     ## Optimal Value
 
-    At least 452 (a linear-quadratic regulator gets it) and at most 498: that is finite-horizon value
-    iteration without ends of the track, which is far easier. The range is too wide to tell how good a policy
-    is in percent of the optimum. Over 4,096 episodes (mean ± standard error), the last column being the
-    feedback action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
+    At least 452 (a linear-quadratic regulator gets it) and about 498 at most: that estimate is of
+    finite-horizon value iteration without ends of the track, which is far easier. The range is too wide to
+    tell how good a policy is in percent of the optimum. Over 4,096 episodes (mean ± standard error), the last
+    column being the feedback action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
 
     | Id | Random actions | Zero control | Linear feedback |
     | -- | -------------- | ------------ | --------------- |
