@@ -342,5 +342,5 @@ def test_recipe_verifies_with_the_code_that_it_stands_in(repository, monkeypatch
     monkeypatch.setattr(sys, "argv", ["submissions", base, change])
     assert recipe.main() == 1
     ((command, name),) = seen
-    assert command[:-1] == [sys.executable, "-m", "lag_envs.cli", "verify", "--nonce", change]
+    assert command[:-1] == [sys.executable, "-P", "-m", "lag_envs.cli", "verify", "--nonce", change]
     assert name == "PPO"

@@ -90,6 +90,7 @@ def _positive(text: str) -> int:
 
 
 def _add(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.fields import plain
     from lag_envs.leaderboard.submission import Refused, load
 
     board = Board(args.board)
@@ -97,9 +98,9 @@ def _add(args: argparse.Namespace) -> int:
     for folder in args.folders:
         try:
             entry = board.add(load(folder))
-        except (Refused, BoardError) as error:
+        except (Refused, BoardError, OSError) as error:
             failed += 1
-            print(f"{folder}: refused: {error}", file=sys.stderr)
+            print(f"{plain(folder)}: refused: {error}", file=sys.stderr)
             continue
         ours.append(entry.id)
         if entry.state != "pending":

@@ -21,6 +21,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
+def plain(text: object) -> str:
+    """Return a text in ASCII, without anything that a terminal would act on."""
+    return ascii(str(text))[1:-1]
+
+
 class Fields:
     """A table; every key is taken once, by a method that checks it. `done` refuses those that were not.
 

@@ -11,6 +11,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from lag_envs.leaderboard.protocol import TINY
+
 
 @numba.njit(cache=True)
 def affine(x: Any, weight: Any, bias: Any) -> Any:
@@ -22,6 +24,8 @@ def affine(x: Any, weight: Any, bias: Any) -> Any:
             out[r, j] = bias[j]
         for i in range(weight.shape[0]):
             value = x[r, i]
+            if -TINY < value < TINY:
+                value = 0.0
             for j in range(wide):
                 out[r, j] += value * weight[i, j]
     return out

@@ -382,6 +382,10 @@ class _LookUp:
 # --- controllers --------------------------------------------------------------------------------------------
 
 
+#: Numbers of controllers that plan by which the planning gets longer.
+PLANS = ("opening", "periods")
+
+
 class Controller(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
@@ -397,7 +401,7 @@ class Controller(Architecture):
         self.task = protocol.make_task(env_id)
         numbers = table.table("numbers", {})
         self.numbers = {
-            name: numbers.number(name, -1e6, 1e6)
+            name: numbers.number(name, -1e6, 10.0 if name in PLANS else 1e6)
             for name, parameter in inspect.signature(self.maker).parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY
             and re.fullmatch(r"float( \| None)?", str(parameter.annotation))

@@ -43,6 +43,10 @@ TOML_BYTES, POLICY_BYTES, FOLDER_BYTES, LINE = 65_536, 4_194_304, 16_777_216, 1_
 HEADER_BYTES = 16_384
 #: Hidden layers, their width, and numbers of a network.
 LAYERS, WIDTH, NUMBERS = 8, 1_024, 131_072
+#: Numbers of all networks of a submission, and CPU time of a verification [s].
+ALL_NUMBERS, CPU_SECONDS = 1_048_576, 3_600.0
+#: Numbers nearer to 0 count as 0: arithmetic with subnormal ones takes fifty times as long.
+TINY = 1e-150
 #: Points of a learning curve.
 CURVE = 200
 

@@ -13,7 +13,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Fields, shown
-from lag_envs.leaderboard.policies import Architecture, Controller, Policy, architecture
+from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, architecture
 from lag_envs.leaderboard.protocol import Refused
 
 __all__ = ["KINDS", "Refused", "Submission", "load", "write"]
@@ -110,9 +110,7 @@ def load(folder: Path | str) -> Submission:
     training = _training(top, kind, found)
     top.done()
     _check_kind(kind, made, found)
-    if kind == "learned":
-        _check_different(files, found)
-    policies = []
+    policies: list[tuple[int, Policy]] = []
     for seed in found if made.arrays else [0]:
         name = f"policy_{seed}.safetensors"
         arrays = _arrays(name, files[name], made) if made.arrays else {}
@@ -122,6 +120,13 @@ def load(folder: Path | str) -> Submission:
         except Refused as error:
             raise Refused(f"{name}: {error}" if made.arrays else f"{TOML}: {error}") from error
         policies.append((seed, policy))
+    numbers = sum(array.size for _, policy in policies for array in policy.arrays.values())
+    if isinstance(made, MLP) and numbers > protocol.ALL_NUMBERS:
+        raise Refused(
+            f"the networks have {numbers:,} numbers together, {protocol.ALL_NUMBERS:,} are the most"
+        )
+    if kind == "learned":
+        _check_different(policies)
     return Submission(
         env, **about, kind=kind, policies=tuple(policies), digest=_digest(files), folder=folder,
         training=training,
@@ -240,11 +245,11 @@ def _check_kind(kind: str, made: Architecture, found: list[int]) -> None:
         raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
 
 
-def _check_different(files: Mapping[str, bytes], found: list[int]) -> None:
+def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
     """Refuse one learned policy under two seeds."""
     first: dict[bytes, int] = {}
-    for seed in found:
-        content = files[f"policy_{seed}.safetensors"]
+    for seed, policy in policies:
+        content = b"".join(policy.arrays[name].tobytes() for name in sorted(policy.arrays))
         if (other := first.setdefault(content, seed)) != seed:
             raise Refused(
                 f"the policies of seeds {other} and {seed} are the same; each needs its own training"
@@ -275,7 +280,8 @@ def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[
     for key, array in found.items():
         if not np.isfinite(array).all():
             raise Refused(f"{name}: {key} has entries that are not finite")
-        arrays[key] = np.ascontiguousarray(array, np.float64)
+        values = np.ascontiguousarray(array, np.float64)
+        arrays[key] = np.where(np.abs(values) < protocol.TINY, 0.0, values)
         arrays[key].flags.writeable = False
     return arrays
 

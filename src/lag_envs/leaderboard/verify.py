@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from lag_envs import __version__
 from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.fields import plain
 from lag_envs.leaderboard.submission import Refused, Submission, load
 
 Array = NDArray[np.float64]
@@ -67,7 +68,7 @@ def verify(
     """
     if not 1 <= episodes <= 100_000:
         raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
     conditions = protocol.disturbances(env)
     faster = protocol.often(env)
@@ -81,6 +82,8 @@ def verify(
     def tick(n: int) -> None:
         nonlocal done
         done += n
+        if time.process_time() - busy > protocol.CPU_SECONDS:
+            raise Refused(f"verifying it takes more than {protocol.CPU_SECONDS:g} s of CPU time")
         if progress is not None:
             progress(done, work)
 
@@ -297,7 +300,7 @@ def compare(result: dict[str, Any], other: dict[str, Any]) -> tuple[bool, float]
     Returns
     -------
     same : bool
-        Whether every action, reward and end was the same, to the bit.
+        Whether every action, reward and end was the same, to the bit, and all means under disturbances.
     difference : float
         The largest difference of a policy's mean return, relative to the way from random to best known; on
         two machines `protocol.TOLERANCE` at most.
@@ -316,6 +319,7 @@ def compare(result: dict[str, Any], other: dict[str, Any]) -> tuple[bool, float]
     known = KNOWN_RETURNS[result["env"]]
     difference = max(abs(np.mean(a["returns"]) - np.mean(b["returns"])) for a, b in pairs)
     same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
+    same &= all(result[name] == other[name] for name in ("robustness", "often"))
     return same, float(difference) / (known.best - known.random)
 
 
@@ -420,7 +424,9 @@ def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Pa
 def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
     from tqdm import tqdm
 
-    with tqdm(desc=folder.name, unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5) as bar:
+    with tqdm(
+        desc=plain(folder.name), unit=" steps", unit_scale=True, disable=None, leave=False, delay=0.5
+    ) as bar:
 
         def show(done: int, work: int) -> None:
             bar.total = work
@@ -435,10 +441,10 @@ def table(result: dict[str, Any]) -> list[str]:
     from lag_envs.scores import score
 
     if "refused" in result:
-        return [f"{result['folder']}: refused: {result['refused']}"]
+        return [f"{plain(result['folder'])}: refused: {result['refused']}"]
     env = result["env"]
     lines = [
-        f"{result['folder']}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
+        f"{plain(result['folder'])}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
         f"  {'seed':>6}  {'return':>12}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:
