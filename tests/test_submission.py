@@ -15,6 +15,7 @@ import pytest
 from safetensors.numpy import save
 
 from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.kernels import affine
 from lag_envs.leaderboard.policies import bin_centres
 from lag_envs.leaderboard.submission import Refused, load, write
 
@@ -921,3 +922,44 @@ def test_page_tells_the_limits():
     from lag_envs.leaderboard.policies import ACTIVATIONS, ARCHITECTURES
 
     assert all(f"`{name}`" in text for name in (*ACTIVATIONS, *ARCHITECTURES))
+
+
+# --- what costs time ---
+
+
+def test_subnormal_numbers_are_zero(tmp_path):
+    """Arithmetic with them takes fifty times as long."""
+    arrays = {seed: net(seed) for seed in range(5)}
+    for seed in arrays:
+        arrays[seed] = {name: array.astype(np.float64) for name, array in arrays[seed].items()}
+        arrays[seed]["weight_0"][0] = 1e-310
+    made = learned(tmp_path / "it", arrays=arrays)
+    assert (made.policies[0][1].arrays["weight_0"][0] == 0.0).all()
+    x = np.array([[1e-310, 1.0]])
+    assert affine(x, np.array([[1e300], [2.0]]), np.zeros(1)).item() == 2.0
+
+
+def test_copies_of_one_policy_are_refused(tmp_path, nets):
+    """However their files are padded."""
+    content = (nets / "policy_0.safetensors").read_bytes()
+    size = int.from_bytes(content[:8], "little")
+    for seed in range(5):
+        padding = b" " * (8 * seed)
+        header = (size + len(padding)).to_bytes(8, "little") + content[8 : 8 + size] + padding
+        (nets / f"policy_{seed}.safetensors").write_bytes(header + content[8 + size :])
+    with pytest.raises(Refused, match="the policies of seeds 0 and 1 are the same"):
+        load(nets)
+
+
+def test_networks_have_a_limit_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(protocol, "ALL_NUMBERS", 90)
+    with pytest.raises(Refused, match="have 95 numbers together, 90 are the most"):
+        learned(tmp_path / "it")
+
+
+def test_plans_have_a_limit(tmp_path):
+    with pytest.raises(Refused, match=r"opening.*10"):
+        write(
+            tmp_path / "it", kind="controller", **(ABOUT | {"env": "PivotedBar-v0"}),
+            policy={"architecture": "controller", "name": "iLQR", "numbers": {"opening": 1e6}},
+        )  # fmt: skip

@@ -301,3 +301,19 @@ def test_command_of_the_package(tmp_path, capsys):
     assert load(tmp_path / "a").digest
     assert main(["verify", str(tmp_path / "a"), "--episodes", "1"]) == 0
     assert "1 episodes each" in capsys.readouterr().out
+
+
+def test_verification_has_a_limit_of_time(submission, monkeypatch):
+    monkeypatch.setattr(protocol, "CPU_SECONDS", 0.0)
+    with pytest.raises(Refused, match="takes more than 0 s of CPU time"):
+        verify(submission, "n", 5)
+
+
+def test_names_of_folders_do_nothing_to_a_terminal(tmp_path, capsys):
+    folder = tmp_path / "evil\x1b[2J"
+    folder.mkdir()
+    arguments = argparse.ArgumentParser()
+    declare_verify(arguments)
+    assert run_verify(arguments.parse_args([str(folder)])) == 1
+    out = capsys.readouterr().out
+    assert "\x1b" not in out and "evil\\x1b[2J: refused: " in out
