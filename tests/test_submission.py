@@ -21,6 +21,7 @@ from lag_envs.leaderboard.submission import Refused, load, write
 
 ENV = "InclineTilt-v0"
 ABOUT = {"env": ENV, "name": "An agent", "authors": ["A. Nobody"], "license": "MIT"}
+SLOW = pytest.mark.slow
 TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
 NET = {"architecture": "mlp", "hidden": [3], "activation": "tanh", "squash": "clip"}
 LINEAR = {"gain": np.array([-1.0, -1.0, -3.0, 1.0]), "offset": np.zeros(1)}
@@ -725,12 +726,14 @@ def model(algo, seed=0, bins=0, normalise=False, **options):
         ("PPO", {"use_sde": True, "normalise": True}),
         ("PPO", {"use_sde": True, "policy_kwargs": {"squash_output": True, "net_arch": [8, 5]}}),
         ("PPO", {"bins": 5, "policy_kwargs": {"net_arch": []}}),
-        ("A2C", {}),
+        pytest.param("A2C", {}, marks=SLOW),
         ("SAC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}),
-        ("SAC", {"normalise": True, "policy_kwargs": {"net_arch": [16]}}),
+        pytest.param("SAC", {"normalise": True, "policy_kwargs": {"net_arch": [16]}}, marks=SLOW),
         ("TD3", {"policy_kwargs": {"net_arch": [16, 16]}}),
-        ("DDPG", {"policy_kwargs": {"net_arch": [16, 16]}}),
-        ("TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}),
+        pytest.param("DDPG", {"policy_kwargs": {"net_arch": [16, 16]}}, marks=SLOW),
+        pytest.param(
+            "TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}, marks=pytest.mark.slow
+        ),
         ("DQN", {"bins": 9, "normalise": True, "policy_kwargs": {"net_arch": [16, 16]}}),
     ],
 )

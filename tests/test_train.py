@@ -77,7 +77,11 @@ def config(tmp_path):
 # --- learners ---
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize(
+    "algo",
+    # TQC is SAC with another critic, and the slowest.
+    [pytest.param(a, marks=pytest.mark.slow) if a == "tqc" else a for a in ALGORITHMS],
+)
 def test_every_learner_goes_on_as_if_nothing_had_happened(algo, tmp_path):
     whole, cut = make_run(tmp_path / "whole", algo), make_run(tmp_path / "cut", algo)
     assert go(whole)
