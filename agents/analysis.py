@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap, trim_mean
+from scipy.stats import bootstrap
+
+from lag_envs.leaderboard import ranking
+from lag_envs.leaderboard.ranking import iqm
 
 Array = NDArray[np.float64]
 Data = dict[str, Any]
@@ -21,17 +24,6 @@ POINTS = 33
 
 
 # --- statistics ---------------------------------------------------------------------------------------------
-
-
-def iqm(values: ArrayLike, axis: int | None = None) -> Any:
-    """Return the interquartile mean: of the values without the lowest and the highest quarter.
-
-    Examples
-    --------
-    >>> float(iqm([1.0, 2.0, 4.0, 100.0]))
-    3.0
-    """
-    return trim_mean(values, 0.25, axis=axis)
 
 
 def interval(statistic: Callable[..., Any], *strata: ArrayLike) -> list[float] | None:
@@ -71,15 +63,8 @@ def iqm_of_all(*strata: ArrayLike, axis: int = -1) -> Any:
 
 
 def improvement(x: ArrayLike, y: ArrayLike, axis: int = -1) -> Any:
-    """Return the probability that an element of x is above one of y; equal ones count half.
-
-    Examples
-    --------
-    >>> float(improvement([1.0, 3.0], [0.0, 1.0]))
-    0.875
-    """
-    a, b = np.asarray(x)[..., :, None], np.asarray(y)[..., None, :]
-    return np.mean((a > b) + 0.5 * (a == b), axis=(-2, -1))
+    """Return `ranking.improvement`, as SciPy's bootstrap calls it: with the axis, which is the last."""
+    return ranking.improvement(x, y)
 
 
 def estimate(groups: Sequence[ArrayLike]) -> Data:

@@ -373,9 +373,9 @@ class Policy:
         action, state = self.model.predict(observation, state, episode_start, deterministic)
         bins = getattr(self.model.action_space, "n", None)
         if bins is not None:
-            from agents.sb3_vec_env import bin_centres
+            from lag_envs.leaderboard.policies import bin_centres
 
-            action = bin_centres(int(bins))[np.asarray(action)][..., None]
+            action = bin_centres(int(bins)).astype(np.float32)[np.asarray(action)][..., None]
         return action, state
 
 

@@ -70,7 +70,7 @@ It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): the same command goe
 
 examples:
   python -m agents.optimum InclineBrake-v0 --quick    one id on coarse grids, in seconds; writes to FOLDER
-  python -m agents.optimum                            all ids, in about 20 minutes on one core
+  python -m agents.optimum                            all ids, in about half an hour on one core
   python -m agents.optimum CylinderInCylinderPump-v0 --new    anew, forgetting what was computed"""
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 import lag_envs  # noqa: F401  (registers the environments)
+from lag_envs.leaderboard.policies import bin_centres
 
 
 def make_sb3_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> SB3VecEnv:
@@ -214,7 +215,7 @@ class DiscreteActions(VecEnvWrapper):
 
     def __init__(self, venv: VecEnv, bins: int) -> None:
         super().__init__(venv, action_space=gym.spaces.Discrete(bins))
-        self._centres = bin_centres(bins)
+        self._centres = bin_centres(bins).astype(np.float32)
 
     def reset(self) -> Any:
         """Begin an episode in every environment."""
@@ -227,8 +228,3 @@ class DiscreteActions(VecEnvWrapper):
     def step_wait(self) -> Any:
         """Step all environments."""
         return self.venv.step_wait()
-
-
-def bin_centres(bins: int) -> NDArray[np.float32]:
-    """Return the middles of equal parts of [-1, 1]."""
-    return ((2.0 * np.arange(bins) + 1.0) / bins - 1.0).astype(np.float32)

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -12,7 +13,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import bench, demo, report
+from agents import bench, demo, report, scale
 from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
@@ -212,3 +213,20 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
     assert "DummyVecEnv" in capsys.readouterr().out
     assert "| step | 2 | " in report.adapter() and "| PPO | 16 | " in report.adapter()
     assert bench.main(["--rounds", "0"]) == 2
+
+
+# --- the scale of scores ---
+
+
+def test_scale_measures_what_is_in_use(monkeypatch, capsys):
+    monkeypatch.setattr(scale, "BATCH", 500)
+    monkeypatch.setattr(scale, "FEW", 20)
+    assert scale.main(["InclineBrake-v0", "--batches", "2"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 2
+    for line in lines:
+        mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
+        assert abs(mean - used) < 5.0 * error
+    assert scale.main(["CylinderInCylinderPump-v0", "--quick"]) == 0
+    assert "optimal" not in capsys.readouterr().out
+    assert scale.main(["InclineBrak-v0"]) == 2 and scale.main(["--batches", "0"]) == 2

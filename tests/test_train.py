@@ -19,7 +19,7 @@ from agents import learners, run, train
 from agents.evaluate import evaluate, evaluate_batch
 from agents.learners import ALGORITHMS, HYPERPARAMS, hyperparameters, load_policy
 from agents.run import Run, UserError
-from agents.sb3_vec_env import bin_centres
+from lag_envs.leaderboard.policies import bin_centres
 from lag_envs.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]

@@ -11,6 +11,8 @@ from typing import NamedTuple
 class Known(NamedTuple):
     """Mean returns that are known of an environment with its default parameters.
 
+    In a clone, ``python -m agents.scale`` measures `random` and `best` anew.
+
     Parameters
     ----------
     random : float

@@ -11,8 +11,7 @@ Every agent takes one observation or a batch, and hands back what it has to reme
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 from lag_envs.controllers.basic import Constant, Random, do_nothing
@@ -21,6 +20,7 @@ from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.incline import SwitchingLine, TiltCascade
 from lag_envs.controllers.pd import PD
 from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, lqr, plan_swing_up
+from lag_envs.errors import hint
 from lag_envs.tasks import TASKS, load_task
 
 __all__ = [
@@ -108,7 +108,7 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
     check_id(env_id)
     makers = CONTROLLERS[env_id]
     if name not in makers:
-        raise ValueError(f"{env_id} has no controller {name!r}; {_hint(name, makers)}")
+        raise ValueError(f"{env_id} has no controller {name!r}; {hint(name, makers)}")
     place, fixed = TASKS[env_id]
     return makers[name](load_task(place)(**fixed | env_options))
 
@@ -116,11 +116,4 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
 def check_id(env_id: str) -> None:
     """Raise ValueError for an environment that there is not."""
     if env_id not in CONTROLLERS:
-        raise ValueError(f"there is no environment {env_id!r}; {_hint(env_id, CONTROLLERS)}")
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    """Return what might have been meant, or all there is."""
-    names = {k.lower(): k for k in known}
-    close = [names[c] for c in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)]
-    return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(names.values())}"
+        raise ValueError(f"there is no environment {env_id!r}; {hint(env_id, CONTROLLERS)}")
