@@ -176,10 +176,15 @@ class Trace:
         self._zeros.add(number.name)
         return number
 
-    def operations(self, outputs: Iterable[Any]) -> tuple[list[Operation], list[Value]]:
-        """Return what computes the outputs, in order and without detours, and what the outputs are then."""
+    def operations(
+        self, outputs: Iterable[Any], zeros: Iterable[str] = ()
+    ) -> tuple[list[Operation], list[Value]]:
+        """Return what computes the outputs, in order and without detours, and what the outputs are then.
+
+        Inputs named in `zeros` are known to be zero, as those that `zero` returns.
+        """
         results = [value.name if isinstance(value, Number) else value for value in outputs]
-        operations = _drop_zeros(self._fused(outputs), results, self._zeros)
+        operations = _drop_zeros(self._fused(outputs), results, self._zeros | set(zeros))
         needed = set(results)
         kept = []
         for operation in reversed(operations):
