@@ -357,7 +357,7 @@ def evaluate(
     -inf
     """
     table = _IEEE | dict(functions or {})
-    known: dict[Value, Any] = dict(values)
+    known = dict(values)
     for name, op, args in operations:
         known[name] = table[op](*(known[a] if isinstance(a, str) else a for a in args))
     return known
