@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError
+from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import Number, Operation, Trace
 
 #: A weight in a sum: a scalar's name, or a number.
@@ -89,7 +90,7 @@ class Lowering:
     def __init__(self, free: Sequence[str], prescribed: Mapping[str, Sequence[Expr]]) -> None:
         self._free = list(free)
         self._prescribed = dict(prescribed)
-        self._trace = Trace()
+        self._trace: Trace = ElementaryTrace()
         self._inputs: dict[str, Number] = {}
         self.constants: dict[str, Expr] = {}
         self._by_text: dict[str, str] = {}
@@ -141,8 +142,6 @@ class Lowering:
         inner = self.scalar(atom.argument)
         if atom.function == "sum":
             return inner
-        if atom.function not in ("sin", "cos", "exp", "log", "sqrt"):
-            raise FormulaError(f"{atom.text:.60}: a function of the held control alone must be sin, cos, exp, log or sqrt")
         return getattr(self._trace, atom.function)(inner)
 
     # --- series ----------------------------------------------------------------------------------------------
@@ -281,6 +280,7 @@ class Lowering:
         mass: Mapping[tuple[int, int], Expr],
         force: Sequence[Expr],
         absent: Callable[[Mapping[str, Expr]], Iterable[str]] = lambda constants: (),
+        fused: bool = True,
     ) -> SeriesRecord:
         """Return the record of ``Σ_j mass[i, j] a_j = force[i]``.
 
@@ -292,6 +292,8 @@ class Lowering:
             Right-hand side.
         absent : callable, optional
             Says which of the constants are zero; their terms are left out.
+        fused : bool, default True
+            Whether scalars may be computed with fused multiply-adds.
         """
         right = [self.series(e) if e.terms else -1 for e in force]
         entries: dict[tuple[int, int], tuple[int, Any]] = {}
@@ -299,12 +301,12 @@ class Lowering:
             varying = any(_varies(a) for a in e.atoms())
             entries[place] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
         zero = frozenset(absent(self.constants))
-        return self._finished(right, entries, zero)
+        return self._finished(right, entries, zero, fused)
 
-    def _finished(self, right: list[int], entries: dict, zero: frozenset[str]) -> SeriesRecord:
+    def _finished(self, right: list[int], entries: dict, zero: frozenset[str], fused: bool) -> SeriesRecord:
         """Leave out what is zero, and what nobody needs."""
         weights = [w for _, _, ws, _ in self.nodes for w in ws] + [w for _, w in entries.values()]
-        operations, results = _without(self._trace, weights, zero)
+        operations, results = self._trace.operations(weights, zero, fused=fused)
         value = iter(results)
         now: dict[int, int] = {-1: -1}  # -1: the series vanishes
         nodes: list[Node] = []
@@ -376,11 +378,6 @@ def _needed(size: int, inputs: Any, constants: Any, operations: Any, nodes: Any,
         {place: (renumber[n], w) for place, (n, w) in mass.items()},
         tuple(renumber[n] for n in force),
     )
-
-
-def _without(trace: Trace, outputs: Sequence[Any], zero: frozenset[str]) -> tuple[list[Operation], list]:
-    """Return operations and results of recorded scalars where some inputs are zero."""
-    return trace.operations(outputs, zero)
 
 
 def _key(weight: Any) -> Any:

@@ -29,9 +29,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple, Protocol
 
+from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import Node, SeriesRecord
+from lag_envs.stepping.tracing import Operation, evaluate
 
 #: The highest order that a series may have.
 LARGEST_ORDER = 24
@@ -43,6 +46,18 @@ TOLERANCE = 1e-14
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
 TRIES = 10
+
+
+ELEMENTARY = ("sin", "cos", "exp", "log", "atan", "tanh")
+
+
+@cache
+def elementary(name: str, fused: bool) -> tuple[tuple[Operation, ...], str]:
+    """Return the operations of an elementary function of ``x``, and the name of their result."""
+    trace = ElementaryTrace()
+    operations, (result,) = trace.operations([getattr(trace, name)(*trace.inputs("x"))], fused=fused)
+    assert isinstance(result, str)
+    return tuple(operations), result
 
 
 class Target(Protocol):
@@ -95,6 +110,7 @@ class Series:
         self.record = record
         self.size = record.size
         self._slots: dict[tuple[str, int], int] = {}
+        self._planned = False
         for i in range(self.size):
             self._slot("v", i)
             self._slot("q", i)
@@ -106,17 +122,21 @@ class Series:
             if node >= 0:
                 for row, column in {place, place[::-1]}:
                     self._pair(("mass", row, column), self._x(node), self._slot("a", column))
+        self._planned = True
 
     # --- which series are kept -----------------------------------------------------------------------------
 
     def _slot(self, kind: str, i: int) -> int:
-        return self._slots.setdefault((kind, i), len(self._slots))
+        if (kind, i) not in self._slots:
+            assert not self._planned, f"nobody planned for {kind}{i}"
+            self._slots[kind, i] = len(self._slots)
+        return self._slots[kind, i]
 
     def _x(self, n: int) -> int:
         """Return the slot of a node's coefficients."""
         node = self.record.nodes[n]
         if node.op in ("place", "velocity"):
-            return self._slot(node.op[0].replace("p", "q"), node.index)
+            return self._slot({"place": "q", "velocity": "v"}[node.op], node.index)
         return self._slot("x", n)
 
     def _d(self, n: int) -> int:
@@ -474,7 +494,7 @@ class Certificate:
     * exp z: s <= (H(D, z) + Σ|D| s)/N, then E_z = s + (|z| + s)(exp E - 1).
     * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
       p = |z_0| - Σ'|z| bounds 1/|ẑ⁻¹| from below; it needs p² > R.
-    * log z of x: x̂ D_z = D_x̂ leaves H(x, z)/p for the truncated x̂ (orders j < N in D_j/N), p = |x_0| - Σ'|x|;
+    * log z of x: x̂ D_z = D_x̂ leaves H(D_z, x)/(N p) for the truncated x̂, with p = |x_0| - Σ'|x|; then
       log(1 + e/x̂) adds E_x/(p - E_x).
     * atan z with slope g = 1/(1 + x²): (H(D, g) + Σ|D| E_g)/N + E_x (|g| + E_g), the integral of the slope
       along the rest of the argument; E_g holds for every part of that rest, since it grows with E_x.
@@ -582,12 +602,8 @@ class Certificate:
         t, series, record = self._t, self._series, self._series.record
         slots, n = series._slots, series.size
         self._n = self._norms(range(series.slots), self._order)
-        pairs = dict(series._pairs)
-        for i, node in enumerate(record.nodes):
-            if node.op == "log":
-                pairs[i,] = (series._x(node.args[0]), series._x(i))
-        overlaps = self._overlaps(list(dict.fromkeys(pairs.values())))
-        self._h = {key: overlaps[pair] for key, pair in pairs.items()}
+        overlaps = self._overlaps(list(dict.fromkeys(series._pairs.values())))
+        self._h = {key: overlaps[pair] for key, pair in series._pairs.items()}
         sizes = self._sizes([self._n[slots["v", i], 0] for i in range(n)])
         rest = [t.mul(self._tolerance, size) for size in sizes]
         self._fine = self._expansion.inverse.definite
@@ -695,7 +711,7 @@ class Certificate:
             p = t.sub(t.abs(t.load(slot, t.index(0))), self._n[slot, 1])
             room = t.sub(p, tail)
             self._require(t.less(t.number(0.0), room))
-            return t.add(t.div(self._h[i,], p), t.div(tail, room))
+            return t.add(t.div(self._h[i,], t.mul(p, self._steps)), t.div(tail, room))
         self._require(t.less(tail, one))
         slope_sum = self._n[series._d(x), 1]
         b = t.div(slope_sum, self._steps)
@@ -759,9 +775,12 @@ class Plain:
     On floats its results are those of the unfused print, bit for bit.
     """
 
-    def __init__(self, slots: int, xp: Any = math, number: Callable = float) -> None:
+    def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
         self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
-        self._xp, self.number = xp, number
+        self.number = number
+        self._functions: Any = None
+        if xp is not None:
+            self._functions = {name: getattr(xp, name) for name in (*ELEMENTARY, "sqrt")}
 
     def add(self, a: Any, b: Any) -> Any:
         return a + b
@@ -788,7 +807,9 @@ class Plain:
         return abs(a)
 
     def sqrt(self, a: Any) -> Any:
-        return self._xp.sqrt(a) if a >= 0 else self.number(math.nan)
+        if self._functions is not None:
+            return self._functions["sqrt"](a)
+        return math.sqrt(a) if a >= 0 else math.nan
 
     def less(self, a: Any, b: Any) -> bool:
         return bool(a < b)
@@ -839,20 +860,10 @@ class Plain:
             body()
 
     def elementary(self, name: str, x: Any) -> Any:
-        return getattr(self._xp, name)(x)
+        if self._functions is not None:
+            return self._functions[name](x)
+        operations, result = elementary(name, fused=False)
+        return evaluate(operations, {"x": x})[result]
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
-        known: dict[Any, Any] = dict(inputs)
-        for name, op, args in record.scalars:
-            a = [known[x] if isinstance(x, str) else self.number(x) for x in args]
-            known[name] = {
-                "+": lambda x, y: x + y,
-                "-": lambda x, y: x - y,
-                "*": lambda x, y: x * y,
-                "/": lambda x, y: x / y,
-                "neg": lambda x: -x,
-                "a*b+c": lambda x, y, z: x * y + z,
-                "a*b-c": lambda x, y, z: x * y - z,
-                "c-a*b": lambda x, y, z: z - x * y,
-            }.get(op, lambda *xs, op=op: getattr(self._xp, op)(*xs))(*a)
-        return known
+        return evaluate(record.scalars, inputs, self._functions)
