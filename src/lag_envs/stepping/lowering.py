@@ -12,11 +12,13 @@ made first, and what two equations share is computed once.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError
+from lag_envs.mechanics.algebra import Atom, Expr
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import Number, Operation, Trace
 
@@ -44,9 +46,9 @@ class Node:
     index: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class SeriesRecord:
-    """What a step computes.
+    """What a step computes. Records with the same `digest` have the same code.
 
     Attributes
     ----------
@@ -73,6 +75,18 @@ class SeriesRecord:
     nodes: tuple[Node, ...]
     mass: Mapping[tuple[int, int], tuple[int, Weight]]
     force: tuple[int, ...]
+
+    @cached_property
+    def digest(self) -> str:
+        """All that decides the code, in short: not what the constants are made of."""
+        parts = (self.size, self.inputs, self.scalars, self.nodes, sorted(self.mass.items()), self.force)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SeriesRecord) and other.digest == self.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
 
 class Lowering:

@@ -150,7 +150,7 @@ def emit(
     for name, op, args in operations:
         known = [values[a] if isinstance(a, str) else _constant(a) for a in args]
         lanes = max((v.type.count for v in known if isinstance(v.type, ir.VectorType)), default=0)
-        values[name] = _emit(builder, op, [_splat(builder, v, lanes) for v in known] if lanes else known)
+        values[name] = _emit(builder, op, [splat(builder, v, lanes) for v in known] if lanes else known)
     return values
 
 
@@ -158,7 +158,7 @@ def _constant(value: Any) -> ir.Constant:
     return ir.Constant(ir.IntType(1), int(value)) if isinstance(value, bool) else ir.Constant(_DOUBLE, value)
 
 
-def _splat(b: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
+def splat(b: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
     """Return the vector whose lanes all are this number; a vector as it is."""
     if isinstance(value.type, ir.VectorType):
         return value
@@ -177,7 +177,7 @@ def _like(kind: ir.Type, value: Any, element: ir.Type = _DOUBLE) -> ir.Constant:
     return ir.Constant(element, value)
 
 
-def _call(b: ir.IRBuilder, function: str, *args: ir.Value) -> ir.Value:
+def call(b: ir.IRBuilder, function: str, *args: ir.Value) -> ir.Value:
     """Write a call of one of LLVM's own functions, on numbers or on vectors."""
     kind = args[0].type
     suffix = f"v{kind.count}f64" if isinstance(kind, ir.VectorType) else "f64"
@@ -193,25 +193,25 @@ def _emit(b: ir.IRBuilder, op: str, args: list[ir.Value]) -> ir.Value:
         "*": b.fmul,
         "/": b.fdiv,
         "neg": b.fneg,
-        "a*b+c": lambda x, y, z: _call(b, "fma", x, y, z),
-        "a*b-c": lambda x, y, z: _call(b, "fma", x, y, b.fneg(z)),
-        "c-a*b": lambda x, y, z: _call(b, "fma", b.fneg(x), y, z),
+        "a*b+c": lambda x, y, z: call(b, "fma", x, y, z),
+        "a*b-c": lambda x, y, z: call(b, "fma", x, y, b.fneg(z)),
+        "c-a*b": lambda x, y, z: call(b, "fma", b.fneg(x), y, z),
         "<": lambda x, y: b.fcmp_ordered("<", x, y),
         "<=": lambda x, y: b.fcmp_ordered("<=", x, y),
         "where": b.select,
         "&": b.and_,
         "|": b.or_,
         "~": b.not_,
-        "sqrt": lambda x: _call(b, "sqrt", x),
-        "sin": lambda x: _call(b, "sin", x),
-        "cos": lambda x: _call(b, "cos", x),
-        "log": lambda x: _call(b, "log", x),
+        "sqrt": lambda x: call(b, "sqrt", x),
+        "sin": lambda x: call(b, "sin", x),
+        "cos": lambda x: call(b, "cos", x),
+        "log": lambda x: call(b, "log", x),
         "exp": lambda x: _exp(b, x),
-        "abs": lambda x: _call(b, "fabs", x),
-        "floor": lambda x: _call(b, "floor", x),
+        "abs": lambda x: call(b, "fabs", x),
+        "floor": lambda x: call(b, "floor", x),
         "pow2": lambda n: _pow2(b, n),
         "exponent": lambda x: _exponent(b, x),
-        "copysign": lambda x, sign: _call(b, "copysign", x, sign),
+        "copysign": lambda x, sign: call(b, "copysign", x, sign),
     }[op](*args)
 
 
@@ -222,12 +222,12 @@ def _exp(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
         return _like(x.type, value)
 
     def fma(x: ir.Value, y: ir.Value, z: ir.Value) -> ir.Value:
-        return _call(b, "fma", x, y, z)
+        return call(b, "fma", x, y, z)
 
     for limit, beyond in ((-700.0, "<"), (700.0, ">")):
         x = b.select(b.fcmp_ordered(beyond, x, number(limit)), number(limit), x)
     # x = n log 2 + r with |r| <= log(2)/2; log 2 in two parts.
-    n = _call(b, "floor", fma(x, number(1.4426950408889634), number(0.5)))
+    n = call(b, "floor", fma(x, number(1.4426950408889634), number(0.5)))
     r = fma(b.fneg(n), number(0.6931471803691238), x)
     r = fma(b.fneg(n), number(1.9082149292705877e-10), r)
     p = number(1.0 / math.factorial(13))

@@ -211,6 +211,7 @@ class Series:
 
         def at_order(k: Any, carried: Sequence) -> list:
             inner = self._inner(t, k)
+            inner["per order"] = t.div(t.number(1.0), t.real(k))
             values: list = []
             for n, node in enumerate(record.nodes):
                 value = self._next(t, n, node, values, zero, scalars, inner, k)
@@ -304,7 +305,7 @@ class Series:
                 total = t.mul(weight, x) if total is None else t.fma(weight, x, total)
         return t.number(0.0) if total is None else total
 
-    def _inner(self, t: Target, k: Any, group: int = 8) -> dict[tuple, Any]:
+    def _inner(self, t: Target, k: Any, group: int = 8) -> dict[Any, Any]:
         """Return Σ_{0<j<k} A_j B_{k-j} for all pairs, several in one loop."""
         distinct = list(dict.fromkeys(self._pairs.values()))
         sums: dict[tuple[int, int], Any] = {}
@@ -349,13 +350,13 @@ class Series:
             return t.neg(t.mul(t.fma(values[x], zero[n], total), zero[n]))
         if op == "sqrt":
             return t.div(t.sub(values[x], total), t.add(zero[n], zero[n]))
-        order = t.real(k)
+        per = inner["per order"]
         if op == "log":
-            weighted = t.div(t.sub(t.mul(order, values[x]), total), zero[x])
+            weighted = t.div(t.sub(t.mul(t.real(k), values[x]), total), zero[x])
             t.store(self._slots["d", n], k, weighted)
-            return t.div(weighted, order)
+            return t.mul(weighted, per)
         partner = zero[n] if op == "exp" else zero[args[1]]
-        value = t.div(t.fma(t.mul(order, values[x]), partner, total), order)
+        value = t.fma(values[x], partner, t.mul(total, per))
         return t.neg(value) if op == "cos" else value
 
     def advance(self, t: Target, order: Any) -> tuple[list, list]:
