@@ -1,0 +1,479 @@
+"""The contract of a scene: it states its energies, and everything else follows from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import math
+import numbers
+import sys
+import weakref
+from abc import ABCMeta
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeVar, dataclass_transform
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.mechanics import motion, recording
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, evaluate
+from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
+from lag_envs.mechanics.motion import Mechanics
+from lag_envs.mechanics.recording import TWIN, Values
+
+if TYPE_CHECKING:
+    import sympy
+
+Array = NDArray[np.float64]
+C = TypeVar("C", bound=type)
+
+#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not
+#: vanish or overflow.
+SMALLEST = 1e-60
+
+#: Class attributes that are mappings, and those that are names in order.
+MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
+SEQUENCES = ("state", "left_out")
+
+#: What a scene may define; all other public names of `Scene` are its calls.
+DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
+
+
+def parameter(
+    default: float | None | Callable[[Any], float | None],
+    unit: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    optional: bool = False,
+    infinite: bool = False,
+) -> Any:
+    """Declare a physical parameter.
+
+    Parameters
+    ----------
+    default : float, None, or function of the scene
+        Its value unless another is given. A function takes it from the other parameters:
+        ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
+    unit : str
+        Its unit, for tables and errors.
+    above, least, below : float, optional
+        The range that it must lie in: above, at least, below.
+    optional : bool
+        Whether None may be given; a default of None says so too.
+    infinite : bool
+        Whether infinity may be given.
+    """
+    made = callable(default)
+    return dataclasses.field(
+        default=None if made else default,
+        metadata={
+            "unit": unit,
+            "above": above,
+            "least": least,
+            "below": below,
+            "made": default if made else None,
+            "optional": optional or (default is None),
+            "infinite": infinite,
+        },
+    )
+
+
+def check_number(name: str, value: Any, unit: str = "", *, infinite: bool = False) -> float:
+    """Return the value as a finite float, or raise a ValueError that names it."""
+    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
+        raise ValueError(f"{name} must be a real number, got {value!r}")
+    try:
+        number = float(value)
+    except OverflowError:  # an integer may be too large
+        number = math.inf
+        infinite = False
+    if not math.isfinite(number) and not (infinite and number == math.inf):
+        raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
+    return number
+
+
+def real_array(name: str, values: ArrayLike) -> Array:
+    """Return values as a new float64 array, or raise a ValueError that names them."""
+    try:
+        array = np.array(values)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"{name} must be real numbers, got {values!r}") from error
+    if array.dtype.kind not in "fiu" and array.size:
+        raise ValueError(f"{name} must be real numbers, got {values!r}")
+    return array.astype(np.float64)
+
+
+class Numeric:
+    """The namespace ``xp`` of a formula that is evaluated: the functions of a recorded one, on arrays."""
+
+    pi = math.pi
+    sin, cos, tan, exp, log, sqrt, tanh = np.sin, np.cos, np.tan, np.exp, np.log, np.sqrt, np.tanh
+    atan = arctan = np.arctan
+
+
+#: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
+_admitted: weakref.WeakKeyDictionary[type, set] = weakref.WeakKeyDictionary()
+
+
+class SceneType(ABCMeta):
+    """The type of scenes: a class is made a frozen dataclass, unless it is one, when it is used first."""
+
+    def __call__(cls, *args: Any, **keywords: Any) -> Any:
+        """Return a scene whose parameters and formulas have been checked."""
+        _complete(cls)
+        scene = super().__call__(*args, **keywords)
+        scene._admit()
+        return scene
+
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        """The signature of a call, for help."""
+        _complete(cls)
+        signature = inspect.signature(cls.__init__)
+        return signature.replace(parameters=list(signature.parameters.values())[1:])
+
+
+def _complete(cls: type) -> None:
+    """Make the class a frozen dataclass, unless a decorator has."""
+    if cls is Scene:
+        raise FormulaError("Scene is the base of scenes; derive a class with coordinates, kinetic and potential")
+    if "__dataclass_fields__" not in vars(cls):
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(parameter,))
+class Scene(metaclass=SceneType):
+    """A mechanical scene: parameters and energies, from which all else is derived. Immutable.
+
+    A subclass declares its parameters with `parameter`, its coordinates and controls with their units, and
+    writes its energies::
+
+        class Pendulum(Scene):
+            mass: float = parameter(1.0, "kg", above=0.0)
+            length: float = parameter(1.0, "m", above=0.0)
+
+            coordinates = {"theta": "rad"}
+            controls = {"torque": "N m"}
+
+            def kinetic(self, q, v, xp):
+                return 0.5 * self.mass * (self.length * v.theta) ** 2
+
+            def potential(self, q, xp):
+                return -9.81 * self.mass * self.length * xp.cos(q.theta)
+
+            def applied(self, q, v, u, xp):
+                return {"theta": u.torque}
+
+    Formulas use ``+ - * /``, whole powers and functions of ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log.
+    They are run on recorded numbers, so they cannot branch on them. Fields that are no `parameter`, such as a
+    number of bars, are structural: they may branch and count, and another value compiles anew.
+
+    Attributes
+    ----------
+    coordinates : mapping from str to str
+        Free coordinates and their units, in order.
+    prescribed : mapping from str to str
+        Coordinates that are moved from outside.
+    controls : mapping from str to str
+        Controls and their units. ``s_ddot``, ``s_dot`` or ``s`` sets the acceleration, the rate or the place of a
+        prescribed coordinate ``s``; any other acts in `applied` or `dissipation`.
+    modes : mapping from str to mapping
+        In place of `controls`: several sets of them, chosen by the keyword ``control``.
+    reactions : mapping from str to str
+        Names of forces and the prescribed coordinate that each moves or holds.
+    ratios : mapping from str to pair of str
+        Names of ratios |F|/N and the reactions F and N.
+    state : tuple of str
+        Another order of the state.
+    left_out : tuple of str
+        What the state leaves out.
+    """
+
+    coordinates: ClassVar[Any] = MappingProxyType({})
+    prescribed: ClassVar[Any] = MappingProxyType({})
+    controls: ClassVar[Any] = MappingProxyType({})
+    modes: ClassVar[Any] = MappingProxyType({})
+    reactions: ClassVar[Any] = MappingProxyType({})
+    ratios: ClassVar[Any] = MappingProxyType({})
+    state: ClassVar[Any] = ()
+    left_out: ClassVar[Any] = ()
+
+    # --- what a scene defines ------------------------------------------------------------------------------
+
+    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
+        """Return the kinetic energy T [J]."""
+        raise FormulaError("it is not defined; write kinetic(self, q, v, xp)")
+
+    def potential(self, q: Any, xp: Any) -> Any:
+        """Return the potential energy V [J]."""
+        raise FormulaError("it is not defined; write potential(self, q, xp)")
+
+    def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        """Return Rayleigh's function D [W]: drag is -∂D/∂v."""
+        return 0.0
+
+    def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        """Return generalised forces by coordinate [N or N m]."""
+        return {}
+
+    def rests(self) -> Any:
+        """Return where prescribed coordinates rest that no control moves; by default at 0."""
+        return {}
+
+    def poses(self, q: Any, xp: Any) -> Any:
+        """Return place and angle of each body, (x, y, angle) [m, m, rad]."""
+        return {}
+
+    def bodies(self) -> Any:
+        """Return shapes of each body in its own frame."""
+        return {}
+
+    def check(self) -> None:
+        """Raise ValueError where parameters, each in its range, do not fit together."""
+
+    # --- how a class is made -------------------------------------------------------------------------------
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for parent in cls.__mro__[1:]:
+            if isinstance(parent, SceneType) and parent is not Scene and "__dataclass_fields__" not in vars(parent):
+                _complete(parent)
+        own, annotations = vars(cls), dict(inspect.get_annotations(cls))
+        faults = []
+        for name in (*MAPPINGS, *SEQUENCES):
+            if name in annotations and not str(annotations[name]).replace("typing.", "").startswith("ClassVar"):
+                # A dataclass would take it for a field; what is wrong is said when the class is used.
+                faults.append(f"{name} has an annotation; write {name} = ... without one")
+                del annotations[name]
+        if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
+            annotations["control"] = "str"
+            if "control" not in own:
+                cls.control = next(iter(own["modes"]))  # type: ignore[attr-defined]
+        if annotations != inspect.get_annotations(cls):
+            cls.__annotations__ = annotations
+        for name in MAPPINGS:
+            if isinstance(own.get(name), Mapping):
+                setattr(cls, name, MappingProxyType(dict(own[name])))
+        for name in SEQUENCES:
+            if isinstance(own.get(name), list):
+                setattr(cls, name, tuple(own[name]))
+        cls._faults = tuple(faults)
+
+    _faults: ClassVar[tuple[str, ...]] = ()
+
+    def _admit(self) -> None:
+        """Check parameters and, for the first scene of its kind, names and formulas."""
+        _check_class(type(self))
+        if self.modes and self.control not in tuple(self.modes):  # type: ignore[attr-defined]
+            raise ValueError(
+                f"control must be one of {', '.join(self.modes)}, got {self.control!r}"  # type: ignore[attr-defined]
+            )
+        fields = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}  # type: ignore[arg-type]
+        made = [f for f in fields.values() if f.metadata["made"] and getattr(self, f.name) is None]
+        for field in (*(f for f in fields.values() if f not in made), *made):
+            value = getattr(self, field.name)
+            if field in made:
+                value = field.metadata["made"](self)
+            if value is not None or not (field.metadata["optional"] or field in made):
+                value = _check_range(field, value)
+            object.__setattr__(self, field.name, value)
+        self.check()
+        try:
+            key = self._structure
+            known = key in _admitted.setdefault(type(self), set())
+        except TypeError as error:
+            raise FormulaError(f"{type(self).__name__}: {error}; structural fields must be hashable") from error
+        if not known:
+            _check_names(self)
+            _check_motion(self, self.mechanics)
+            _admitted[type(self)].add(key)
+
+    def _numbers(self) -> tuple[str, ...]:
+        """Return the names of the parameters that have a value."""
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        return tuple(f.name for f in fields if "unit" in f.metadata and getattr(self, f.name) is not None)
+
+    @property
+    def _structure(self) -> tuple:
+        """All that decides which code steps the scene: scenes of a class that agree in it differ in numbers only."""
+        cls, numbers = type(self), self._numbers()
+        formulas = tuple(getattr(cls, name) for name in ("rests", *recording.ARGUMENTS))
+        fields = dataclasses.fields(self)  # type: ignore[arg-type]
+        plain = tuple((f.name, getattr(self, f.name)) for f in fields if "unit" not in f.metadata)
+        zero = tuple(name for name in numbers if getattr(self, name) == 0.0)
+        return formulas, plain, numbers, zero
+
+    def __setattr__(self, name: str, value: Any) -> NoReturn:
+        raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+
+    def __delattr__(self, name: str) -> NoReturn:
+        raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
+    # --- what follows: names -------------------------------------------------------------------------------
+
+    @property
+    def _layout(self) -> Layout:
+        """Names of coordinates, controls and state."""
+        found = vars(self).get("_cached_layout")
+        if found is None:
+            of = type(self).__name__
+            chosen, absent = _controls(self)
+            found = make_layout(
+                of,
+                coordinates=self.coordinates,
+                prescribed=self.prescribed,
+                controls=chosen,
+                absent=absent,
+                state=self.state,
+                left_out=self.left_out,
+                reactions=self.reactions,
+                ratios=self.ratios,
+            )
+            vars(self)["_cached_layout"] = found
+        return found
+
+    @property
+    def mechanics(self) -> Mechanics:
+        """The derived equations, as expressions."""
+        if TWIN in vars(self):
+            raise FormulaError("a formula calls what is derived from it; it may use parameters and other formulas")
+        found = vars(self).get("_cached_mechanics")
+        if found is None:
+            found = motion.derive_motion(self, self._layout, recording.record(self, self._layout))
+            vars(self)["_cached_mechanics"] = found
+        return found
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state's entries, in order."""
+        return tuple(entry.name for entry in self._layout.state)
+
+    @property
+    def state_units(self) -> tuple[str, ...]:
+        """Their units."""
+        return tuple(entry.unit for entry in self._layout.state)
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Names of the controls, in order."""
+        return self._layout.controls
+
+    @property
+    def control_units(self) -> tuple[str, ...]:
+        """Their units."""
+        return self._layout.control_units
+
+
+def _controls(scene: Scene) -> tuple[Any, tuple[str, ...]]:
+    """Return the mode's controls, and the names of those that only other modes have."""
+    of = type(scene).__name__
+    if not isinstance(scene.modes, Mapping):
+        raise FormulaError(f"{of}.modes must map names to controls, got {scene.modes!r:.80}")
+    if not scene.modes:
+        return scene.controls, ()
+    if scene.controls:
+        raise FormulaError(f"{of} has controls and modes; put the controls into the modes")
+    every: dict[str, str] = {}
+    for mode, controls in scene.modes.items():
+        every |= units(f"{of}.modes[{mode!r}]", controls)
+    return scene.modes[scene.control], tuple(every)  # type: ignore[attr-defined]
+
+
+def _check_class(cls: type[Scene]) -> None:
+    """Raise a FormulaError for what can be seen of a class without running its formulas."""
+    of = cls.__name__
+    faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
+    if faults:
+        raise FormulaError(f"{of}.{faults[0]}")
+    if not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise FormulaError(f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)")
+
+
+def _check_names(scene: Scene) -> None:
+    """Raise a FormulaError where a name is taken."""
+    cls, of = type(scene), type(scene).__name__
+    public = {name for name in dir(Scene) if not name.startswith("_")}
+    for c in cls.__mro__[: cls.__mro__.index(Scene)]:
+        if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
+            raise FormulaError(
+                f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
+                "dissipation and applied, from which these follow"
+            )
+        for name in (*inspect.get_annotations(c), *vars(c)):
+            if name in public and name not in DEFINED:
+                raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
+    layout = scene._layout
+    derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
+    taken = {
+        **dict.fromkeys(DEFINED, "part of every scene"),
+        **dict.fromkeys(derived, "a coordinate or its derivative"),
+        **dict.fromkeys((e.name for e in layout.state), "an entry of the state"),
+        **dict.fromkeys((*layout.controls, *layout.absent), "a control"),
+    }
+    for field in dataclasses.fields(scene):  # type: ignore[arg-type]
+        check_name(of, field.name)
+        if field.name in taken:
+            raise FormulaError(f"{of}: the field {field.name!r} has the name of {taken[field.name]}; choose another")
+    others = set(layout.controls) - {p.control for p in layout.prescribed}
+    for name in sorted(others & {e.name for e in layout.state}):
+        raise FormulaError(f"{of}: the control {name!r} has the name of an entry of the state; choose another")
+
+
+def _check_motion(scene: Scene, found: Mechanics) -> None:
+    """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
+    n = len(found.free)
+    values = {recording.parameter(name): np.float64(getattr(scene, name)) for name in scene._numbers()}
+    generator = np.random.default_rng(11)
+    symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
+    seen = []
+    with np.errstate(all="ignore"):
+        for _ in range(16):
+            at = values | {symbol: generator.uniform(0.1, 1.5) for symbol in symbols}
+            matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
+            if not np.isfinite(matrix).all():
+                continue
+            size = np.sqrt(np.abs(np.diag(matrix)))
+            if not (size > 0.0).all():
+                seen.append(0.0)
+                continue
+            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]))
+    if seen and max(seen) < 1e-13:
+        what = "singular" if max(seen) > -1e-13 else "not positive"
+        raise FormulaError(
+            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; every "
+            "motion of the free coordinates needs a positive kinetic energy"
+        )
+
+
+def _check_range(field: dataclasses.Field, value: Any) -> float:
+    unit = field.metadata["unit"]
+    number = check_number(field.name, value, unit, infinite=field.metadata["infinite"])
+    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
+    for rule, limit, broken in (
+        ("above", above, above is not None and not number > above),
+        ("at least", least, least is not None and not number >= least),
+        ("below", below, below is not None and not number < below),
+        ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
+        ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
+    ):
+        if broken:
+            raise ValueError(
+                f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
+            )
+    return number
+
+
+def check_step(dt: Any) -> float:
+    """Return the step as float, or raise a ValueError."""
+    dt = check_number("dt", dt, "s")
+    if not dt >= sys.float_info.min:  # what lies between has no inverse
+        raise ValueError(f"dt must be above 0 s, got {dt:g} s")
+    return dt
