@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -289,14 +289,8 @@ class Lowering:
 
     # --- the whole -------------------------------------------------------------------------------------------
 
-    def record(
-        self,
-        mass: Mapping[tuple[int, int], Expr],
-        force: Sequence[Expr],
-        absent: Callable[[Mapping[str, Expr]], Iterable[str]] = lambda constants: (),
-        fused: bool = True,
-    ) -> SeriesRecord:
-        """Return the record of ``Σ_j mass[i, j] a_j = force[i]``.
+    def parts(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr]) -> tuple[list[int], dict]:
+        """Return nodes of the right-hand sides and entries of the mass matrix, see `without`.
 
         Parameters
         ----------
@@ -304,21 +298,25 @@ class Lowering:
             Mass matrix.
         force : sequence of Expr
             Right-hand side.
-        absent : callable, optional
-            Says which of the constants are zero; their terms are left out.
-        fused : bool, default True
-            Whether scalars may be computed with fused multiply-adds.
         """
         right = [self.series(e) if e.terms else -1 for e in force]
         entries: dict[tuple[int, int], tuple[int, Any]] = {}
-        for place, e in sorted(mass.items()):
+        for where, e in sorted(mass.items()):
             varying = any(_varies(a) for a in e.atoms())
-            entries[place] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
-        zero = frozenset(absent(self.constants))
-        return self._finished(right, entries, zero, fused)
+            entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
+        return right, entries
 
-    def _finished(self, right: list[int], entries: dict, zero: frozenset[str], fused: bool) -> SeriesRecord:
-        """Leave out what is zero, and what nobody needs."""
+    def record(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True) -> SeriesRecord:
+        """Return the record of ``Σ_j mass[i, j] a_j = force[i]``; see `parts` and `without`."""
+        return self.without(*self.parts(mass, force), fused=fused)
+
+    def without(
+        self, right: list[int], entries: dict, zero: frozenset[str] = frozenset(), fused: bool = True
+    ) -> SeriesRecord:
+        """Leave out the terms of constants that are zero, and what nobody needs.
+
+        Terms are left out after products have been arranged: what is left rounds as it would with them.
+        """
         weights = [w for _, _, ws, _ in self.nodes for w in ws] + [w for _, w in entries.values()]
         operations, results = self._trace.operations(weights, zero, fused=fused)
         value = iter(results)
