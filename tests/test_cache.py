@@ -261,7 +261,8 @@ def test_environments_step_on_whatever_is_left_of_their_code(place):
     assert step() == (bits, "")
     rng = random.Random(1)
     for path in files(place):
-        flipped(rng.randrange(path.stat().st_size))(path)
+        if not path.name.startswith("flow"):  # what is read whole is linked with what is compiled anew
+            flipped(rng.randrange(path.stat().st_size))(path)
     again, told = step()
     assert again == bits
     assert told.count("RuntimeWarning") == 1

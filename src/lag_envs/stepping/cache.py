@@ -28,6 +28,8 @@ LIMIT = 256 * 2**20
 _MAGIC = b"lag_envs 1"
 _SUFFIX = ".compiled"
 _DAY = 86400.0
+#: The latest Numba that was seen to run loaded code.
+_KNOWN = (0, 68)
 _warned = False
 
 
@@ -208,10 +210,16 @@ def _reduce(result: Any) -> bytes:
 def _rebuild(content: bytes, target: Any) -> Any:
     import pickle
 
+    from numba import __version__
     from numba.core.compiler import CompileResult
     from numba.core.runtime import rtsys
 
-    rtsys.initialize(target)
+    # Compiled code needs Numba's memory system and none of what it is compiled with; making all that ready
+    # would take longer than all the rest. What a newer Numba needs is not known.
+    if tuple(map(int, __version__.split(".")[:2])) <= _KNOWN:
+        rtsys.initialize(target)
+    else:
+        target.refresh()
     try:
         return CompileResult._rebuild(target, *pickle.loads(content))
     except Exception as error:  # whole, but of another kind than this Numba reads
