@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
@@ -252,15 +251,6 @@ def _exponent(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
 
 def _integers(kind: ir.Type) -> ir.Type:
     return ir.VectorType(_INT, kind.count) if isinstance(kind, ir.VectorType) else _INT
-
-
-def jit(function: Callable) -> Callable:
-    """Compile a function, cached on disk where a place can be written to."""
-    options = {"error_model": "numpy", "nogil": True}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # no writable cache folder: compile anew in every process
-        return numba.njit(function, **options)
 
 
 #: What the source of a compiled function may name.
