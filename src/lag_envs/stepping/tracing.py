@@ -70,11 +70,11 @@ def _fma(a: Any, b: Any, c: Any) -> Any:
     try:
         exact = Fraction(a) * Fraction(b) + Fraction(c)
     except (OverflowError, ValueError):  # infinite, not a number
-        return a * b + c
+        return c if math.isfinite(a) and math.isfinite(b) else a * b + c
     try:
         return float(exact) if exact else a * b + c
     except OverflowError:
-        return math.copysign(math.inf, exact)
+        return math.inf if exact > 0 else -math.inf
 
 
 #: Every operation on Python's floats, with the bits of machine code (but for the functions of its own).
