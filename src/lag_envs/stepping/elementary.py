@@ -30,7 +30,7 @@ LARGEST_ANGLE = 2.6e7
 
 # pi/2 in parts: three of 29 bits, of which multiples by whole numbers up to 2^24 are exact; then the rest.
 _HALF_PI = (1.570796325802803, 9.920935774287987e-10, 2.2517417706346578e-18, 3.5215598651832e-27)
-# log 2 in two parts, the first of 42 bits.
+# log 2 in two parts, the first of 32 bits.
 _LOG2 = (0.6931471803691238, 1.9082149292705877e-10)
 
 # (sin r - r)/r³ and (cos r - 1)/r² in r², |r| <= pi/4; signs as `sincos` needs them.

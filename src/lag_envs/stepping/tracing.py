@@ -21,6 +21,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
+#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
+MAGIC = 1.5 * 2.0**52
+
 
 def _bits(value: float) -> int:
     return int(struct.unpack("<Q", struct.pack("<d", value))[0])
@@ -31,9 +34,6 @@ def _pow2(n: float) -> float:
     bits = _bits(n + (MAGIC + 1023.0)) << 52
     return float(struct.unpack("<d", struct.pack("<Q", bits % 2**64))[0])
 
-
-#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
-MAGIC = 1.5 * 2.0**52
 
 _FLOAT: dict[str, Callable] = {
     "+": lambda a, b: a + b,
