@@ -1,12 +1,12 @@
 """Sine, cosine, exponential, logarithm, arc tangent and hyperbolic tangent from plain arithmetic.
 
-Libraries of C, Python and JavaScript differ in the last bits of these functions. The formulas here consist of
-``+ - * /``, comparisons, selections and the few exact operations of `Trace` (`pow2`, `exponent`,
-`copysign`) and have no branches. Recorded and printed unfused, they give the same bits on every machine and in every
-language whose numbers are IEEE doubles; in a vector, every lane gives what a single number gives.
+Libraries of C, Python and JavaScript differ in the last bits of these functions. The formulas here consist
+of ``+ - * /``, comparisons, selections and the few exact operations of `Trace` (`pow2`, `exponent`,
+`copysign`), without branches. Recorded and written unfused, they give the same bits on every machine and in
+every language whose numbers are IEEE doubles; every lane of a vector gives what a single number gives.
 
-Errors against exact values, fused and unfused, in units in the last place: 1.5 at most, for `tanh` and
-`tan` 2.5 (`tests/test_elementary.py`). NaN gives NaN; what lies outside a function's domain does too.
+Errors against exact values, fused and unfused, in units in the last place: 1.5 at most, of `tanh` 2.5, of
+`tan` 3 (`tests/test_elementary.py`). NaN gives NaN; what lies outside a function's domain does too.
 
 Each function first reduces its argument, then sums a polynomial. The coefficients are minimax
 approximations of relative error (Remez's algorithm in 45 digits, then rounded). A multiple of a constant is
@@ -28,9 +28,9 @@ from lag_envs.stepping.tracing import MAGIC, Trace, polynomial
 #: Up to here [rad] `sincos` is accurate; beyond, it gives NaN.
 LARGEST_ANGLE = 2.6e7
 
-# pi/2 in parts: three of 29 bits, so that their multiples by whole numbers up to 2^24 are exact; then the rest.
+# pi/2 in parts: three of 29 bits, of which multiples by whole numbers up to 2^24 are exact; then the rest.
 _HALF_PI = (1.570796325802803, 9.920935774287987e-10, 2.2517417706346578e-18, 3.5215598651832e-27)
-# log 2 in two parts, the first of 42 bits.
+# log 2 in two parts, the first of 32 bits.
 _LOG2 = (0.6931471803691238, 1.9082149292705877e-10)
 
 # (sin r - r)/r³ and (cos r - 1)/r² in r², |r| <= pi/4; signs as `sincos` needs them.
@@ -51,19 +51,19 @@ _COS = (
     2.087570080122465e-09,
     -1.1358534276562641e-11,
 )
-# (exp(r) - 1 - r)/r² in r, |r| <= log(2)/2.
+# (exp(r) - 1 - r)/r² in r, -log(2)/4 <= r <= 3 log(2)/4.
 _EXP = (
     0.5,
-    0.16666666666666677,
-    0.0416666666666667,
-    0.008333333333321917,
-    0.001388888888886733,
-    0.00019841269885467486,
-    2.4801587359787623e-05,
-    2.7557244823117295e-06,
-    2.755724330451125e-07,
-    2.5108836286739477e-08,
-    2.0924299328941977e-09,
+    0.1666666666666668,
+    0.04166666666666607,
+    0.00833333333331312,
+    0.0013888888889907992,
+    0.0001984126991780986,
+    2.4801581625794516e-05,
+    2.755732100621516e-06,
+    2.756588697165766e-07,
+    2.4774262983310336e-08,
+    2.4449611904138396e-09,
 )
 # (2 atanh(s) - 2 s)/s³ in s², |s| <= 3 - 2√2.
 _LOG = (
@@ -96,8 +96,8 @@ _ATAN = (
 def sincos(x: Any, xp: Any) -> tuple[Any, Any]:
     """Return sine and cosine of an angle [rad] up to `LARGEST_ANGLE`."""
     x = xp.where(xp.abs(x) <= LARGEST_ANGLE, x, math.nan)
-    # x = n pi/2 + r - rest. The first difference is exact, of the others the rounding errors are kept. Signs of
-    # small terms are such that a negative zero stays one.
+    # x = n pi/2 + r - rest. The first difference is exact, of the others the rounding errors are kept. The
+    # small terms have such signs that a negative zero stays one.
     shifted = x * (2.0 / math.pi) + MAGIC
     n = shifted - MAGIC
     a = x - n * _HALF_PI[0]
@@ -208,7 +208,10 @@ def _nearest(x: Any) -> Any:
 
 
 def _exp_parts(x: Any) -> tuple[Any, Any]:
-    """Return n and ``rest`` with exp(x) = 2**n (1 + rest), n whole."""
-    n = _nearest(x * (1.0 / math.log(2.0)))
+    """Return n and ``rest`` with exp(x) = 2**n (1 + rest), n whole.
+
+    More of r is positive than negative: so `tanh` needs n only where little cancels.
+    """
+    n = _nearest(x * (1.0 / math.log(2.0)) - 0.25)
     r = (x - n * _LOG2[0]) - n * _LOG2[1]
     return n, r + r * r * polynomial(_EXP, r)

@@ -21,6 +21,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
+#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
+MAGIC = 1.5 * 2.0**52
+
 
 def _bits(value: float) -> int:
     return int(struct.unpack("<Q", struct.pack("<d", value))[0])
@@ -31,9 +34,6 @@ def _pow2(n: float) -> float:
     bits = _bits(n + (MAGIC + 1023.0)) << 52
     return float(struct.unpack("<d", struct.pack("<Q", bits % 2**64))[0])
 
-
-#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
-MAGIC = 1.5 * 2.0**52
 
 _FLOAT: dict[str, Callable] = {
     "+": lambda a, b: a + b,
@@ -70,11 +70,11 @@ def _fma(a: Any, b: Any, c: Any) -> Any:
     try:
         exact = Fraction(a) * Fraction(b) + Fraction(c)
     except (OverflowError, ValueError):  # infinite, not a number
-        return a * b + c
+        return c if math.isfinite(a) and math.isfinite(b) else a * b + c
     try:
         return float(exact) if exact else a * b + c
     except OverflowError:
-        return math.copysign(math.inf, exact)
+        return math.inf if exact > 0 else -math.inf
 
 
 #: Every operation on Python's floats, with the bits of machine code (but for the functions of its own).
