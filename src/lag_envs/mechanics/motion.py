@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 from lag_envs.mechanics import recording
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, substitute
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative, substitute
 from lag_envs.mechanics.equations import Energies, Equations, derive, place, velocity
 from lag_envs.mechanics.layout import Layout, Prescribed
 from lag_envs.mechanics.recording import Record, control, parameter
@@ -80,6 +80,49 @@ class Mechanics:
     def key(self) -> str:
         """A hash of `text`."""
         return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def _rate(self, expr: Expr) -> Expr:
+        """Return the time derivative of a function of the places."""
+        total = Expr({})
+        for name in self.layout.names:
+            total = total + derivative(expr, place(name)) * velocity(name)
+        return total
+
+    @cached_property
+    def mass_rate(self) -> tuple[Expr, ...]:
+        """The time derivatives of `entries`."""
+        return tuple(self._rate(entry) for entry in self.entries())
+
+    @cached_property
+    def coupling_rate(self) -> dict[tuple[int, str], Expr]:
+        """The time derivatives of `coupling`."""
+        return {key: self._rate(entry) for key, entry in self.coupling.items()}
+
+    @cached_property
+    def drag(self) -> dict[str, Expr]:
+        """∂D/∂v of each coordinate."""
+        held, loss = _held(self.layout, self.record), self.record.energies.dissipation
+        return {name: substitute(derivative(loss, velocity(name)), held) for name in self.layout.names}
+
+    @cached_property
+    def gyroscopic(self) -> tuple[Expr, Expr] | None:
+        """T₁ and T₀, the parts of T of first and of no degree in the velocities; None where there are none."""
+        parts: list[dict] = [{}, {}]
+        for monomial, c in collect(self.record.energies.kinetic).terms.items():
+            degree = sum(n for atom, n in monomial if atom.kind == "velocity")
+            if degree < 2:
+                parts[1 - degree][monomial] = c
+        held = _held(self.layout, self.record)
+        first, rest = (substitute(Expr(terms), held) for terms in parts)
+        return (first, rest) if any(parts) else None
+
+    def weight(self, name: str) -> list[Expr]:
+        """Return the terms of ∂V/∂q of a coordinate with sines and cosines left out, which are 1 at most."""
+        slope = substitute(derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record))
+        bare = []
+        for monomial, c in slope.sorted_terms():
+            bare.append(Expr({tuple((a, n) for a, n in monomial if a.function not in ("sin", "cos")): c}))
+        return bare
 
     @cached_property
     def full(self) -> Equations:

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, evaluate
 from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.evaluation import Carrying, Dual, Numeric, Point
 from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
@@ -106,14 +107,6 @@ def real_array(name: str, values: ArrayLike) -> Array:
     if array.dtype.kind not in "fiu" and array.size:
         raise ValueError(f"{name} must be real numbers, got {values!r}")
     return array.astype(np.float64)
-
-
-class Numeric:
-    """The namespace ``xp`` of a formula that is evaluated: the functions of a recorded one, on arrays."""
-
-    pi = math.pi
-    sin, cos, tan, exp, log, sqrt, tanh = np.sin, np.cos, np.tan, np.exp, np.log, np.sqrt, np.tanh
-    atan = arctan = np.arctan
 
 
 #: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
@@ -370,6 +363,212 @@ class Scene(metaclass=SceneType):
     def control_units(self) -> tuple[str, ...]:
         """Their units."""
         return self._layout.control_units
+
+    # --- what follows: numbers -----------------------------------------------------------------------------
+
+    def _check_state(self, state: ArrayLike) -> Array:
+        """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
+        array = self._check_states(state)
+        if array.ndim != 1:
+            raise ValueError(f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}")
+        return array
+
+    def _check_states(self, states: ArrayLike) -> Array:
+        """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
+        array, names = real_array("state", states), self.state_names
+        if array.shape[-1:] != (len(names),):
+            raise ValueError(f"state must be ({', '.join(names)}), got an array of shape {array.shape}")
+        bad = ~np.isfinite(array)
+        if bad.any():
+            row = array[tuple(np.argwhere(bad)[0][:-1])]
+            raise ValueError(f"state must be finite, got {dict(zip(names, row.tolist(), strict=True))}")
+        return array
+
+    def _check_controls(self, control: ArrayLike, ndim: int) -> Array:
+        """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
+
+        A single control may stand without its axis; `ndim` is that of the states, by which this is told.
+        """
+        array, names = real_array("the control", control), self.control_names
+        bad = ~np.isfinite(array)
+        if bad.any():
+            raise ValueError(f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}")
+        if array.ndim == 0 and (len(names) == 1 or array == 0.0):
+            return np.full(len(names), float(array))
+        if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):
+            return array[..., None]
+        if array.shape[-1:] != (len(names),):
+            wanted = f"({', '.join(names)})" if names else "left out, since the scene has none"
+            raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
+        return array
+
+    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
+        """Return the motion at states under controls, and the shape of its numbers."""
+        states = self._check_states(state)
+        controls = self._check_controls(control, states.ndim)
+        try:
+            shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+        except ValueError:
+            raise ValueError(
+                f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
+            ) from None
+        columns = [np.moveaxis(array, -1, 0) for array in (states, controls)]
+        return Point(self.mechanics, self._symbols(), *columns, Numeric), shape
+
+    def _symbols(self) -> dict[Atom, float]:
+        """Return the parameters' values by symbol."""
+        return {recording.parameter(name): np.float64(getattr(self, name)) for name in self._numbers()}
+
+    def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
+        """Return the accelerations of the free coordinates, by name.
+
+        Parameters
+        ----------
+        state : array_like, shape (..., n_state)
+            One state or many.
+        control : array_like, shape (..., n_controls), optional
+            The controls that are held; a single one may stand without its axis.
+        """
+        point, shape = self._point(state, control)
+        return {name: _shaped(point.acceleration[name], shape) for name in self._layout.free}
+
+    def mass_matrix(self, state: ArrayLike, control: ArrayLike = 0.0) -> Array:
+        """Return the mass matrix of the free coordinates, shape (..., n, n)."""
+        point, shape = self._point(state, control)
+        n = len(self._layout.free)
+        return np.stack([_shaped(x, shape) for x in point.mass], axis=-1).reshape(*shape, n, n)
+
+    def energy(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
+        """Return kinetic, potential and total energy [J].
+
+        Where the kinetic energy has terms T₁ or T₀ of first or no degree in the velocities, also ``jacobi``,
+        Jacobi's integral T₂ - T₀ + V: that is what `power` changes.
+
+        Parameters
+        ----------
+        state : array_like, shape (..., n_state)
+            One state or many.
+        control : array_like, shape (..., n_controls), optional
+            The controls that are held; they matter where a velocity depends on them.
+        """
+        point, shape = self._point(state, control)
+        names = self._layout.names
+        q = Values("coordinate", {name: point.values[place(name)] for name in names})
+        v = Values("velocity of a coordinate", {name: point.values[velocity(name)] for name in names})
+        kinetic, potential = self.kinetic(q, v, Numeric), self.potential(q, Numeric)
+        energies = {"kinetic": kinetic, "potential": potential, "total": kinetic + potential}
+        if self.mechanics.gyroscopic is not None:
+            linear, rest = point.of(self.mechanics.gyroscopic)
+            energies["jacobi"] = kinetic - linear - 2.0 * rest + potential
+        return {name: _shaped(value, shape) for name, value in energies.items()}
+
+    def forces(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
+        """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
+
+        Those of `reactions` have the names that it gives; what moves another coordinate s is ``drive_s``. A
+        ratio |F|/N is infinite where N is not above 1e-12 of the weight: the contact carries nothing, or pulls.
+
+        Parameters
+        ----------
+        state : array_like, shape (..., n_state)
+            One state or many.
+        control : array_like, shape (..., n_controls), optional
+            The controls that are held.
+        """
+        point, shape = self._point(state, control)
+        layout = self._layout
+        named = dict(layout.reactions)
+        for p in layout.at("acceleration", "rate"):
+            if p.name not in named.values():
+                named[f"drive_{p.name}"] = p.name
+        forces = {k: _shaped(f, shape) for k, f in zip(named, point.force(list(named.values())), strict=True)}
+        for name, friction, normal in layout.ratios:
+            least = _shaped(1e-12 * point.weight(named[normal]), shape)
+            out = np.full(shape, np.inf)
+            carries = forces[normal] > least
+            forces[name] = np.divide(np.abs(forces[friction]), forces[normal], out=out, where=carries)[()]
+        return forces
+
+    def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
+        """Return the powers of ``drive`` and ``applied`` forces and that lost to ``drag`` [W].
+
+        Energy changes by drive + applied - drag. What drives a coordinate whose rate the state leaves out is the
+        inertial force of its frame.
+        """
+        point, shape = self._point(state, control)
+        return {name: _shaped(value, shape) for name, value in point.power().items()}
+
+    def linearise(self, state: ArrayLike, control: ArrayLike = 0.0) -> tuple[Array, Array]:
+        """Return the derivatives of the state's rate of change by state and control, (A, B).
+
+        Parameters
+        ----------
+        state : array_like, shape (..., n_state)
+            One state or many.
+        control : array_like, shape (..., n_controls), optional
+            The controls that are held.
+
+        Returns
+        -------
+        A : ndarray, shape (..., n_state, n_state)
+            ∂(d state/dt)/∂state, exact.
+        B : ndarray, shape (..., n_state, n_controls)
+            ∂(d state/dt)/∂control.
+        """
+        states = self._check_states(state)
+        controls = self._check_controls(control, states.ndim)
+        shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+        n = states.shape[-1]
+        unit = np.eye(n + controls.shape[-1])
+        numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
+        numbers += [Dual(controls[..., i], unit[n + i]) for i in range(controls.shape[-1])]
+        point = Point(self.mechanics, self._symbols(), numbers[:n], numbers[n:], Carrying)
+        slopes = [rate.slope if isinstance(rate, Dual) else np.zeros(len(unit)) for rate in point.rates()]
+        both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
+        return both[..., :n].copy(), both[..., n:].copy()
+
+    def energy_balance(
+        self, state: ArrayLike, control: ArrayLike, dt: float, *, nodes: int = 16
+    ) -> dict[str, float]:
+        """Compare a step's change of energy with the work done on it [J].
+
+        Work and loss are integrated by Gauss-Legendre quadrature on the exact flow within the step.
+
+        Parameters
+        ----------
+        state : array_like, shape (n_state,)
+            Start.
+        control : float or array_like, shape (n_controls,)
+            The controls that are held.
+        dt : float
+            Length of the step [s].
+        nodes : int, default 16
+            Nodes of the quadrature.
+
+        Returns
+        -------
+        dict
+            ``change`` of energy, or of Jacobi's integral where `energy` has it; ``work`` of drive and applied
+            forces, ``loss`` to drag, and ``residual`` = change - work + loss.
+        """
+        dt = check_step(dt)
+        controls = self._check_controls(control, 1)
+        points, weights = np.polynomial.legendre.leggauss(nodes)
+        times = 0.5 * dt * (points + 1.0)
+        held: Any = controls[None] if self.control_names else 1
+        states = np.array([self.simulate(state, held, t)[1] for t in [*times, dt]])
+        power = self.power(states[:-1], controls)
+        work, loss = (
+            float(np.sum(0.5 * dt * weights * value)) for value in (power["drive"] + power["applied"], power["drag"])
+        )
+        name = "total" if self.mechanics.gyroscopic is None else "jacobi"
+        change = float(self.energy(states[-1], controls)[name] - self.energy(state, controls)[name])
+        return {"change": change, "work": work, "loss": loss, "residual": change - work + loss}
+
+
+def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
+    """Return a float64 array of a shape, or a number where the shape is empty."""
+    return np.broadcast_to(np.asarray(value, dtype=np.float64), shape).copy()[()]
 
 
 def _controls(scene: Scene) -> tuple[Any, tuple[str, ...]]:
