@@ -68,11 +68,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         constants = constants_of(self.task)
         self._program = program = Program(self.task, absent=absent([constants]))
         rows = program.kept + program.scratch
-        self._rows = np.array([0.0] * len(rows) + [constants[name] for name in program.uniform])
+        numbers = [constants[name] for name in program.uniform]
+        self._rows = np.array([0.0] * len(rows) + numbers + [0.0] * program.room)
         #: Key of the seed, number of the episode, key of the episode.
         self._ids = np.zeros(3, dtype=np.uint64)
         self._row = {name: j for j, name in enumerate(rows)}
-        self._size, self._u = len(self.task.observation), self._row["u"]
+        self._size = len(program.o)
         self._ready = False
         self._started = False
         self._bind()
@@ -166,11 +167,10 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
                 + ("the episode has terminated" if self._started else "no episode has begun")
             )
         observation = np.empty(self._size, FLOAT32)
-        before = self._rows[self._u]
         reward, over = self._step(self._rows, observation, a, self._ids)
         if over:
             if over == SLOW:
-                reward, over = self._slow_step(observation, before)
+                reward, over = self._slow_step(observation)
             self._ready = over % 2 == 0
         if self.render_mode == "human":
             self.render()
