@@ -193,7 +193,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._viewer.draw(self.state, self.control, self.target)
 
     def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
-        """Return keys for `gymnasium.utils.play`: a and d for the ends of the control, none for no control."""
+        """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""
         rest = self.task.rest_action
         keys = {"": rest, "a": -1.0, "d": 1.0, "ad": rest}
         return {pressed: np.array([action], FLOAT32) for pressed, action in keys.items()}
