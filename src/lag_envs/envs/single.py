@@ -13,6 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import SLOW, Program, constants_of
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -63,7 +64,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = render_mode
         self.diagnostics = diagnostics
         self.metadata = {"render_modes": RENDER_MODES, "render_fps": max(1, round(1.0 / self.task.dt))}
-        self.action_space = action_space()
+        self._actions = Actions(self.task.formulas.actions, self.task.formulas.choices)
+        self.action_space = self._actions.space
+        self._plain = not self._actions.values and self._actions.count == 1
         self.observation_space = observation_space([self.task])
 
         constants = constants_of(self.task)
@@ -112,7 +115,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         state, target = start_options(options)
         given_state = None if state is None else self.task.check_start(state)
-        given_target = None if target is None else self.task.check_target(target)
+        given_target = None if target is None else np.atleast_1d(self.task.check_target(target))
         super().reset(seed=seed)
         if seed is not None:
             self._ids[:2] = int(seed) % 2**64, 0
@@ -122,7 +125,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if given_state is not None:
             self._rows[: len(given_state)] = given_state
         if given_target is not None:
-            self._rows[self._row["g"]] = given_target
+            self._rows[[self._row[name] for name in self._program.g]] = given_target
         observation = np.empty(self._size, dtype=np.float32)
         self._program.start_one(
             self._rows, observation, self._ids, given_state is not None, given_target is not None
@@ -156,12 +159,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         StepRefused
             Where the step cannot be taken to full accuracy. In each case the environment stays as it was.
         """
-        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
+        if self._plain and type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
             a = action.item()
+            if not -math.inf < a < math.inf:
+                raise ValueError(f"the action must be finite, got {action!r}")
         else:
-            a = one_action(action)
-        if not -math.inf < a < math.inf:
-            raise ValueError(f"the action must be finite, got {action!r}")
+            a = self._actions.one(action)
         if not self._ready:
             raise ResetNeeded(
                 "call reset() before step(): "
@@ -212,14 +215,17 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._rows[: len(self.scene.state_names)].copy()
 
     @property
-    def target(self) -> float | None:
-        """The episode's target; None for a task without one."""
-        return None if self.task.target_range is None else float(self._rows[self._row["g"]])
+    def target(self) -> Any:
+        """The episode's target; an array where there are several, None for a task without one."""
+        return single_number(self._read(self._program.g)) if self._program.g else None
 
     @property
-    def control(self) -> float:
-        """The control applied last, in SI units; 0 after a reset."""
-        return float(self._rows[self._row["u"]])
+    def control(self) -> Any:
+        """The control applied last, in SI units; an array where there are several; 0 after a reset."""
+        return single_number(self._read(self._program.u))
+
+    def _read(self, names: list[str]) -> NDArray[np.float64]:
+        return self._rows[[self._row[name] for name in names]]
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -234,18 +240,19 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     # --- the rest ------------------------------------------------------------------------------------------
 
-    def _slow_step(self, observation: NDArray[np.float32], control_before: float) -> tuple[float, int]:
+    def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
-        start = [rows[self._row[name]] for name in [*program.y, "u"]]
         constants = constants_of(self.task)
+        held = self._read(program.held)
+        start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
         *end, status = program.advance(
-            *start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants)
+            *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
         )
         if status < 0:
-            refusal = self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
-            rows[self._u] = control_before
-            raise refusal
+            raise self.scene.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+        for name, value in zip(program.u, held, strict=True):
+            rows[self._row[name]] = value
         for name, value in zip(program.z, end, strict=True):
             rows[self._row[name]] = value
         return program.finish_one(rows, observation, self._ids)
@@ -297,11 +304,6 @@ def absent(constants: list[dict[str, float]]) -> frozenset[str]:
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
-def action_space() -> gym.spaces.Box[np.float32]:
-    """Return the space of actions, the same for every task."""
-    return gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that holds the observations of all the tasks."""
     high = np.max([np.asarray(task.bounds()) for task in tasks], axis=0).astype(np.float32)
@@ -320,16 +322,6 @@ def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("sta
     if unknown:
         raise ValueError(f"unknown reset option {unknown[0]!r}; known are {', '.join(known)}")
     return [(options or {}).get(name) for name in known]
-
-
-def one_action(action: Any) -> float:
-    """Return an action of any real type as float, or raise a ValueError."""
-    array = np.asarray(action)
-    if array.shape != (1,):
-        raise ValueError(f"the action must have shape (1,), got shape {array.shape}: {action!r}")
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"the action must be a real number, got {action!r} of type {array.dtype}")
-    return float(array[0])
 
 
 def diagnostics(scene: Any, state: NDArray[np.float64], control: Any) -> dict[str, Any]:

@@ -210,6 +210,7 @@ class FlowFormulas:
 
     clipped = True
     actions = controls = 1
+    choices = ()
     trace = Trace
 
     def __init__(self, task: Task) -> None:
