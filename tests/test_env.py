@@ -16,6 +16,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from rollouts import IDS, RENDERS, actions, make, trace
 
+from lag_envs.envs import program
+from lag_envs.envs.program import Program
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.scenes.base import StepRefused
 
@@ -700,3 +702,32 @@ def test_a_refused_step_changes_nothing():
             env.step(np.ones(1))
         assert (env.state == state).all() and env.control == 0.0
     env.reset(seed=2)
+
+
+def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
+    # It is most of what making an environment takes.
+    recorded = []
+    record = Program._record
+
+    def count(self, task, constants):
+        recorded.append(task)
+        record(self, task, constants)
+
+    monkeypatch.setattr(Program, "_record", count)
+    monkeypatch.setattr(program, "_programs", {})
+    for i in range(5):
+        make("PivotedBar-v0", mass=0.1 + 0.1 * i, dt=0.01 + 0.01 * i)
+        gym.make_vec("PivotedBar-v0", num_envs=3, track=0.4 + 0.1 * i)
+    assert len(recorded) == 1
+    others = [{"track": None}, {"track": math.inf}, {"damping": 0.0}, {"gravity": 0.0}]
+    for options in others:
+        make("PivotedBar-v0", **options)
+        make("PivotedBar-v0", mass=0.3, **options)
+    assert len(recorded) == 1 + len(others)
+    gym.make_vec("PivotedBar-v0", num_envs=2, mass=[0.1, 0.2])
+    gym.make_vec("PivotedBar-v0", num_envs=2, mass=[0.3, 0.2])
+    assert len(recorded) == 2 + len(others)
+    for options in ({}, {"target": 0.1}, {"control": "tilt"}):
+        make("InclineTilt-v0", **options)
+        make("InclineTilt-v0", **options)
+    assert len(recorded) == 5 + len(others)

@@ -61,11 +61,13 @@ env.reset(seed=1)
 times.append(perf_counter())
 env.step(env.action_space.sample())
 times.append(perf_counter())
+gymnasium.make({id!r})
+times.append(perf_counter())
 print(*(b - a for a, b in zip(times, times[1:])))
 """
 STAGES = (
     "Python's own start and end", "import numpy", "import gymnasium", "import numba",
-    "import lag_envs, gym.make", "reset", "step",
+    "import lag_envs, gym.make", "reset", "step", "gym.make again",
 )  # fmt: skip
 
 #: Takes at least that many steps of every environment, and returns how many it took.

@@ -14,7 +14,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.program import SLOW, Program, constants_of
+from lag_envs.envs.program import SLOW, constants_of, program_for
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -70,7 +70,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.observation_space = observation_space([self.task])
 
         constants = constants_of(self.task)
-        self._program = program = Program(self.task, absent=absent([constants]))
+        self._program = program = program_for(self.task, absent([constants]))
         rows = program.kept + program.scratch
         numbers = [constants[name] for name in program.uniform]
         self._rows = np.array([0.0] * len(rows) + numbers + [0.0] * program.room)
@@ -267,7 +267,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
         self.__dict__.update(state)
-        self._program = Program(self.task, absent=absent([constants_of(self.task)]))
+        self._program = program_for(self.task, absent([constants_of(self.task)]))
         self._bind()
 
 

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.program import BLOCK, Program, constants_of
+from lag_envs.envs.program import BLOCK, constants_of, program_for
 from lag_envs.envs.single import (
     FLOAT32,
     absent,
@@ -139,7 +139,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _compile(self) -> None:
         first = self._constants[0]
         varying = frozenset(name for name in first if any(c[name] != first[name] for c in self._constants))
-        self._program = Program(self.task, absent(self._constants), varying)
+        self._program = program_for(self.task, absent(self._constants), varying)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
 
