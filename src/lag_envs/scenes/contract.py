@@ -23,6 +23,8 @@ from lag_envs.mechanics.evaluation import Carrying, Dual, Numeric, Point
 from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
+from lag_envs.scenes import picture
+from lag_envs.scenes.shapes import Moment, Shape, Window
 
 if TYPE_CHECKING:
     import sympy
@@ -225,6 +227,14 @@ class Scene(metaclass=SceneType):
     def bodies(self) -> Any:
         """Return shapes of each body in its own frame."""
         return {}
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front: the bodies where they are."""
+        return picture.shapes(self, now)
+
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at: around the first body, as far as the others reach."""
+        return picture.window(self, now)
 
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""
