@@ -44,13 +44,29 @@ ONE_THREAD = {
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
-#: What a cold start does, from the start of the process on.
+#: What a cold start does after the start of the process, in stages; prints the seconds of each.
 COLD_START = """
-import gymnasium, lag_envs
+from time import perf_counter
+times = [perf_counter()]
+import numpy
+times.append(perf_counter())
+import gymnasium
+times.append(perf_counter())
+import numba
+times.append(perf_counter())
+import lag_envs
 env = gymnasium.make({id!r})
+times.append(perf_counter())
 env.reset(seed=1)
+times.append(perf_counter())
 env.step(env.action_space.sample())
+times.append(perf_counter())
+print(*(b - a for a, b in zip(times, times[1:])))
 """
+STAGES = (
+    "Python's own start and end", "import numpy", "import gymnasium", "import numba",
+    "import lag_envs, gym.make", "reset", "step",
+)  # fmt: skip
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -71,8 +87,8 @@ class Target(NamedTuple):
 
 
 TARGETS = (Target("made", 1, 2.0), Target("vector", 64, 6.0), Target("vector", 16384, 3.0))
-#: Seconds from the start of a process to its first step, by state of Numba's cache.
-COLD_TARGETS = {"empty": 2.5, "filled": 1.2}
+#: Seconds from the start of a process to its end after one step, by state of the cache of compiled code.
+COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 
 @dataclass
@@ -274,11 +290,12 @@ PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
 def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
     rows = contestants(settings.ids, settings.sizes) if settings.speed else []
-    cold: dict[str, list[float]] = {}
+    stages: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
-        complete = cold_starts(settings.ids[0], settings.cold_starts, cold)
+        complete = cold_starts(settings.ids[0], settings.cold_starts, stages)
+    cold = {name: [sum(one) for one in many] for name, many in stages.items()}
     results = [summary(row, rows) for row in rows]
     report: dict[str, Any] = {
         "date": settings.date,
@@ -288,7 +305,15 @@ def bench(settings: Settings) -> dict[str, Any]:
         "settings": asdict(settings),
         "rows": results,
         "cold_start": {
-            name: {"seconds": times, "median": quartiles(times)[1]} for name, times in cold.items()
+            name: {
+                "seconds": times,
+                "median": quartiles(times)[1],
+                "stages": {
+                    stage: quartiles(part)[1]
+                    for stage, part in zip(STAGES, zip(*stages[name], strict=True), strict=True)
+                },
+            }
+            for name, times in cold.items()
         },
     }
     report["targets"] = verdicts(results, cold)
@@ -356,8 +381,8 @@ def rate(run: Run, steps: int, clock: Clock) -> float:
     return taken / (clock() - start)
 
 
-def cold_starts(id: str, count: int, times: dict[str, list[float]]) -> bool:
-    """Time whole processes up to the first step into `times`; return False where the user broke it off."""
+def cold_starts(id: str, count: int, times: dict[str, list[list[float]]]) -> bool:
+    """Time the stages of whole processes into `times`; return False where the user broke it off."""
     empty = (count + 1) // 2
     with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
         try:
@@ -372,12 +397,16 @@ def cold_starts(id: str, count: int, times: dict[str, list[float]]) -> bool:
     return True
 
 
-def cold_start(id: str, cache: str) -> float:
-    """Return the seconds that a process takes from its start to its end after one step."""
+def cold_start(id: str, cache: str) -> list[float]:
+    """Return the seconds of each of `STAGES` of a process that takes one step."""
     command = [sys.executable, "-P", "-c", COLD_START.format(id=id)]
     start = time.perf_counter()
-    subprocess.run(command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True)
-    return time.perf_counter() - start
+    done = subprocess.run(
+        command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True, text=True
+    )
+    total = time.perf_counter() - start
+    stages = list(map(float, done.stdout.split()))
+    return [total - sum(stages), *stages]
 
 
 @contextmanager
@@ -533,9 +562,9 @@ def table(report: dict[str, Any]) -> list[str]:
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
-        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}"]
-    if report["cold_start"]:
-        lines += [""]
+        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}; median of each stage, ms:"]
+        rows = [(f"  {stage}", f"{1e3 * seconds:.1f}") for stage, seconds in cold["stages"].items()]
+        lines += [*columns(rows), ""]
     words = {True: "met", False: "missed", None: "not measured"}
     lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
     if not report["complete"]:

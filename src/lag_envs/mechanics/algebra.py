@@ -471,38 +471,73 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
 
 
 def collect(expr: Expr) -> Expr:
-    """Apply cos² + sin² = 1 wherever two terms agree in all else and have coefficients of one sign."""
+    """Apply cos² + sin² = 1, and the rules for the cosine and sine of a sum, wherever terms meet that allow it.
+
+    Two terms meet where they agree in all but a pair of factors and have coefficients of one size. So
+    energies that are written in Cartesian velocities become as short as those that are written in angles.
+    """
     terms = dict(expr.terms)
-    changed = True
-    while changed:
-        changed = False
-        for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
-            c = terms.get(monomial)
-            if c is None:
-                continue
-            for i, (atom, n) in enumerate(monomial):
-                if atom.function != "sin" or n < 2:
-                    continue
-                assert atom.argument is not None
-                cosine = function("cos", atom.argument)
-                ((partner_atom, _),) = next(iter(cosine.terms))
-                rest = monomial[:i] + (((atom, n - 2),) if n > 2 else ()) + monomial[i + 1 :]
-                partner, more = _product(rest, ((partner_atom, 2),))
+    while True:
+        found = _meeting(terms)
+        if found is None:
+            return Expr(terms)
+        for change in found:
+            for monomial, c in change.items():
+                total = terms.get(monomial, 0) + c
+                if total:
+                    terms[monomial] = total
+                else:
+                    terms.pop(monomial, None)
+
+
+def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:
+    """Return changes of terms that one rule asks for, or None where none applies."""
+    for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
+        c = terms[monomial]
+        waves = [(a, n) for a, n in monomial if a.function in ("sin", "cos")]
+        for a, n in waves:
+            if a.function == "sin" and n >= 2:
+                partner = _exchange(monomial, {a: -2, _twin(a): 2})
                 d = terms.get(partner)
-                if more is not None or d is None or (c > 0) != (d > 0):
+                if d is not None and (c > 0) == (d > 0):
+                    common = min(c, d, key=abs)
+                    return [{monomial: -common}, {partner: -common}, {_exchange(monomial, {a: -2}): common}]
+        for x, (a, _) in enumerate(waves):
+            for b, _ in waves[x + 1 :]:
+                if a.argument is b.argument or a.argument.same(b.argument):  # type: ignore[union-attr, arg-type]
                     continue
-                common = min(c, d, key=abs)
-                for key, change in ((monomial, -common), (partner, -common), (rest, common)):
-                    total = terms.get(key, 0) + change
-                    if total:
-                        terms[key] = total
-                    else:
-                        terms.pop(key, None)
-                changed = True
-                break
-            if changed:
-                break
-    return Expr(terms)
+                partner = _exchange(monomial, {a: -1, b: -1, _twin(a): 1, _twin(b): 1})
+                d = terms.get(partner)
+                if d is None or abs(c) != abs(d) or partner == monomial:
+                    continue
+                rest = Expr({_exchange(monomial, {a: -1, b: -1}): c})
+                return [{monomial: -c}, {partner: -d}, (rest * _of_sum(a, b, c == d)).terms]
+    return None
+
+
+def _of_sum(a: Atom, b: Atom, alike: bool) -> Expr:
+    """Return a b ± (twin of a)(twin of b) as one function of a sum of angles."""
+    x, y = a.argument, b.argument
+    assert x is not None and y is not None
+    if a.function == b.function == "cos":
+        return function("cos", x - y if alike else x + y)
+    if a.function == b.function == "sin":
+        return function("cos", x - y) if alike else -function("cos", x + y)
+    if a.function == "cos":  # sin y cos x ± sin x cos y
+        return function("sin", y + x if alike else y - x)
+    return function("sin", x + y if alike else x - y)
+
+
+def _twin(atom: Atom) -> Atom:
+    return Atom("function", "cos" if atom.function == "sin" else "sin", atom.argument)
+
+
+def _exchange(monomial: Monomial, change: Mapping[Atom, int]) -> Monomial:
+    """Return the monomial with powers of some atoms changed."""
+    powers = dict(monomial)
+    for atom, n in change.items():
+        powers[atom] = powers.get(atom, 0) + n
+    return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text))
 
 
 def evaluate(exprs: Iterable[Expr], values: Mapping[Atom, Any], xp: Any) -> list:

@@ -1,0 +1,160 @@
+"""Whole control steps from attempts: substeps as the certificate asks for, one lane or a block of lanes.
+
+An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here it is
+repeated until the control step is over. In a block the lanes that are not done are gathered and go on together.
+Each lane goes through the same attempts as it would alone, so its bits do not depend on its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from lag_envs.stepping.compiling import compile_python
+from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.machine import Layout, compile_attempt
+from lag_envs.stepping.series import TOLERANCE
+
+#: A control step that would need more attempts than this is refused.
+LARGEST_COUNT = 20_000
+#: So is one that would need a substep below this part of it.
+SMALLEST_PART = 1e-9
+#: Lanes of a block, and those that are stepped at once.
+BLOCK, LANES = 64, 8
+
+
+def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step of the lane in `rows`; return the number of attempts, negative where refused.
+
+    Inputs, places and velocities are read, places and velocities are replaced; behind the rows of the attempt the
+    sums of the substeps' bounds on places and velocities are left.
+    """
+    for i in range(2 * n):
+        rows[size + i] = 0.0
+    remaining, h, count = dt, dt, 0
+    while True:
+        rows[wish] = h
+        if elapsed >= 0:
+            rows[elapsed] = dt - remaining
+        attempt(rows, 0, order, tolerance)
+        count += 1
+        if rows[done] > 0.0:
+            for i in range(2 * n):
+                rows[q + i] = rows[after + i]
+            for i in range(n):
+                rows[size + i] += rows[bound + i] * (rows[used] / (order + 2))
+                rows[size + n + i] += rows[bound + i]
+            if not rows[used] < remaining:
+                break
+            remaining -= rows[used]
+            h = min(remaining, 2.0 * rows[used])
+        else:
+            h *= 0.0625
+            if not h > SMALLEST_PART * dt:
+                return -count
+        if count >= LARGEST_COUNT:
+            return -count
+    for i in range(2 * n):
+        if not abs(rows[q + i]) < np.inf:
+            return -count
+    return count
+
+
+def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step of up to BLOCK lanes; return how many were refused.
+
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``: inputs, places, velocities as in an attempt, and after
+    them the status: the number of attempts, negative where the lane was refused.
+    """
+    rows = np.empty(size * LANES)
+    remaining = np.empty(BLOCK)
+    wishes = np.empty(BLOCK)
+    lane = np.empty(BLOCK, np.int64)
+    status = base + (q + 2 * n) * BLOCK
+    for i in range(count):
+        remaining[i] = dt
+        wishes[i] = dt
+        memory[status + i] = 0.0
+        lane[i] = i
+    going, refused, first_round = count, 0, True
+    while going > 0:
+        kept = 0
+        for first in range(0, going, LANES):
+            some = min(LANES, going - first)
+            if first_round and some == LANES:
+                for r in range(q + 2 * n):
+                    at = base + r * BLOCK + first
+                    for i in range(LANES):
+                        rows[r * LANES + i] = memory[at + i]
+            else:
+                for r in range(q + 2 * n):
+                    for i in range(LANES):
+                        rows[r * LANES + i] = memory[base + r * BLOCK + lane[first + min(i, some - 1)]]
+            for i in range(LANES):
+                source = lane[first + min(i, some - 1)]
+                rows[wish * LANES + i] = wishes[source]
+                if elapsed >= 0:
+                    rows[elapsed * LANES + i] = dt - remaining[source]
+            attempt(rows, 0, order, tolerance)
+            for i in range(some):
+                source = lane[first + i]
+                memory[status + source] += 1.0
+                spent = memory[status + source] >= LARGEST_COUNT
+                if rows[done * LANES + i] > 0.0:
+                    for r in range(2 * n):
+                        memory[base + (q + r) * BLOCK + source] = rows[(after + r) * LANES + i]
+                    step = rows[used * LANES + i]
+                    if not step < remaining[source]:
+                        for r in range(2 * n):
+                            if not abs(memory[base + (q + r) * BLOCK + source]) < np.inf:
+                                spent = True
+                        if spent and memory[status + source] > 0.0:
+                            memory[status + source] *= -1.0
+                            refused += 1
+                        continue
+                    remaining[source] -= step
+                    wishes[source] = min(remaining[source], 2.0 * step)
+                else:
+                    wishes[source] *= 0.0625
+                    spent = spent or not wishes[source] > SMALLEST_PART * dt
+                if spent:
+                    memory[status + source] *= -1.0
+                    refused += 1
+                else:
+                    lane[kept] = source
+                    kept += 1
+        going, first_round = kept, False
+    return refused
+
+
+def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, float]:
+    layout = Layout(record)
+    return {
+        "n": record.size,
+        "q": layout.q,
+        "wish": layout.h,
+        "done": layout.done,
+        "used": layout.used,
+        "after": layout.q_after,
+        "bound": layout.bound,
+        "size": layout.rows,
+        "elapsed": layout.inputs.get("start_elapsed", -1),
+        "tolerance": tolerance,
+        "SMALLEST_PART": SMALLEST_PART,
+        "LARGEST_COUNT": LARGEST_COUNT,
+    }
+
+
+@cache
+def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
+    """Compile ``advance(rows, dt, order)``, see `_advance`."""
+    return compile_python("advance_lane", _advance, compile_attempt(record, 1), **_numbers(record, tolerance))
+
+
+@cache
+def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
+    """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`."""
+    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": LANES}
+    return compile_python("advance_block", _advance_block, compile_attempt(record, LANES), **numbers)

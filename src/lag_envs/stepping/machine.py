@@ -1,0 +1,257 @@
+"""Prints the step of `lag_envs.stepping.series` to machine code: one lane or several at once, with the same bits."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from lag_envs.mechanics import algebra
+from lag_envs.stepping import elementary, lowering, primitives, series, tracing
+from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.primitives import emit
+from lag_envs.stepping.series import LARGEST_ORDER, Series
+
+_DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
+#: Coefficients of one series that are set aside: a place has one more than the order.
+STRIDE = LARGEST_ORDER + 2
+
+
+class Layout:
+    """Where the numbers of one attempt lie: rows of one number per lane.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped.
+    """
+
+    def __init__(self, record: SeriesRecord) -> None:
+        n, first = record.size, len(record.inputs)
+        #: Row of each input, then of places, velocities and the step that is wished for.
+        self.inputs = {name: i for i, name in enumerate(record.inputs)}
+        self.q, self.v, self.h = first, first + n, first + 2 * n
+        #: Results: 1 where a step was certified, its length, places and velocities after it, bounds on v.
+        self.done = self.h + 1
+        self.used, self.q_after = self.done + 1, self.done + 2
+        self.v_after, self.bound = self.q_after + n, self.q_after + 2 * n
+        self.rows = self.bound + n
+
+
+class Machine:
+    """The target that writes LLVM's language: numbers are doubles, or vectors of them."""
+
+    def __init__(self, builder: ir.IRBuilder, slots: int, lanes: int, fused: bool) -> None:
+        self._b, self._fused = builder, fused
+        self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
+        self._lanes = lanes
+        memory = builder.alloca(self.kind, slots * STRIDE)
+        memory.align = 8 * lanes
+        self._memory = memory
+
+    def number(self, value: float) -> ir.Value:
+        constant = ir.Constant(_DOUBLE, value)
+        return constant if self._lanes == 1 else ir.Constant(self.kind, [constant] * self._lanes)
+
+    def add(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fadd(a, b)
+
+    def sub(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fsub(a, b)
+
+    def mul(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fmul(a, b)
+
+    def div(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fdiv(a, b)
+
+    def fma(self, a: Any, b: Any, c: Any) -> ir.Value:
+        if not self._fused:
+            return self._b.fadd(self._b.fmul(a, b), c)
+        return primitives.call(self._b, "fma", a, b, c)
+
+    def neg(self, a: Any) -> ir.Value:
+        return self._b.fneg(a)
+
+    def abs(self, a: Any) -> ir.Value:
+        return primitives.call(self._b, "fabs", a)
+
+    def sqrt(self, a: Any) -> ir.Value:
+        return primitives.call(self._b, "sqrt", a)
+
+    def less(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fcmp_ordered("<", a, b)
+
+    def both(self, a: Any, b: Any) -> ir.Value:
+        return self._b.and_(a, b)
+
+    def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
+        return self._b.select(condition, a, b)
+
+    def any(self, condition: Any) -> ir.Value:
+        if self._lanes == 1:
+            return condition
+        kind = ir.IntType(self._lanes)
+        return self._b.icmp_unsigned("!=", self._b.bitcast(condition, kind), ir.Constant(kind, 0))
+
+    def real(self, k: Any) -> ir.Value:
+        if isinstance(k, ir.Constant):
+            return self.number(float(k.constant))
+        return self._splat(self._b.sitofp(k, _DOUBLE))
+
+    def _splat(self, value: Any) -> ir.Value:
+        return value if self._lanes == 1 else primitives.splat(self._b, value, self._lanes)
+
+    def index(self, k: int) -> ir.Value:
+        return ir.Constant(_INT, k)
+
+    def plus(self, k: Any, n: int) -> ir.Value:
+        if isinstance(k, ir.Constant):
+            return ir.Constant(_INT, k.constant + n)
+        return self._b.add(k, ir.Constant(_INT, n))
+
+    def minus(self, a: Any, b: Any) -> ir.Value:
+        return self._b.sub(a, b)
+
+    def _at(self, slot: int, k: Any) -> ir.Value:
+        return self._b.gep(self._memory, [self.plus(k, slot * STRIDE)])
+
+    def load(self, slot: int, k: Any) -> ir.Value:
+        return self._b.load(self._at(slot, k))
+
+    def store(self, slot: int, k: Any, value: Any) -> None:
+        self._b.store(value, self._at(slot, k))
+
+    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable) -> list:
+        return self._repeat(first, end, None, carried, lambda k, values: (None, body(k, values)))
+
+    def repeat(self, times: int, going: Any, carried: Sequence, body: Callable) -> list:
+        return self._repeat(self.index(0), self.index(times), going, carried, body)
+
+    def _repeat(self, first: Any, end: Any, going: Any, carried: Sequence, body: Callable) -> list:
+        b = self._b
+        start = b.basic_block
+        head, inside, after = (b.append_basic_block(name) for name in ("head", "inside", "after"))
+        b.branch(head)
+        b.position_at_end(head)
+        k = b.phi(_INT)
+        k.add_incoming(first, start)
+        phis = [b.phi(value.type) for value in carried]
+        for phi, value in zip(phis, carried, strict=True):
+            phi.add_incoming(value, start)
+        flag = None
+        if going is not None:
+            flag = b.phi(_BIT)
+            flag.add_incoming(going, start)
+        more = b.icmp_signed("<", k, end)
+        if flag is not None:
+            more = b.and_(more, flag)
+        b.cbranch(more, inside, after)
+        b.position_at_end(inside)
+        still, values = body(k, list(phis))
+        last = b.basic_block
+        k.add_incoming(b.add(k, ir.Constant(_INT, 1)), last)
+        for phi, value in zip(phis, values, strict=True):
+            phi.add_incoming(value, last)
+        if flag is not None:
+            flag.add_incoming(still, last)
+        b.branch(head)
+        b.position_at_end(after)
+        return phis
+
+    def when(self, condition: Any, body: Callable) -> None:
+        with self._b.if_then(condition):
+            body()
+
+    def elementary(self, name: str, x: Any) -> ir.Value:
+        operations, result = series.elementary(name, self._fused)
+        return emit(self._b, operations, {"x": x})[result]
+
+    def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
+        return emit(self._b, record.scalars, dict(inputs))
+
+
+@cache
+def _version() -> str:
+    """Return a digest of the code that decides what is printed."""
+    modules = (algebra, elementary, lowering, primitives, series, tracing)
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(Machine)
+    return hashlib.sha256(source.encode()).hexdigest()
+
+
+def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
+    """Return ``attempt(rows, at, order, tolerance)``, to be called from compiled code.
+
+    It reads and writes the rows of `Layout`, `lanes` numbers each, that begin at ``rows[at]``; see
+    `Series.attempt`.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped.
+    lanes : int
+        How many steps are taken at once.
+    fused : bool, default True
+        Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
+    """
+    digest = hashlib.sha256(f"{_version()} {record.digest} {lanes} {fused}".encode()).hexdigest()[:16]
+    name = f"attempt_{digest}"
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        first = builder.gep(array.data, [args[1]])
+        function = builder.module.globals.get(name) or _write(builder.module, name, record, lanes, fused)
+        builder.call(function, [first, args[2], args[3]])
+        return context.get_dummy_value()
+
+    @intrinsic
+    def attempt(typingctx, rows, at, order, tolerance):  # type: ignore[no-untyped-def]
+        return types.void(rows, types.int64, types.int64, types.float64), codegen
+
+    attempt.__name__ = name
+    return attempt
+
+
+def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused: bool) -> ir.Function:
+    """Write the function ``name(rows, order, tolerance)`` into a module."""
+    step, layout = Series(record), Layout(record)
+    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT, _DOUBLE])
+    function = ir.Function(module, kind, name)
+    function.linkage = "internal"
+    set.add(function.attributes, "noinline")
+    set.add(function.attributes, '"prefer-vector-width"="512"')
+    rows, order, tolerance = function.args
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    t = Machine(builder, step.slots, lanes, fused)
+
+    def pointer(row: int) -> ir.Value:
+        return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())
+
+    def read(row: int) -> ir.Value:
+        value = builder.load(pointer(row))
+        value.align = 8
+        return value
+
+    def write(row: int, value: ir.Value) -> None:
+        builder.store(value, pointer(row)).align = 8
+
+    n = record.size
+    inputs = {name: read(row) for name, row in layout.inputs.items()}
+    q = [read(layout.q + i) for i in range(n)]
+    v = [read(layout.v + i) for i in range(n)]
+    limit = tolerance if lanes == 1 else primitives.splat(builder, tolerance, lanes)
+    done, used, q, v, bounds = step.attempt(t, inputs, q, v, read(layout.h), order, limit)
+    write(layout.done, builder.select(done, t.number(1.0), t.number(0.0)))
+    write(layout.used, used)
+    for i in range(n):
+        write(layout.q_after + i, q[i])
+        write(layout.v_after + i, v[i])
+        write(layout.bound + i, bounds[i])
+    builder.ret_void()
+    return function
