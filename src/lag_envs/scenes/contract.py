@@ -537,6 +537,71 @@ class Scene(metaclass=SceneType):
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
 
+    def lagrangian(self) -> sympy.Expr:
+        """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
+        from lag_envs.new_lagrange import lagrangian
+
+        return lagrangian(self)
+
+    @staticmethod
+    def from_sympy(
+        name: str,
+        kinetic: Any,
+        potential: Any,
+        *,
+        coordinates: Mapping,
+        controls: Any = (),
+        prescribed: Any = (),
+        dissipation: Any = 0,
+        applied: Any = None,
+        parameters: Any = (),
+    ) -> Scene:
+        """Return a scene of SymPy expressions.
+
+        Parameters
+        ----------
+        name : str
+            Name of its class.
+        kinetic, potential, dissipation : SymPy expression
+            The energies [J], and Rayleigh's function [W].
+        coordinates, prescribed, controls : dict from symbol to str
+            Free and prescribed coordinates and controls with their units. The velocity of a function of time is its
+            derivative, ``theta.diff(t)``, that of a plain symbol ``theta`` the symbol ``theta_dot``.
+        applied : dict from symbol to expression, optional
+            Generalised forces by coordinate.
+        parameters : dict from symbol to float
+            The other symbols with their numbers.
+
+        Returns
+        -------
+        Scene
+            A scene with these numbers. Called with keywords it gives one with other numbers: ``scene(m=2.0)``.
+
+        Examples
+        --------
+        >>> import sympy
+        >>> theta, theta_dot, m, l, tau = sympy.symbols("theta theta_dot m l tau")
+        >>> pendulum = Scene.from_sympy(
+        ...     "Pendulum", m * l**2 * theta_dot**2 / 2, -9.81 * m * l * sympy.cos(theta),
+        ...     coordinates={theta: "rad"}, controls={tau: "N m"}, applied={theta: tau}, parameters={m: 1.0, l: 2.0},
+        ... )
+        >>> pendulum.acceleration([0.0, 0.0], 1.0)["theta"].item(), pendulum(m=0.5).m
+        (0.25, 0.5)
+        """
+        from lag_envs.new_lagrange import from_sympy
+
+        return from_sympy(
+            name,
+            kinetic,
+            potential,
+            coordinates=coordinates,
+            controls=controls,
+            prescribed=prescribed,
+            dissipation=dissipation,
+            applied=applied,
+            parameters=parameters,
+        )
+
     def energy_balance(
         self, state: ArrayLike, control: ArrayLike, dt: float, *, nodes: int = 16
     ) -> dict[str, float]:
