@@ -96,7 +96,7 @@ class ElasticPendulum(Scene):
 class Trolley(Scene):
     """Two pendulums of different length on a driven trolley, whose rate and whose hoist's rate are held."""
 
-    masses: tuple = (0.3, 0.2)
+    masses: tuple = (0.5, 0.25)
     length: float = parameter(0.7, "m", above=0.0)
     short: float = parameter(0.4, "m", above=0.0)
     gravity: float = parameter(9.81, "m/s²", least=0.0)
@@ -110,7 +110,7 @@ class Trolley(Scene):
         first, second = self.masses
         total = 0
         for m, length, name in ((first, self.length + q.h, "alpha"), (second, self.short, "beta")):
-            angle, rate = q[name], v[name]
+            angle, rate = getattr(q, name), getattr(v, name)
             out = v.h if name == "alpha" else 0
             x = v.s + length * rate * xp.cos(angle) + out * xp.sin(angle)
             y = length * rate * xp.sin(angle) - out * xp.cos(angle)
@@ -149,7 +149,7 @@ class Functions(Scene):
         return (1 + q.r**2) * v.theta**4 / 8 + xp.log(1 + v.r**2)
 
     def applied(self, q, v, u, xp):
-        return {"theta": u.torque * xp.cos(q.theta), "r": -xp.tanh(10 * v.r) - xp.pi * v.r**3}
+        return {"theta": u.torque * xp.cos(q.theta), "r": -xp.tanh(10 * v.r) - 3 * v.r**3}
 
 
 ALL = (ChargedParticle, RotatingHoop, RotatingFrame, ElasticPendulum, Trolley, Functions)

@@ -25,8 +25,8 @@ Monomial = tuple[tuple["Atom", int], ...]
 LARGEST_PRODUCT = 4096
 
 
-class FormulaError(TypeError):
-    """A formula does what recorded numbers cannot follow."""
+class FormulaError(TypeError, ValueError):
+    """A scene is not written as it must be: a formula does what recorded numbers cannot follow, or a name is wrong."""
 
 
 class Atom:
@@ -244,10 +244,7 @@ class Expr:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
 
     def __float__(self) -> float:
-        number = self.number
-        if number is None:
-            self._refuse("float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp")
-        return number
+        self._refuse("float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp")
 
     def __int__(self) -> int:
         self._refuse("int()", "a formula must be smooth")
@@ -340,6 +337,8 @@ FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
 def function(name: str, argument: Any) -> Expr:
     """Return a function of an expression."""
     argument = Expr.of(argument)
+    if name == "sqrt":
+        _check_root(argument)
     number = argument.number
     if number is not None:
         try:
@@ -351,6 +350,17 @@ def function(name: str, argument: Any) -> Expr:
         opposite = function(name, -argument)
         return opposite if name == "cos" else -opposite
     return Expr({((Atom("function", name, argument), 1),): 1})
+
+
+def _check_root(argument: Expr) -> None:
+    """Refuse √x² of what moves: it is |x|, and not smooth."""
+    if len(argument.terms) == 1:
+        for atom, n in next(iter(argument.terms)):
+            if n % 2 == 0 and (n // 2) % 2 and any(s.kind != "parameter" for s in Expr.of(atom).symbols()):
+                raise FormulaError(
+                    f"xp.sqrt of the square of {atom.text} is its absolute value; an energy must be smooth: write the "
+                    "number itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+                )
 
 
 def _leads_negative(expr: Expr) -> bool:

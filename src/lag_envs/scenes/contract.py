@@ -251,7 +251,11 @@ class Scene(metaclass=SceneType):
         for name in (*MAPPINGS, *SEQUENCES):
             if name in annotations and not str(annotations[name]).replace("typing.", "").startswith("ClassVar"):
                 # A dataclass would take it for a field; what is wrong is said when the class is used.
-                faults.append(f"{name} has an annotation; write {name} = ... without one")
+                field = isinstance(own.get(name), dataclasses.Field)
+                faults.append(
+                    f"{name} is part of every scene; give the parameter another name" if field
+                    else f"{name} has an annotation; write {name} = ... without one"
+                )
                 del annotations[name]
         if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
             annotations["control"] = "str"
@@ -294,6 +298,7 @@ class Scene(metaclass=SceneType):
         if not known:
             _check_names(self)
             _check_motion(self, self.mechanics)
+            _check_bodies(self)
             _admitted[type(self)].add(key)
 
     def _numbers(self) -> tuple[str, ...]:
@@ -699,6 +704,22 @@ def _check_names(scene: Scene) -> None:
     others = set(layout.controls) - {p.control for p in layout.prescribed}
     for name in sorted(others & {e.name for e in layout.state}):
         raise FormulaError(f"{of}: the control {name!r} has the name of an entry of the state; choose another")
+
+
+def _check_bodies(scene: Scene) -> None:
+    """Raise a FormulaError where a body has no place, or a force no equation."""
+    of, found = type(scene).__name__, scene.mechanics
+    with recording.formula(scene, "bodies"):
+        bodies = scene.bodies()
+    if not isinstance(bodies, Mapping):
+        raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
+    for body in bodies:
+        if body not in found.record.poses:
+            raise FormulaError(f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})")
+    try:
+        found.full  # noqa: B018
+    except FormulaError as error:
+        raise FormulaError(f"{of}.{error}") from error
 
 
 def _check_motion(scene: Scene, found: Mechanics) -> None:
