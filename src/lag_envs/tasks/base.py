@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.base import Scene, check_number
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
+from lag_envs.stepping.flows import Stepper, lift_lines
+from lag_envs.stepping.tracing import Trace
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
@@ -48,6 +50,8 @@ class Task(ABC):
     observation: ClassVar[tuple[str, ...]]
     #: Random targets lie in [-target_range, target_range]; None for a task without target.
     target_range: ClassVar[float | None] = None
+    #: The action without control; with it a person's hands are off.
+    rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
 
@@ -68,7 +72,11 @@ class Task(ABC):
                 "duration",
                 *(["target"] if self.target_range is not None else []),
             ]
-            raise TypeError(f"unknown keyword {unknown[0]!r}; this environment takes {', '.join(options)}")
+            # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
+            raise TypeError(
+                f"got an unexpected keyword argument {unknown[0]!r}; "
+                f"this environment takes {', '.join(options)}"
+            )
         self.scene: Scene = self.scene_type(**(self.defaults | parameters))
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
@@ -125,6 +133,11 @@ class Task(ABC):
 
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Raise ValueError for a start outside the set in which the episode goes on."""
+
+    @property
+    def formulas(self) -> FlowFormulas:
+        """What compiled functions are made of."""
+        return FlowFormulas(self)
 
     # --- the picture ---------------------------------------------------------------------------------------
 
@@ -190,6 +203,67 @@ class Task(ABC):
     @abstractmethod
     def bounds(self) -> Sequence[float]:
         """Return a bound on the size of each observation entry, proved for every start that is accepted."""
+
+
+class FlowFormulas:
+    """The formulas of a task on a scene with a flow of its own, as `lag_envs.envs.program` asks for them."""
+
+    clipped = True
+    actions = controls = 1
+    trace = Trace
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self.state = task.scene.state_names
+        self.observation = task.observation
+        self.draws = task.draws
+        self.targets = 0 if task.target_range is None else 1
+        self.bounded = bool(task.scene.order)
+        self.has_last = type(task).last_reward is not Task.last_reward
+
+    def constants(self) -> dict[str, float]:
+        """Return every number that compiled functions take, by name."""
+        task = self._task
+        start = {f"centre{i}": c for i, c in enumerate(task.centre)}
+        start |= {f"half{i}": h for i, h in enumerate(task.start)}
+        return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+
+    def stepper(self, absent: frozenset[str]) -> Stepper:
+        """Return the code of a control step."""
+        return Stepper(self._task.scene, absent)
+
+    def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the controls that are applied."""
+        return [self._task.control(a[0], y, k, k.dt, xp)]
+
+    def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
+        """Return the reward, and whether the episode is over."""
+        reward = self._task.reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
+        return reward, self._task.terminated(z, k, xp)
+
+    def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that terminates."""
+        return self._task.last_reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
+
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> Sequence:
+        """Return the lifted state after a kick."""
+        return self._task.kick(z, draws, k, xp)
+
+    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> Sequence:
+        """Return the observation."""
+        return self._task.observe(y, g[0] if g else 0.0, k)
+
+    def sample_targets(self, draws: Sequence, k: Any) -> list:
+        """Return targets from draws in [0, 1)."""
+        if not self.targets:
+            return []
+        if self._task.target is not None:
+            return [k["goal"]]
+        return [self._task.target_range * (2.0 * draws[0] - 1.0)]
+
+    def lift(self, y: str) -> list[str]:
+        """Return the lines that complete the lifted state."""
+        return lift_lines(len(self.state), self._task.scene.angle, y)
 
 
 def finite(bound: float) -> float:
