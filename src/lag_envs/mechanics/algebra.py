@@ -354,13 +354,35 @@ def function(name: str, argument: Any) -> Expr:
 
 def _check_root(argument: Expr) -> None:
     """Refuse √x² of what moves: it is |x|, and not smooth."""
-    if len(argument.terms) == 1:
-        for atom, n in next(iter(argument.terms)):
-            if n % 2 == 0 and (n // 2) % 2 and any(s.kind != "parameter" for s in Expr.of(atom).symbols()):
-                raise FormulaError(
-                    f"xp.sqrt of the square of {atom.text} is its absolute value; an energy must be smooth: write the "
-                    "number itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
-                )
+    root = _root(argument)
+    moving = root is not None and any(s.kind != "parameter" for s in root.symbols())
+    if not moving and len(argument.terms) == 1:  # a square times something
+        squares = (a for a, n in next(iter(argument.terms)) if n % 4 == 2)
+        moving = any(s.kind != "parameter" for a in squares for s in Expr.of(a).symbols())
+    if moving:
+        raise FormulaError(
+            f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: write the number "
+            "itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+        )
+
+
+def _root(square: Expr) -> Expr | None:
+    """Return an expression whose square is given, or None where none is seen."""
+    parts: dict[Monomial, Fraction] = {}
+    for monomial, c in square.sorted_terms():
+        whole = Fraction(c)
+        roots = [math.isqrt(n) if n > 0 else 0 for n in (whole.numerator, whole.denominator)]
+        if all(n % 2 == 0 for _, n in monomial) and [r * r for r in roots] == [whole.numerator, whole.denominator]:
+            parts[tuple((a, n // 2) for a, n in monomial)] = Fraction(*roots)
+    root = Expr({})
+    for monomial, c in parts.items():
+        term = Expr({monomial: c})
+        mixed = 2 * root * term
+        opposite = any(square.terms.get(m, 0) == -d for m, d in mixed.terms.items())
+        root = root - term if opposite else root + term
+    # An even power is kept apart from a square that comes by chance: only the whole decides.
+    odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
+    return root if odd and (root * root).same(square) else None
 
 
 def _leads_negative(expr: Expr) -> bool:

@@ -251,11 +251,11 @@ class Scene(metaclass=SceneType):
         for name in (*MAPPINGS, *SEQUENCES):
             if name in annotations and not str(annotations[name]).replace("typing.", "").startswith("ClassVar"):
                 # A dataclass would take it for a field; what is wrong is said when the class is used.
-                field = isinstance(own.get(name), dataclasses.Field)
-                faults.append(
-                    f"{name} is part of every scene; give the parameter another name" if field
-                    else f"{name} has an annotation; write {name} = ... without one"
-                )
+                if isinstance(own.get(name), dataclasses.Field):
+                    faults.append(f"{name} is part of every scene; give the parameter another name")
+                    delattr(cls, name)
+                else:
+                    faults.append(f"{name} has an annotation; write {name} = ... without one")
                 del annotations[name]
         if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
             annotations["control"] = "str"
@@ -417,16 +417,20 @@ class Scene(metaclass=SceneType):
             raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
         return array
 
-    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
-        """Return the motion at states under controls, and the shape of its numbers."""
+    def _check_both(self, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+        """Return states and controls with their last axes, and the shape of what follows from both."""
         states = self._check_states(state)
         controls = self._check_controls(control, states.ndim)
         try:
-            shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+            return states, controls, np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
         except ValueError:
             raise ValueError(
                 f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
             ) from None
+
+    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
+        """Return the motion at states under controls, and the shape of its numbers."""
+        states, controls, shape = self._check_both(state, control)
         columns = [np.moveaxis(array, -1, 0) for array in (states, controls)]
         return Point(self.mechanics, self._symbols(), *columns, Numeric), shape
 
@@ -530,9 +534,7 @@ class Scene(metaclass=SceneType):
         B : ndarray, shape (..., n_state, n_controls)
             ∂(d state/dt)/∂control.
         """
-        states = self._check_states(state)
-        controls = self._check_controls(control, states.ndim)
-        shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+        states, controls, shape = self._check_both(state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
         numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
@@ -693,8 +695,8 @@ def _check_names(scene: Scene) -> None:
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {
         **dict.fromkeys(DEFINED, "part of every scene"),
-        **dict.fromkeys(derived, "a coordinate or its derivative"),
         **dict.fromkeys((e.name for e in layout.state), "an entry of the state"),
+        **dict.fromkeys(derived, "a coordinate or its derivative"),
         **dict.fromkeys((*layout.controls, *layout.absent), "a control"),
     }
     for field in dataclasses.fields(scene):  # type: ignore[arg-type]
