@@ -25,8 +25,8 @@ Monomial = tuple[tuple["Atom", int], ...]
 LARGEST_PRODUCT = 4096
 
 
-class FormulaError(TypeError):
-    """A formula does what recorded numbers cannot follow."""
+class FormulaError(TypeError, ValueError):
+    """A scene is not written as it must be: a formula does what recorded numbers cannot follow, or a name is wrong."""
 
 
 class Atom:
@@ -244,10 +244,7 @@ class Expr:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
 
     def __float__(self) -> float:
-        number = self.number
-        if number is None:
-            self._refuse("float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp")
-        return number
+        self._refuse("float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp")
 
     def __int__(self) -> int:
         self._refuse("int()", "a formula must be smooth")
@@ -340,6 +337,8 @@ FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
 def function(name: str, argument: Any) -> Expr:
     """Return a function of an expression."""
     argument = Expr.of(argument)
+    if name == "sqrt":
+        _check_root(argument)
     number = argument.number
     if number is not None:
         try:
@@ -351,6 +350,39 @@ def function(name: str, argument: Any) -> Expr:
         opposite = function(name, -argument)
         return opposite if name == "cos" else -opposite
     return Expr({((Atom("function", name, argument), 1),): 1})
+
+
+def _check_root(argument: Expr) -> None:
+    """Refuse √x² of what moves: it is |x|, and not smooth."""
+    root = _root(argument)
+    moving = root is not None and any(s.kind != "parameter" for s in root.symbols())
+    if not moving and len(argument.terms) == 1:  # a square times something
+        squares = (a for a, n in next(iter(argument.terms)) if n % 4 == 2)
+        moving = any(s.kind != "parameter" for a in squares for s in Expr.of(a).symbols())
+    if moving:
+        raise FormulaError(
+            f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: write the number "
+            "itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+        )
+
+
+def _root(square: Expr) -> Expr | None:
+    """Return an expression whose square is given, or None where none is seen."""
+    parts: dict[Monomial, Fraction] = {}
+    for monomial, c in square.sorted_terms():
+        whole = Fraction(c)
+        roots = [math.isqrt(n) if n > 0 else 0 for n in (whole.numerator, whole.denominator)]
+        if all(n % 2 == 0 for _, n in monomial) and [r * r for r in roots] == [whole.numerator, whole.denominator]:
+            parts[tuple((a, n // 2) for a, n in monomial)] = Fraction(*roots)
+    root = Expr({})
+    for monomial, c in parts.items():
+        term = Expr({monomial: c})
+        mixed = 2 * root * term
+        opposite = any(square.terms.get(m, 0) == -d for m, d in mixed.terms.items())
+        root = root - term if opposite else root + term
+    # An even power is kept apart from a square that comes by chance: only the whole decides.
+    odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
+    return root if odd and (root * root).same(square) else None
 
 
 def _leads_negative(expr: Expr) -> bool:

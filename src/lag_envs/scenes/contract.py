@@ -23,6 +23,8 @@ from lag_envs.mechanics.evaluation import Carrying, Dual, Numeric, Point
 from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
+from lag_envs.scenes import picture
+from lag_envs.scenes.shapes import Moment, Shape, Window
 
 if TYPE_CHECKING:
     import sympy
@@ -226,6 +228,14 @@ class Scene(metaclass=SceneType):
         """Return shapes of each body in its own frame."""
         return {}
 
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front: the bodies where they are."""
+        return picture.shapes(self, now)
+
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at: around the first body, as far as the others reach."""
+        return picture.window(self, now)
+
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""
 
@@ -241,7 +251,11 @@ class Scene(metaclass=SceneType):
         for name in (*MAPPINGS, *SEQUENCES):
             if name in annotations and not str(annotations[name]).replace("typing.", "").startswith("ClassVar"):
                 # A dataclass would take it for a field; what is wrong is said when the class is used.
-                faults.append(f"{name} has an annotation; write {name} = ... without one")
+                if isinstance(own.get(name), dataclasses.Field):
+                    faults.append(f"{name} is part of every scene; give the parameter another name")
+                    delattr(cls, name)
+                else:
+                    faults.append(f"{name} has an annotation; write {name} = ... without one")
                 del annotations[name]
         if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
             annotations["control"] = "str"
@@ -284,6 +298,7 @@ class Scene(metaclass=SceneType):
         if not known:
             _check_names(self)
             _check_motion(self, self.mechanics)
+            _check_bodies(self)
             _admitted[type(self)].add(key)
 
     def _numbers(self) -> tuple[str, ...]:
@@ -402,16 +417,20 @@ class Scene(metaclass=SceneType):
             raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
         return array
 
-    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
-        """Return the motion at states under controls, and the shape of its numbers."""
+    def _check_both(self, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+        """Return states and controls with their last axes, and the shape of what follows from both."""
         states = self._check_states(state)
         controls = self._check_controls(control, states.ndim)
         try:
-            shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+            return states, controls, np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
         except ValueError:
             raise ValueError(
                 f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
             ) from None
+
+    def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
+        """Return the motion at states under controls, and the shape of its numbers."""
+        states, controls, shape = self._check_both(state, control)
         columns = [np.moveaxis(array, -1, 0) for array in (states, controls)]
         return Point(self.mechanics, self._symbols(), *columns, Numeric), shape
 
@@ -515,9 +534,7 @@ class Scene(metaclass=SceneType):
         B : ndarray, shape (..., n_state, n_controls)
             ∂(d state/dt)/∂control.
         """
-        states = self._check_states(state)
-        controls = self._check_controls(control, states.ndim)
-        shape = np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+        states, controls, shape = self._check_both(state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
         numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
@@ -526,6 +543,71 @@ class Scene(metaclass=SceneType):
         slopes = [rate.slope if isinstance(rate, Dual) else np.zeros(len(unit)) for rate in point.rates()]
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
+
+    def lagrangian(self) -> sympy.Expr:
+        """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
+        from lag_envs.new_lagrange import lagrangian
+
+        return lagrangian(self)
+
+    @staticmethod
+    def from_sympy(
+        name: str,
+        kinetic: Any,
+        potential: Any,
+        *,
+        coordinates: Mapping,
+        controls: Any = (),
+        prescribed: Any = (),
+        dissipation: Any = 0,
+        applied: Any = None,
+        parameters: Any = (),
+    ) -> Scene:
+        """Return a scene of SymPy expressions.
+
+        Parameters
+        ----------
+        name : str
+            Name of its class.
+        kinetic, potential, dissipation : SymPy expression
+            The energies [J], and Rayleigh's function [W].
+        coordinates, prescribed, controls : dict from symbol to str
+            Free and prescribed coordinates and controls with their units. The velocity of a function of time is its
+            derivative, ``theta.diff(t)``, that of a plain symbol ``theta`` the symbol ``theta_dot``.
+        applied : dict from symbol to expression, optional
+            Generalised forces by coordinate.
+        parameters : dict from symbol to float
+            The other symbols with their numbers.
+
+        Returns
+        -------
+        Scene
+            A scene with these numbers. Called with keywords it gives one with other numbers: ``scene(m=2.0)``.
+
+        Examples
+        --------
+        >>> import sympy
+        >>> theta, theta_dot, m, l, tau = sympy.symbols("theta theta_dot m l tau")
+        >>> pendulum = Scene.from_sympy(
+        ...     "Pendulum", m * l**2 * theta_dot**2 / 2, -9.81 * m * l * sympy.cos(theta),
+        ...     coordinates={theta: "rad"}, controls={tau: "N m"}, applied={theta: tau}, parameters={m: 1.0, l: 2.0},
+        ... )
+        >>> pendulum.acceleration([0.0, 0.0], 1.0)["theta"].item(), pendulum(m=0.5).m
+        (0.25, 0.5)
+        """
+        from lag_envs.new_lagrange import from_sympy
+
+        return from_sympy(
+            name,
+            kinetic,
+            potential,
+            coordinates=coordinates,
+            controls=controls,
+            prescribed=prescribed,
+            dissipation=dissipation,
+            applied=applied,
+            parameters=parameters,
+        )
 
     def energy_balance(
         self, state: ArrayLike, control: ArrayLike, dt: float, *, nodes: int = 16
@@ -613,8 +695,8 @@ def _check_names(scene: Scene) -> None:
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {
         **dict.fromkeys(DEFINED, "part of every scene"),
-        **dict.fromkeys(derived, "a coordinate or its derivative"),
         **dict.fromkeys((e.name for e in layout.state), "an entry of the state"),
+        **dict.fromkeys(derived, "a coordinate or its derivative"),
         **dict.fromkeys((*layout.controls, *layout.absent), "a control"),
     }
     for field in dataclasses.fields(scene):  # type: ignore[arg-type]
@@ -624,6 +706,22 @@ def _check_names(scene: Scene) -> None:
     others = set(layout.controls) - {p.control for p in layout.prescribed}
     for name in sorted(others & {e.name for e in layout.state}):
         raise FormulaError(f"{of}: the control {name!r} has the name of an entry of the state; choose another")
+
+
+def _check_bodies(scene: Scene) -> None:
+    """Raise a FormulaError where a body has no place, or a force no equation."""
+    of, found = type(scene).__name__, scene.mechanics
+    with recording.formula(scene, "bodies"):
+        bodies = scene.bodies()
+    if not isinstance(bodies, Mapping):
+        raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
+    for body in bodies:
+        if body not in found.record.poses:
+            raise FormulaError(f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})")
+    try:
+        found.full  # noqa: B018
+    except FormulaError as error:
+        raise FormulaError(f"{of}.{error}") from error
 
 
 def _check_motion(scene: Scene, found: Mechanics) -> None:
