@@ -25,7 +25,12 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def load_task(place: str) -> type[Task]:
-    """Return the task class at "module:Class"."""
+def load_task(place: str | type[Any]) -> type[Any]:
+    """Return the task class at "module:Class"; a class as it is."""
+    if isinstance(place, type):
+        return place
     module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
+    found: Any = import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
