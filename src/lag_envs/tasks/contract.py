@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 import math
 import numbers
 from collections.abc import Mapping, Sequence
@@ -95,7 +96,7 @@ class Task:
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}")
-        known = [f.name for f in dataclasses.fields(kind)]  # type: ignore[arg-type]
+        known = list(inspect.signature(kind).parameters)
         for name in sorted(set(parameters) - set(known)):
             options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else [])]
             raise TypeError(f"unknown keyword {name!r}; this environment takes {', '.join(options)}")
@@ -153,6 +154,9 @@ class Task:
 
     def chance(self, per_interval: float) -> float:
         """Return a step's chance of what has a chance per interval, so that a second has as many for any `dt`."""
+        recorded = vars(self).get("_recorded_chance")
+        if recorded is not None:
+            return recorded(per_interval)
         return -math.expm1(self.dt / self.interval * math.log1p(-per_interval))
 
     @property
@@ -242,6 +246,7 @@ class TaskFormulas:
 
     def __init__(self, task: Task) -> None:
         self._task = task
+        self._chances: dict[float, str] = {}
         scene = task.scene
         self.state = scene.state_names
         self._controls = scene.control_names
@@ -272,6 +277,7 @@ class TaskFormulas:
             found[f"centre{i}"], found[f"half{i}"] = self._starts[name]
         if task.fixed_target is not None:
             found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
+        found |= {name: task.chance(p) for p, name in self._chances.items()}
         found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
         return found | {"x": float(scene._order(task.dt))}
 
@@ -301,6 +307,7 @@ class TaskFormulas:
         names = self._task.scene._numbers()
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
         task.dt = k.dt
+        vars(task)["_recorded_chance"] = lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
         return task
 
     def _state(self, y: Sequence) -> Values:
