@@ -153,6 +153,19 @@ class Task(ABC):
         """Return the part of the plane to look at [m]."""
         return self.scene.window(now)
 
+    def share(self, control: float) -> float:
+        """Return the control as a share of the largest one."""
+        return control / self.limit_control
+
+    def turning(self, state: Sequence[float]) -> float:
+        """Return the rate of a coordinate that the picture shows and the state leaves out."""
+        return self.scene.turning(state)
+
+    def control_readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells of the control."""
+        name, _, unit = self.scene.control_unit.rstrip("]").partition(" [")
+        return [Reading(name, now.control, unit, "action")]
+
     def readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells besides state and control."""
         if now.target is None:

@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes import picture
 from lag_envs.scenes.contract import Scene, check_number, real_array
+from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
 
 #: Unless a task says otherwise, starts given by hand may be this fast at most [rad/s or m/s].
@@ -216,6 +218,42 @@ class Task:
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "formulas"}
+
+    # --- the picture ---------------------------------------------------------------------------------------
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front: the scene, and what matters to the task."""
+        return self.scene.shapes(now)
+
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at [m]."""
+        return self.scene.window(now)
+
+    def share(self, control: Any) -> Any:
+        """Return controls as shares of their largest sizes."""
+        largest = {a.control: max(abs(a.low), abs(a.high)) for a in self.formulas.acting}
+        shares = [
+            float(value) / largest[name] if name in largest else 0.0
+            for name, value in zip(self.scene.control_names, np.atleast_1d(control), strict=True)
+        ]
+        return shares[0] if len(shares) == 1 else shares
+
+    def turning(self, state: Sequence[float]) -> Any:
+        """Return the rates of the coordinates that the state leaves out."""
+        return np.array(picture.turning(self.scene, state))
+
+    def control_readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells of the controls."""
+        names = zip(self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True)
+        return [Reading(name, float(value), unit, "action") for name, value, unit in names]
+
+    def readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells besides state and controls: the targets."""
+        given = [] if now.target is None else np.atleast_1d(now.target)
+        return [
+            Reading(t.name, float(value), t.unit, "target")
+            for t, value in zip(self.formulas.target_boxes, given, strict=False)
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
