@@ -25,6 +25,15 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
+def __getattr__(name: str) -> Any:
+    """Return `Task`, from which a task of one's own derives; it is loaded when it is asked for."""
+    if name == "Task":
+        from lag_envs.tasks.contract import Task
+
+        return Task
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 def load_task(place: str | type[Any]) -> type[Any]:
     """Return the task class at "module:Class"; a class as it is."""
     if isinstance(place, type):
