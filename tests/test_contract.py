@@ -340,11 +340,21 @@ def test_free_place_may_be_left_out():
 
 
 def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same():
-    assert "damping" not in RotaryPendulum().mechanics.text
-    damped = RotaryPendulum(damping=0.1).mechanics
-    assert "damping" in damped.text and "arm_damping" not in damped.text
-    assert damped.text == RotaryPendulum(damping=0.2, mass=3.0).mechanics.text
-    assert damped.key == RotaryPendulum(damping=0.3).mechanics.key != RotaryPendulum().mechanics.key
+    """In a denominator or a function it is put in at once; elsewhere code leaves out what it multiplies."""
+    damped = RotaryPendulum(damping=0.1)
+    assert damped.mechanics.key == RotaryPendulum(damping=0.2, mass=3.0).mechanics.key
+    assert RotaryPendulum()._code() is not damped._code() is RotaryPendulum(damping=0.2, mass=3.0)._code()
+
+    class Soft(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+        slope: float = parameter(0.0, "N", least=0.0)
+
+        def potential(self, q, xp):
+            return self.spring * xp.sqrt(1 + q.x**2 + self.width * q.x**4) + self.slope * q.x
+
+    assert "width" in Soft().mechanics.text and "width" not in Soft(width=0.0).mechanics.text
+    assert Soft(width=0.1).mechanics.key == Soft(width=0.2).mechanics.key != Soft(width=0.0).mechanics.key
+    assert Soft(width=0.0).acceleration([1.0, 0.0])["x"] == pytest.approx(-math.sqrt(2.0))
 
 
 def test_what_rests_leaves_no_code():

@@ -41,9 +41,7 @@ def constants_of(task: Any) -> dict[str, float]:
 
 def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
     """Return the program of a task: the same for all tasks that differ in their numbers only."""
-    values = (getattr(task.scene, field.name) for field in dataclasses.fields(task.scene))
-    choices = tuple(math.isinf(v) if isinstance(v, float) else repr(v) for v in values)
-    key = (type(task), type(task.scene), choices, task.variant, absent, varying)
+    key = (type(task), type(task.scene), task.formulas.key, absent, varying)
     if key not in _programs:
         _programs[key] = Program(task, absent, varying)
     return _programs[key]
@@ -303,8 +301,8 @@ class Program:
                 *_store(_at, self.u), *(f"{_at(row)} = {name}" for name, row in rows.items()),
             ]  # fmt: skip
             after = [f"{name} = {_at(rows[name])}" for name in self._stepper.results]
-            start = f"np.uint64({len(self.uniform)})"
-            call = f"advance_block(par, {start}, size, k_dt, {self._x})"
+            start, dt = f"np.int64({len(self.uniform)})", "k_dt"
+            call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
             moving = [*_block(lane, before), call]
             move = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
             again = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish]

@@ -114,7 +114,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             progress, if there is one, is left as it is.
         """
         state, target = start_options(options)
-        given_state = None if state is None else self.task.check_start(state)
+        given_state = None if state is None else self.task.start_state(state)
         given_target = None if target is None else np.atleast_1d(self.task.check_target(target))
         super().reset(seed=seed)
         if seed is not None:
@@ -250,7 +250,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
         )
         if status < 0:
-            raise self.scene.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
         for name, value in zip(program.u, held, strict=True):
             rows[self._row[name]] = value
         for name, value in zip(program.z, end, strict=True):
@@ -306,8 +306,10 @@ def absent(constants: list[dict[str, float]]) -> frozenset[str]:
 
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that holds the observations of all the tasks."""
-    high = np.max([np.asarray(task.bounds()) for task in tasks], axis=0).astype(np.float32)
-    return gym.spaces.Box(-high, high, dtype=np.float32)
+    boxes = [task.formulas.box() for task in {id(task): task for task in tasks}.values()]
+    low = np.min([low for low, _ in boxes], axis=0).astype(np.float32)
+    high = np.max([high for _, high in boxes], axis=0).astype(np.float32)
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def check_render_mode(mode: str | None) -> None:

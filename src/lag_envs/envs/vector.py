@@ -176,7 +176,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         seeds = self._check_seeds(seed)
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([self._tasks[i].check_start(state[i]) for i in lanes])
+            state = np.array([self._tasks[i].start_state(state[i]) for i in lanes])
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
@@ -363,7 +363,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
         control = self.control[i]
-        error = self._tasks[i].scene.refusal(self.state[i], control, self.task.dt, None, where)
+        error = self._tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
         error.results = results
         return error
 

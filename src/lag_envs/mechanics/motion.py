@@ -21,11 +21,11 @@ from lag_envs.mechanics.recording import Record, control, parameter
 
 @dataclasses.dataclass(frozen=True)
 class Mechanics:
-    """The equations of motion of a scene, for its mode, its structural fields and its parameters that are 0.
+    """The equations of motion of a scene, for its mode and its structural fields.
 
     The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. Symbols in these are places and
     velocities of the free coordinates, places and velocities of prescribed ones whose acceleration is
-    controlled, places of those whose rate is, controls, and parameters that are not 0. A held acceleration,
+    controlled, places of those whose rate is, controls, and parameters. A held acceleration,
     rate or place stands as the control that sets it.
 
     Attributes
@@ -41,6 +41,9 @@ class Mechanics:
     coupling : dict
         For a prescribed coordinate m whose rate is held, entries G_im of the mass matrix by (i, name of m):
         the state carries w = v + M⁻¹ Σ_m G_im ṡ_m.
+    zeros : tuple of str
+        Parameters that are 0 and stand in a denominator or a function: they were put in before anything was
+        derived. Others that are 0 leave out their terms when code is made.
     """
 
     layout: Layout
@@ -48,6 +51,7 @@ class Mechanics:
     mass: Mapping[tuple[int, int], Expr]
     force: tuple[Expr, ...]
     coupling: Mapping[tuple[int, str], Expr]
+    zeros: tuple[str, ...] = ()
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -187,7 +191,11 @@ def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
         Where they are not what an energy may be, or need a coordinate that the state leaves out.
     """
     of = type(scene).__name__
-    zero = {parameter(name): Expr.of(0) for name in scene._numbers() if getattr(scene, name) == 0.0}
+    zero = {
+        parameter(name): Expr.of(0)
+        for name in scene._numbers()
+        if getattr(scene, name) == 0.0 and any(_is_hard(e, name) for e in found.exprs())
+    }
     if zero:
         names = ", ".join(f"{atom.name}=0" for atom in zero)
         found = recording.restrict(found, zero, scene, f"with {names}")
@@ -214,7 +222,16 @@ def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
     mass = {(i, j): entry for (i, j), entry in equations.mass.items() if j < n}
     force = [substitute(f, held) for f in force]
     _check_left_out(of, layout, {**{k: e for k, e in mass.items()}, **coupling}, force)
-    return Mechanics(layout, found, mass, tuple(force), coupling)
+    return Mechanics(layout, found, mass, tuple(force), coupling, tuple(sorted(atom.name for atom in zero)))
+
+
+def _is_hard(expr: Expr, name: str) -> bool:
+    """Tell whether a parameter stands in a denominator or in a function."""
+    return any(
+        n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
+        for monomial in expr.terms
+        for atom, n in monomial
+    )
 
 
 def _check_left_out(of: str, layout: Layout, mass: Mapping, force: list[Expr]) -> None:

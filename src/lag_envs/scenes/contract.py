@@ -25,10 +25,13 @@ from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture
+from lag_envs.scenes.base import StepRefused
 from lag_envs.scenes.shapes import Moment, Shape, Window
 
 if TYPE_CHECKING:
     import sympy
+
+    from lag_envs.stepping.general import SeriesStepper, StepBound, StepCode
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=type)
@@ -568,6 +571,150 @@ class Scene(metaclass=SceneType):
         slopes = [rate.slope if isinstance(rate, Dual) else np.zeros(len(unit)) for rate in point.rates()]
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
+
+    # --- what follows: steps -------------------------------------------------------------------------------
+
+    @property
+    def _stepper(self) -> SeriesStepper:
+        from lag_envs.stepping.general import stepper_of
+
+        return stepper_of(self.mechanics)
+
+    def _constants(self) -> dict[str, float]:
+        """Return the numbers that a step needs, made from the parameters."""
+        found = vars(self).get("_cached_constants")
+        if found is None:
+            found = self._stepper.constants({name: getattr(self, name) for name in self._numbers()})
+            for name, value in found.items():
+                if not math.isfinite(value):
+                    raise ValueError(
+                        f"these parameters make a coefficient of the motion, {name}, {value}: {self}"
+                    )
+            vars(self)["_cached_constants"] = found
+        return found
+
+    def _order(self, dt: float) -> int:
+        """Return the order of the series for a control step."""
+        from lag_envs.stepping.general import usual_order
+
+        return usual_order(dt)
+
+    def _code(self) -> StepCode:
+        return self._stepper.code(
+            frozenset(name for name, value in self._constants().items() if value == 0.0)
+        )
+
+    def simulate(self, state: ArrayLike, controls: ArrayLike | int, dt: float) -> Array:
+        """Step the equations of motion with each control held for one step.
+
+        Parameters
+        ----------
+        state : array_like, shape (n_state,)
+            Start, in the order of `state_names`.
+        controls : array_like, shape (T,) or (T, n_controls); int for a scene without controls
+            One set of controls per step, neither clipped nor guarded; or the number of steps.
+        dt : float
+            Length of a step [s].
+
+        Returns
+        -------
+        ndarray of float64, shape (T + 1, n_state)
+            The states, ``[0]`` being the start.
+
+        Raises
+        ------
+        ValueError
+            For a state, control or step that is not finite or has the wrong shape, or a step not above 0.
+        StepRefused
+            Where a step cannot be certified within the cap on substeps, or has no finite result. Its attribute
+            `trajectory` holds the rows before that.
+        """
+        start, dt = self._check_state(state), check_step(dt)
+        given = self._check_sequence(controls)
+        trajectory = np.empty((len(given) + 1, len(start)))
+        trajectory[0] = start
+        code, constants = self._code(), self._constants()
+        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+        row = code.simulation(trajectory, given, dt, float(self._order(dt)), *numbers)
+        if row:
+            raise self._refusal(
+                trajectory[row - 1], given[row - 1], dt, trajectory[:row], f"step {row - 1} of {len(given)}"
+            )
+        return trajectory
+
+    def _check_sequence(self, controls: ArrayLike | int) -> Array:
+        """Return controls as an array of shape (T, n_controls), or raise a ValueError."""
+        n = len(self.control_names)
+        if n == 0:
+            if isinstance(controls, bool) or not isinstance(controls, int | np.integer) or controls < 0:
+                raise ValueError(
+                    f"this scene has no control: give the number of steps in place of controls, got {controls!r:.60}"
+                )
+            return np.empty((int(controls), 0))
+        array = real_array("controls", controls)
+        if array.ndim == 1 and n == 1:
+            array = array[:, None]
+        if array.ndim != 2 or array.shape[1] != n:
+            wanted = "(T,)" if n == 1 else f"(T, {n}), in each row {', '.join(self.control_names)}"
+            raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
+        bad = ~np.isfinite(array)
+        if bad.any():
+            raise ValueError(
+                f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}"
+            )
+        return array
+
+    def step_bound(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> StepBound:
+        """Return how a control step is divided, and what its series leave out at most.
+
+        Parameters
+        ----------
+        state : array_like, shape (n_state,)
+            Where the step begins.
+        control : array_like, shape (n_controls,) or ()
+            The controls that are held.
+        dt : float
+            Length of the step [s].
+
+        Returns
+        -------
+        StepBound
+            Substeps, order, and for each entry of the state a proved bound on the truncation error, summed over
+            the substeps; rounding, and the growth of earlier substeps' errors along the motion, come on top.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As `simulate` does.
+        """
+        from lag_envs.stepping.general import StepBound
+
+        start, dt = self._check_state(state), check_step(dt)
+        held = self._check_controls(control, 1).reshape(-1)
+        code, constants = self._code(), self._constants()
+        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+        order = self._order(dt)
+        status, bounds = code.bounded(start, held, dt, order, numbers)
+        if status < 0:
+            raise self._refusal(start, held, dt, None, "the step")
+        of = {("place", name): bounds[0][i] for i, name in enumerate(self._layout.free)}
+        of |= {("velocity", name): bounds[1][i] for i, name in enumerate(self._layout.free)}
+        by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in self._layout.state}
+        return StepBound(status, order, by_state, "proved with the step")
+
+    def _refusal(
+        self, state: Array, control: ArrayLike, dt: float, trajectory: Array | None, where: str
+    ) -> StepRefused:
+        """Return the error for a step that was refused."""
+        start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
+        held = zip(self.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
+        error = StepRefused(
+            f"{where} was refused: from ({start}) with {', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and "
+            f"dt={dt:g} s it could not be certified within the largest number of substeps, or has no finite result; "
+            "take a smaller dt or milder parameters"
+        )
+        error.trajectory = None if trajectory is None else trajectory.copy()
+        return error
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""

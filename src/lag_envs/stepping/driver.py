@@ -66,19 +66,23 @@ def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-d
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
     Row r of lane i lies at ``memory[base + r * BLOCK + i]``: inputs, places, velocities as in an attempt, and after
-    them the status: the number of attempts, negative where the lane was refused.
+    them the status: the number of attempts, negative where the lane was refused. A lane whose status is negative
+    to begin with is left alone.
     """
     rows = np.empty(size * LANES)
     remaining = np.empty(BLOCK)
     wishes = np.empty(BLOCK)
     lane = np.empty(BLOCK, np.int64)
     status = base + (q + 2 * n) * BLOCK
+    going = 0
     for i in range(count):
         remaining[i] = dt
         wishes[i] = dt
-        memory[status + i] = 0.0
-        lane[i] = i
-    going, refused, first_round = count, 0, True
+        if memory[status + i] >= 0.0:
+            memory[status + i] = 0.0
+            lane[going] = i
+            going += 1
+    refused, first_round = 0, going == count
     while going > 0:
         kept = 0
         for first in range(0, going, LANES):

@@ -197,6 +197,8 @@ class ElementaryTrace(Trace):
         """Return the arc tangent."""
         return atan(a, self)
 
+    arctan = atan
+
     def tanh(self, a: Any) -> Any:
         """Return the hyperbolic tangent."""
         return tanh(a, self)

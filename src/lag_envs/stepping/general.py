@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
-from lag_envs.stepping.driver import BLOCK, compile_advance, compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import Lowering, SeriesRecord
-from lag_envs.stepping.machine import Layout
 from lag_envs.stepping.series import TOLERANCE
 
 
@@ -50,6 +51,7 @@ class SeriesStepper:
         self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
+        self._codes: dict[frozenset[str], StepCode] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
     # --- constants -------------------------------------------------------------------------------------------
@@ -143,7 +145,9 @@ class SeriesStepper:
 
     def code(self, absent: frozenset[str] = frozenset()) -> StepCode:
         """Return the step without the terms of constants that are zero."""
-        return StepCode(self, self._lowering.without(*self._parts, absent), absent)
+        if absent not in self._codes:
+            self._codes[absent] = StepCode(self, self._lowering.without(*self._parts, absent), absent)
+        return self._codes[absent]
 
 
 def _solve(matrix: Sequence[Sequence], right: Sequence) -> list:
@@ -160,6 +164,27 @@ def _solve(matrix: Sequence[Sequence], right: Sequence) -> list:
             b[i] = b[i] - a[i][j] * b[j]
         b[i] = b[i] / a[i][i]
     return b
+
+
+class StepBound(NamedTuple):
+    """How a control step is divided, and what its series leave out.
+
+    Attributes
+    ----------
+    substeps : int
+        Number of attempts that the step took; 1 where the first one was certified as a whole.
+    order : int
+        Order of the series.
+    bounds : dict of str to float
+        For each entry of the state a bound on the truncation error, in its unit.
+    kind : str
+        ``"proved with the step"``, or ``"proved before the step"``.
+    """
+
+    substeps: int
+    order: int
+    bounds: dict[str, float]
+    kind: str
 
 
 class StepCode:
@@ -226,10 +251,14 @@ class StepCode:
         used = " ".join([*self.prepare, *self.finish, *self._inputs])
         self.constants = [value for value in given.values() if isinstance(value, str) and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()]
         self.rows = [*self._inputs, *q, *v, "status"]
+        #: Those of them that the rest of the step needs afterwards.
+        self.results = [*q, *v, "status"]
 
     @property
     def scratch(self) -> int:
         """Numbers that `compile` needs in its array of rows."""
+        from lag_envs.stepping.machine import Layout
+
         return Layout(self.record).rows + 2 * self._n
 
     @property
@@ -243,6 +272,9 @@ class StepCode:
         The status is the number of attempts, or negative where the step is refused. In `rows`, `scratch`
         numbers long, the sums of the substeps' bounds on places and velocities are left at the end.
         """
+        from lag_envs.stepping.driver import compile_advance
+        from lag_envs.stepping.machine import Layout
+
         layout = Layout(self.record)
         n = self._n
         body = [
@@ -251,7 +283,7 @@ class StepCode:
             *(f"rows[{i}] = {name}" for i, name in enumerate(self._inputs) if name != "start_elapsed"),
             *(f"rows[{layout.q + i}] = q{i}" for i in range(n)),
             *(f"rows[{layout.v + i}] = v{i}" for i in range(n)),
-            "status = advance_lane(rows, dt, order)",
+            "status = advance_lane(rows, dt, np.int64(order))",
             *(f"q{i} = rows[{layout.q + i}]" for i in range(n)),
             *(f"v{i} = rows[{layout.v + i}]" for i in range(n)),
             *self.finish,
@@ -259,8 +291,28 @@ class StepCode:
         ]
         return compile_function("advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance))
 
+    def bounded(
+        self, state: Sequence[float], controls: Sequence[float], dt: float, order: int, constants: Sequence[float]
+    ) -> tuple[int, tuple[Any, Any]]:
+        """Take a step; return its status, and the sums of bounds on places and velocities."""
+        rows = np.zeros(self.scratch)
+        *_, status = self._advance(rows, *state, *controls, dt, float(order), *constants)
+        n = self._n
+        return status, (rows[-2 * n : -n], rows[-n:])
+
+    @cached_property
+    def _advance(self) -> Callable:
+        return self.compile()
+
+    @cached_property
+    def simulation(self) -> Callable:
+        """What `compile_simulate` makes."""
+        return self.compile_simulate()
+
     def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``advance_block(memory, base, count, dt, order)`` on `rows` of BLOCK lanes."""
+        from lag_envs.stepping.driver import compile_advance_block
+
         return compile_advance_block(self.record, tolerance)
 
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
@@ -270,7 +322,7 @@ class StepCode:
         """
         extra = "".join(f", {name}" for name in self.constants)
         loop = [
-            *(f"u{i} = controls[i, {i}]" for i in range(len(self.controls))),
+            *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
             f"{', '.join(self.start)}, status = advance({self.arguments})",
             "if status < 0:",
             "    return i + 1",
@@ -287,4 +339,16 @@ class StepCode:
         return compile_function("simulate", "\n    ".join(body) + "\n", self.compile(tolerance))
 
 
-__all__ = ["BLOCK", "SeriesStepper", "StepCode"]
+_steppers: dict[str, SeriesStepper] = {}
+
+
+def stepper_of(mechanics: Mechanics) -> SeriesStepper:
+    """Return the stepper of these equations of motion; equal ones share it."""
+    if mechanics.key not in _steppers:
+        _steppers[mechanics.key] = SeriesStepper(mechanics)
+    return _steppers[mechanics.key]
+
+
+def usual_order(dt: float) -> int:
+    """Return the order of the series for a control step [s], unless a scene is given another."""
+    return 16 if dt <= 0.03 else 20 if dt <= 0.1 else 22

@@ -16,6 +16,7 @@ Three things happen on the way:
 from __future__ import annotations
 
 import math
+import numbers
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
@@ -138,6 +139,21 @@ class Number:
 
     def __neg__(self) -> Any:
         return self.trace.record("neg", self)
+
+    def __pos__(self) -> Any:
+        return self
+
+    def __abs__(self) -> Any:
+        return self.trace.record("abs", self)
+
+    def __pow__(self, exponent: Any) -> Any:
+        if isinstance(exponent, bool) or not isinstance(exponent, numbers.Real) or exponent != int(exponent):
+            raise TypeError(f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others")
+        power: Any = 1.0
+        for bit in bin(abs(int(exponent)))[2:]:
+            power = power * power
+            power = power * self if bit == "1" else power
+        return power if exponent >= 0 else 1.0 / power
 
     def __lt__(self, other: Any) -> Any:
         return self.trace.record("<", self, other)
@@ -269,6 +285,8 @@ class Trace:
         ]
 
     # The functions that a formula may call, named as in NumPy.
+
+    pi = math.pi
 
     def where(self, condition: Any, a: Any, b: Any) -> Any:
         """Select elementwise."""

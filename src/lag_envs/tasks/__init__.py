@@ -25,7 +25,21 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def load_task(place: str) -> type[Task]:
-    """Return the task class at "module:Class"."""
+def __getattr__(name: str) -> Any:
+    """Return `Task`, from which a task of one's own derives; it is loaded when it is asked for."""
+    if name == "Task":
+        from lag_envs.tasks.contract import Task
+
+        return Task
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def load_task(place: str | type[Any]) -> type[Any]:
+    """Return the task class at "module:Class"; a class as it is."""
+    if isinstance(place, type):
+        return place
     module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
+    found: Any = import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.scenes.base import Scene, check_number
+from lag_envs.scenes.base import Scene, StepRefused, check_number
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.flows import Stepper, lift_lines
 from lag_envs.stepping.tracing import Trace
@@ -134,6 +134,10 @@ class Task(ABC):
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Raise ValueError for a start outside the set in which the episode goes on."""
 
+    def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
+        """Return a given start, checked; see `check_start`."""
+        return self.check_start(state)
+
     @property
     def formulas(self) -> FlowFormulas:
         """What compiled functions are made of."""
@@ -148,6 +152,19 @@ class Task(ABC):
     def window(self, now: Moment) -> Window:
         """Return the part of the plane to look at [m]."""
         return self.scene.window(now)
+
+    def share(self, control: float) -> float:
+        """Return the control as a share of the largest one."""
+        return control / self.limit_control
+
+    def turning(self, state: Sequence[float]) -> float:
+        """Return the rate of a coordinate that the picture shows and the state leaves out."""
+        return self.scene.turning(state)
+
+    def control_readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells of the control."""
+        name, _, unit = self.scene.control_unit.rstrip("]").partition(" [")
+        return [Reading(name, now.control, unit, "action")]
 
     def readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells besides state and control."""
@@ -221,6 +238,22 @@ class FlowFormulas:
         self.targets = 0 if task.target_range is None else 1
         self.bounded = bool(task.scene.order)
         self.has_last = type(task).last_reward is not Task.last_reward
+
+    @property
+    def key(self) -> tuple:
+        """What decides the code: tasks of a class that agree in it differ in their numbers only."""
+        scene = self._task.scene
+        values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
+        return *(math.isinf(v) if isinstance(v, float) else repr(v) for v in values), self._task.variant
+
+    def refusal(self, *arguments: Any) -> StepRefused:
+        """Return the error for a step that was refused."""
+        return self._task.scene.refusal(*arguments)
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return the lowest and highest values of the observation's entries."""
+        high = list(self._task.bounds())
+        return [-b for b in high], high
 
     def constants(self) -> dict[str, float]:
         """Return every number that compiled functions take, by name."""
