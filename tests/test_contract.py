@@ -332,6 +332,9 @@ def test_free_place_may_be_left_out():
 
     scene = Coasting()
     assert scene.state_names == ("x_dot", "theta", "theta_dot")
+    whole = type("Whole", (Coasting,), {"left_out": ()})()
+    path = whole.simulate([5.0, 1.0, 0.2, 0.3], 3, 0.02)
+    np.testing.assert_array_equal(scene.simulate([1.0, 0.2, 0.3], 3, 0.02), path[:, 1:])
     A, B = scene.linearise([1.0, 0.2, 0.3])
     assert A.shape == (3, 3) and B.shape == (3, 0)
 

@@ -141,6 +141,15 @@ class SceneType(ABCMeta):
         return signature.replace(parameters=list(signature.parameters.values())[1:])
 
 
+def _annotations(cls: type) -> dict[str, Any]:
+    """Return the class's own annotations; from Python 3.14 on they may name what is not there yet."""
+    if sys.version_info >= (3, 14):
+        import annotationlib
+
+        return dict(annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF))
+    return dict(inspect.get_annotations(cls))
+
+
 def _complete(cls: type) -> None:
     """Make the class a frozen dataclass, unless a decorator has."""
     if cls is Scene:
@@ -260,7 +269,7 @@ class Scene(metaclass=SceneType):
                 and "__dataclass_fields__" not in vars(parent)
             ):
                 _complete(parent)
-        own, annotations = vars(cls), dict(inspect.get_annotations(cls))
+        own, annotations = vars(cls), _annotations(cls)
         faults = []
         for name in (*MAPPINGS, *SEQUENCES):
             if name in annotations and not str(annotations[name]).replace("typing.", "").startswith(
@@ -277,7 +286,7 @@ class Scene(metaclass=SceneType):
             annotations["control"] = "str"
             if "control" not in own:
                 cls.control = next(iter(own["modes"]))  # type: ignore[attr-defined]
-        if annotations != inspect.get_annotations(cls):
+        if annotations != _annotations(cls):
             cls.__annotations__ = annotations
         for name in MAPPINGS:
             if isinstance(own.get(name), Mapping):
@@ -315,6 +324,7 @@ class Scene(metaclass=SceneType):
             ) from error
         if not known:
             _check_names(self)
+            recording.check_again(self, self._layout, recording.record(self, self._layout))
             _check_motion(self, self.mechanics)
             _check_bodies(self)
             _admitted[type(self)].add(key)
@@ -872,7 +882,7 @@ def _check_names(scene: Scene) -> None:
                 f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
                 "dissipation and applied, from which these follow"
             )
-        for name in (*inspect.get_annotations(c), *vars(c)):
+        for name in (*_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
     layout = scene._layout
@@ -922,8 +932,8 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
     symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
     seen = []
     with np.errstate(all="ignore"):
-        for _ in range(16):
-            at = values | {symbol: generator.uniform(0.1, 1.5) for symbol in symbols}
+        for low, high in ((0.1, 1.5), (-3.0, 3.0), (0.01, 0.1), (1.0, 10.0)) * 4:
+            at = values | {symbol: generator.uniform(low, high) for symbol in symbols}
             matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
             if not np.isfinite(matrix).all():
                 continue
