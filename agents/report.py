@@ -479,7 +479,7 @@ def adapter() -> str:
         ours, theirs = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
         rows.append([row["kind"], str(row["num_envs"]), ours, theirs, f"{row['ratio'][1]:.1f}"])
     text = (
-        f"`make_sb3_vec_env` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
+        f"`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
         f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
     )

@@ -376,3 +376,30 @@ def test_dashes_cover_the_line():
 def test_numbers_keep_their_width():
     assert rendering._number(-1.5) == "−1.500"
     assert rendering._number(123456.0) == "1.23e+05"
+
+
+# --- playing by hand ---
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
+    """Gymnasium's play, as it is called without arguments: keys are pressed, then the window is closed."""
+    from gymnasium.utils.play import play
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make(env_id, render_mode="rgb_array")
+    down, up = pygame.KEYDOWN, pygame.KEYUP
+    script = [(down, "a"), (down, "d"), (up, "a"), (down, "x"), (up, "d"), (pygame.QUIT, "")]
+    rest = env.unwrapped.task.rest_action
+    played = []
+
+    def press(before, after, action, reward, terminated, truncated, info):
+        played.append(action.tolist())
+        kind, key = script[len(played) - 1]
+        pygame.event.post(pygame.event.Event(kind, {"key": ord(key)} if key else {}))
+
+    play(env, callback=press, seed=1, fps=1000)
+    assert played == [[rest], [-1.0], [rest], [1.0], [1.0], [rest]]
+    env.reset(seed=1)
+    env.step(np.array([rest], dtype=np.float32))
+    assert env.unwrapped.control == 0.0

@@ -310,6 +310,24 @@ def run_report(args: argparse.Namespace) -> int:
         raise UserError(str(error)) from error
 
 
+# --- hyperparams ---
+
+
+def declare_hyperparams(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``hyperparams``."""
+    parser.add_argument("learner", metavar="LEARNER", help="ppo, sac, td3, tqc or dqn")
+
+
+def run_hyperparams(args: argparse.Namespace) -> int:
+    """Print the hyperparameters of a learner."""
+    from lag_envs.hyperparams import HYPERPARAMS, learners
+
+    if args.learner not in learners():
+        raise UserError(f"there is no learner {args.learner!r}; {hint(args.learner, learners())}")
+    print((HYPERPARAMS / f"{args.learner}.yml").read_text(encoding="utf-8"), end="")
+    return 0
+
+
 # --- leaderboard, verify, export ---
 
 
@@ -418,6 +436,20 @@ examples:
   lag-envs report --sections bound,stability maps    two parts, into the folder maps""",
         declare_report,
         run_report,
+    ),
+    Command(
+        "hyperparams",
+        "print hyperparameters for the RL Zoo",
+        """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the form of
+the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with.
+
+examples:
+  lag-envs hyperparams ppo > ppo.yml
+  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
+  python -m rl_zoo3.enjoy --algo ppo --env PivotedBar-v0 --gym-packages lag_envs -f logs
+  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs""",
+        declare_hyperparams,
+        run_hyperparams,
     ),
     Command(
         "export",

@@ -48,6 +48,8 @@ class Task(ABC):
     observation: ClassVar[tuple[str, ...]]
     #: Random targets lie in [-target_range, target_range]; None for a task without target.
     target_range: ClassVar[float | None] = None
+    #: The action without control; with it a person's hands are off.
+    rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
 
@@ -68,7 +70,11 @@ class Task(ABC):
                 "duration",
                 *(["target"] if self.target_range is not None else []),
             ]
-            raise TypeError(f"unknown keyword {unknown[0]!r}; this environment takes {', '.join(options)}")
+            # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
+            raise TypeError(
+                f"got an unexpected keyword argument {unknown[0]!r}; "
+                f"this environment takes {', '.join(options)}"
+            )
         self.scene: Scene = self.scene_type(**(self.defaults | parameters))
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:

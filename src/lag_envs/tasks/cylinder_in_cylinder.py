@@ -472,6 +472,7 @@ class Damping(Task):
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
+    rest_action = -1.0
 
     def check(self) -> None:
         """Refuse the other control, and a scene without a field."""

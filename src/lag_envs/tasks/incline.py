@@ -327,6 +327,7 @@ class Brake(Task):
     defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
     observation = ("distance", "v")
     limit_control = 6.0
+    rest_action = -1.0
     gentle = 0.5
 
     def check(self) -> None:
