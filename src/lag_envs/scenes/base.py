@@ -395,15 +395,27 @@ class Scene(ABC):
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
-        y, u, k = (
-            self.lift(self.check_state(state)),
-            check_number("control", control),
-            SimpleNamespace(**self.constants()),
-        )
-        coefficients = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
-        return pendulum.truncation_bound(
-            float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order
-        )
+        omega, drive = self._pendulum(state, control)
+        return pendulum.truncation_bound(omega, drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def certified_speed(self, state: ArrayLike, control: float, dt: float) -> float | None:
+        """Return the |θ'| up to which one series per step is certified, if the rest is as given [rad/s].
+
+        Up to it, and not beyond, `truncation_bound` reports one substep and at most 1e-12 rad/s left out. It is
+        below 0 where drive, drag or field are too strong for one series at any speed, and None for a scene
+        that is not stepped by one.
+        """
+        if self.flow.coefficients is not pendulum.Drive:
+            return None
+        _, drive = self._pendulum(state, control)
+        return pendulum.certified_speed(drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def _pendulum(self, state: ArrayLike, control: float) -> tuple[float, pendulum.Drive]:
+        """Return θ' and the coefficients of the normal form."""
+        y, u = self.lift(self.check_state(state)), check_number("control", control)
+        k = SimpleNamespace(**self.constants())
+        drive = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
+        return float(self.unpack(y, u, k)[1]), drive
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""

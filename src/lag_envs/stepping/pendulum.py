@@ -171,6 +171,15 @@ def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> fl
     return x * (1.0 - 1e-14)
 
 
+def certified_speed(drive: Drive, dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
+    """Return the |θ'| up to which one series is enough [rad/s]; below 0 where it never is."""
+    x = largest_x(dt, order, tolerance)
+    if not certified(0.0, drive, dt, x, np):
+        return -1.0
+    speed = x / dt
+    return speed if speed * dt <= x else math.nextafter(speed, 0.0)
+
+
 class Bound(NamedTuple):
     """What is known before a step is taken."""
 
