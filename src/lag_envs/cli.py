@@ -117,10 +117,9 @@ def _description(task: Task) -> list[str]:
 
 def _parameter(field: dataclasses.Field, scene: Any) -> tuple[str, str, str]:
     value, meta = getattr(scene, field.name), field.metadata
-    rules = [(word, meta.get(word)) for word in ("above", "least", "below")]
-    rule = ", ".join(
-        f"{'at least' if word == 'least' else word} {limit:g}" for word, limit in rules if limit is not None
-    )
+    words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
+    rules = ((word, meta.get(key)) for key, word in words.items())
+    rule = ", ".join(f"{word} {limit:g}" for word, limit in rules if limit is not None)
     shown = f"{value:.6g} {meta.get('unit', '')}" if isinstance(value, float) else repr(value)
     return f"  {field.name}", shown.rstrip(), rule
 
