@@ -2,9 +2,10 @@
 
 An episode is recorded as it comes out of ``gym.make``: its float64 states, and the controls that were
 applied. From the same start, under the same controls, the exact states are computed to more than 30 digits by
-chaining control steps whose states are not rounded in between; for the error of one step every step of the
-episode is taken again by itself, from the state that was recorded. Ours are computed by `reference`. Gymnasium's
-equations are typed in here, and solved by Taylor series in integers that share no code with the product.
+chaining control steps whose states are not rounded in between. For the error of one step, every step of the
+episode is taken again by itself, from the state that was recorded. Ours are computed by `reference`.
+Gymnasium's equations are typed in here, and solved by Taylor series in integers that share no code with the
+product.
 """
 
 from __future__ import annotations

@@ -401,9 +401,9 @@ class Scene(ABC):
     def certified_speed(self, state: ArrayLike, control: float, dt: float) -> float | None:
         """Return the |θ'| up to which one series per step is certified, if the rest is as given [rad/s].
 
-        Up to it, and not beyond, `truncation_bound` reports one substep and at most 1e-12 rad/s left out. It is
-        below 0 where drive, drag or field are too strong for one series at any speed, and None for a scene
-        that is not stepped by one.
+        Up to it, and not beyond, `truncation_bound` reports one substep, which leaves out at most 1e-12
+        rad/s. It is below 0 where drive, drag or field are too strong for one series at any speed, and None
+        for a scene that is not stepped by one.
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
@@ -456,7 +456,7 @@ NO_LOAD = 1e-12
 
 
 def friction_ratio(friction: Any, normal: Any, weight: float) -> Any:
-    """Return |F|/N; infinite where the contact pulls or carries nothing, up to a rounding of the weight [N]."""
+    """Return |F|/N; infinite where the contact pulls, or carries nothing but a rounding of the weight."""
     friction, normal = np.broadcast_arrays(np.abs(friction), normal)
     out = np.full(normal.shape, np.inf)
     return np.divide(friction, normal, out=out, where=normal > NO_LOAD * weight)[()]

@@ -17,6 +17,9 @@ called; the pair (cos, sin) is turned by the step's angle with two short polynom
 With κ = x/2 the series x/(1-κτ) and G/(1-κτ)² then satisfy the same recurrences with >= in place of =, so
 |W_k| <= xκ^k for every k. A series cut off after W_N leaves out at most xκ^(N+1)/(1-κ) of hθ', and
 at most xκ^(N+1)/((1-κ)(N+2)) of θ.
+
+Where one series is not enough the step is divided. What many substeps add up is computed with twice the
+digits (`substep`), and where damping is heavy most of them are spared by following the slow manifold.
 """
 
 from __future__ import annotations
@@ -116,9 +119,8 @@ def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = O
 def substep(w: Twofold, c: Twofold, s: Twofold, drive: Drive, order: int = ORDER) -> tuple:
     """Return hθ', cosθ and sinθ after one of many steps, and by how much θ changes, with twice the digits.
 
-    Of many equal steps the errors add up, at best like a random walk, and where a pendulum swings to and fro
-    they become errors of its energy, so of its rate, and their effect grows with time. So each of them
-    has to be more exact than a float.
+    Errors of many steps add up, at best like a random walk. They change a pendulum's energy, so its rate, and
+    that its phase, more and more with time. So each step has to be more exact than a float.
 
     Parameters
     ----------
@@ -129,13 +131,12 @@ def substep(w: Twofold, c: Twofold, s: Twofold, drive: Drive, order: int = ORDER
     order : int
         The highest coefficient of the series.
     """
-    leading, _ = taylor_coefficients(w, c, s, drive, TWOFOLD)
-    plain, _ = taylor_coefficients(w.high, c.high, s.high, Drive(*(x.high for x in drive)), order)
-    coefficients = [*leading, pairwise_sum(plain[TWOFOLD + 1 :])]
-    change = pairwise_sum(coefficients[1:])
-    turns = [x * (1.0 / (k + 1)) for k, x in enumerate([*leading, *plain[TWOFOLD + 1 :]])]
-    angle = pairwise_sum([*turns[: TWOFOLD + 1], pairwise_sum(turns[TWOFOLD + 1 :])])
-    return w + change, *rotate(c, s, angle, partial(mixed_polynomial, twofold=3)), angle
+    large, _ = taylor_coefficients(w, c, s, drive, min(TWOFOLD, order))
+    W, _ = taylor_coefficients(w.high, c.high, s.high, Drive(*(x.high for x in drive)), order)
+    W[: len(large)] = large
+    angle = pairwise_sum([x * (1.0 / (k + 1)) for k, x in enumerate(W)])
+    c, s = rotate(c, s, angle, partial(mixed_polynomial, twofold=3))
+    return pairwise_sum(W), c, s, angle
 
 
 def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
@@ -241,27 +242,27 @@ def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order, tolerance):  # 
     return np.ceil(max(2.0, max(n, 5.0 * half)))
 
 
-def _divide(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, n):  # type: ignore[no-untyped-def]
+def _divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, n):  # type: ignore[no-untyped-def]
     """Advance by dt in n equal substeps; return θ, θ', cosθ, sinθ."""
     h = dt / n
     h_low = fma(-h, n, dt) / n
-    step = scale(omega, alpha, beta, gamma, delta, ramp, h, h_low)
-    w, w_low = step[0], step[1]
+    scaled = scale(omega, alpha, beta, gamma, delta, ramp, h, h_low)
+    w, w_low = scaled[0], scaled[1]
     c_low = s_low = turned = turned_low = 0.0
     for i in range(int(n)):
-        w, w_low, c, c_low, s, s_low, turned, turned_low = fine(
-            w, w_low, c, c_low, s, s_low, turned, turned_low, *step[2:], float(i)
+        w, w_low, c, c_low, s, s_low, turned, turned_low = substep(
+            w, w_low, c, c_low, s, s_low, turned, turned_low, *scaled[2:], float(i)
         )
     omega = w / h
     return theta + turned, omega + (fma(-omega, h, w) + (w_low - omega * h_low)) / h, c, s
 
 
-def _slow(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  # type: ignore[no-untyped-def]
+def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  # type: ignore[no-untyped-def]
     """Advance by dt along the slow manifold in n equal substeps; return θ, θ', cosθ, sinθ.
 
-    There θ' is the rate that drive and drag alone lead to, known in closed form, and another part V due to
-    the field. In one substep V = -(P + V')/Γ holds with a series of its own. Solved by sweeps, each of
-    which gains a factor of about |θ'|/gamma.
+    There θ' is the drift that drive and drag alone lead to, known in closed form, plus a part V due to the
+    field. In a substep V = -(P + V')/Γ has a series of its own. It is found by sweeps, each of which gains a
+    factor of about |θ'|/gamma.
     """
     h = dt / n
     a, b, g = alpha * h * h, beta * h * h, gamma * h
@@ -314,11 +315,12 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
         return theta + angle, fma(change, 1.0 / dt, omega), c, s, 1
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
-    # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then jump along the
-    # slow manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2, with and
-    # without drive. Without a field the drift is all there is.
+    # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then follow the slow
+    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. Where the
+    # field is nothing beside the push, the drift is all there is.
+    drift = field <= 1e-18 * push
     layer = dt
-    if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (field == 0.0 or push <= 1e-2 * gamma * gamma):
+    if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or push <= 1e-2 * gamma * gamma):
         layer = (40.0 + math.log(max(1.0, abs(omega) + (field + push) / gamma))) / gamma
     slow = layer < 0.5 * dt
     if not slow:
@@ -327,15 +329,17 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     m = 0.0
     if slow:
         m = 1.0
-        if field > 0.0:
+        if not drift:
             m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
     # A substep along the slow manifold costs as much as 50 others.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         return theta, omega, c, s, -1
-    theta, omega, c, s = divide(theta, omega, c, s, alpha, beta, gamma, delta, ramp, layer, n)
+    theta, omega, c, s = divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, layer, n)
     if slow:
-        push = delta + ramp * layer
-        theta, omega, c, s = along(theta, c, s, alpha, beta, gamma, push, ramp, dt - layer, m, order)
+        if drift:
+            alpha = beta = 0.0
+        delta += ramp * layer
+        theta, omega, c, s = slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order)
     if not (abs(theta) < math.inf and abs(omega) < math.inf):
         return theta, omega, c, s, -2
     return theta, omega, c, s, int(n + m)
@@ -375,36 +379,35 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
         absent,
     )
     count = compile_python("_substeps", _substeps, compile_python("_rate", _rate))
-    divide, along = _compile_divide(order), compile_python("along", _slow)
+    divided, slow_motion = _compile_divided(order), compile_python("slow_motion", _slow_motion)
     limits = {"TOLERANCE": tolerance, "MAX_SUBSTEPS": MAX_SUBSTEPS}
-    return compile_python("flow", _flow, holds, series, count, divide, along, order=order, **limits)
+    return compile_python("flow", _flow, holds, series, count, divided, slow_motion, order=order, **limits)
 
 
 @cache
-def _compile_divide(order: int) -> Callable:
-    """Compile `_divide` once for all pendulums: many substeps are in no haste, and what is zero adds nothing."""
+def _compile_divided(order: int) -> Callable:
+    """Compile `_divided` once for all pendulums; what is zero adds nothing."""
     coefficients = ", ".join(Drive._fields)
     pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Drive._fields))
-    scale = compile_traced("scale", f"omega, {coefficients}, h, h_low", lambda xp, *numbers: _scale(*numbers))
-    fine = compile_traced("fine", f"{pairs}, i", lambda xp, *numbers: _fine(order, *numbers))
-    return compile_python("divide", _divide, scale, fine)
 
+    def scale(xp: Any, omega: Any, *numbers: Any) -> tuple:
+        *drive, h, h_low = numbers
+        step = Twofold(h, h_low)
+        return parts(step * omega, *scaled(Drive(*map(Twofold, drive)), step))
 
-def _scale(omega: Any, *numbers: Any) -> tuple:
-    """Return hθ' and the scaled coefficients, each as two floats, from plain ones and a twofold h."""
-    *coefficients, h, h_low = numbers
-    step = Twofold(h, h_low)
-    return _parts(step * omega, *scaled(Drive(*map(Twofold, coefficients)), step))
+    def one(xp: Any, *numbers: Any) -> tuple:
+        *halves, i = numbers
+        w, c, s, turned, *drive = map(Twofold, halves[::2], halves[1::2])
+        a, b, gamma, d, r = drive
+        w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
+        return parts(w, c, s, turned + angle)
 
+    def parts(*numbers: Twofold) -> tuple:
+        return tuple(part for number in numbers for part in number.parts())
 
-def _fine(order: int, *numbers: Any) -> tuple:
-    """Advance (hθ', cosθ, sinθ, angle turned), each as two floats, by the substep with the number i."""
-    *pairs, i = numbers
-    w, c, s, turned, *drive = (Twofold(*pairs[k : k + 2]) for k in range(0, len(pairs), 2))
-    a, b, gamma, d, r = drive
-    w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
-    return _parts(w, c, s, turned + angle)
-
-
-def _parts(*numbers: Twofold) -> tuple:
-    return tuple(part for number in numbers for part in number.parts())
+    return compile_python(
+        "divided",
+        _divided,
+        compile_traced("scale", f"omega, {coefficients}, h, h_low", scale),
+        compile_traced("substep", f"{pairs}, i", one),
+    )

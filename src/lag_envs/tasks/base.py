@@ -117,7 +117,7 @@ class Task(ABC):
 
     @property
     def edges(self) -> Sequence[Sequence[float]]:
-        """States at the edge of what the task reaches, as far as entries other than θ and θ' drive the motion."""
+        """States at the edge of what the task reaches, in all that drives the motion but θ and θ'."""
         return [self.centre]
 
     def certified_speed(self) -> float | None:
