@@ -49,7 +49,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 def _line(id: str) -> tuple[str, ...]:
     task = _task(id)
-    low, high = _controls(task)
+    low, high = task.control_range
     name, _, unit = task.scene.control_unit.partition(" [")
     control = f"{name} {low:g} to {high:g} {unit.rstrip(']')}".rstrip()
     return (
@@ -76,7 +76,7 @@ def run_info(args: argparse.Namespace) -> int:
 
     task = _task(_known(args.id))
     scene = task.scene
-    low, high = _controls(task)
+    low, high = task.control_range
     text = [args.id, "", *_description(task)]
     text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
     states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
@@ -117,10 +117,9 @@ def _description(task: Task) -> list[str]:
 
 def _parameter(field: dataclasses.Field, scene: Any) -> tuple[str, str, str]:
     value, meta = getattr(scene, field.name), field.metadata
-    rules = [(word, meta.get(word)) for word in ("above", "least", "below")]
-    rule = ", ".join(
-        f"{'at least' if word == 'least' else word} {limit:g}" for word, limit in rules if limit is not None
-    )
+    words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
+    rules = ((word, meta.get(key)) for key, word in words.items())
+    rule = ", ".join(f"{word} {limit:g}" for word, limit in rules if limit is not None)
     shown = f"{value:.6g} {meta.get('unit', '')}" if isinstance(value, float) else repr(value)
     return f"  {field.name}", shown.rstrip(), rule
 
@@ -135,31 +134,18 @@ def _own_parameters(task: Task) -> list[tuple[str, ...]]:
 
 def _accuracy(task: Task) -> list[str]:
     """Say what is proved of a step with the largest control, and how far one substep goes."""
-    scene, angle = task.scene, task.scene.angle
-    low, high = _controls(task)
-
-    def bound(speed: float | None = None) -> Any:
-        """Return the bound of the worse of the two controls, from the farthest start or at a given θ'."""
-        state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
-        if speed is not None and angle is not None:
-            state[angle + 1] = speed
-        bounds = [scene.truncation_bound(state, u, task.dt) for u in (low, high)]
-        return max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
-
-    first = bound()
-    if first is None:
+    scene = task.scene
+    edge = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+    bounds = [scene.truncation_bound(edge, u, task.dt) for u in task.control_range]
+    first = max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
+    speed = task.certified_speed()
+    if first is None or speed is None:
         return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
-    near, far = 0.0, 1e4
-    if bound(near).substeps > 1:
+    reach = "no step is certified for a single substep: the number follows from the bound before each step"
+    if speed >= 0.0:
+        shown = math.floor(10.0 * speed) / 10.0
         reach = (
-            "no step is certified for a single substep: the number follows from the bound before each step"
-        )
-    else:
-        for _ in range(60):
-            middle = 0.5 * (near + far)
-            near, far = (middle, far) if bound(middle).substeps == 1 else (near, middle)
-        reach = (
-            f"one substep is certified up to |theta_dot| = {near:.3g} rad/s; above, the bound tells how many"
+            f"one substep is certified up to |theta_dot| = {shown:g} rad/s; above, the bound tells how many"
         )
     return [
         f"Taylor series of order {first.order}",
@@ -578,20 +564,6 @@ def _task(id: str) -> Task:
 
     place, fixed = TASKS[id]
     return load_task(place)(**fixed)
-
-
-def _controls(task: Task) -> tuple[float, float]:
-    """Return the controls of the actions -1 and 1 at the centre of the starts."""
-    from types import SimpleNamespace
-
-    import numpy as np
-
-    from lag_envs.envs.program import constants_of
-
-    k = SimpleNamespace(**constants_of(task))
-    y = task.scene.lift(np.asarray(task.centre, dtype=np.float64))
-    low, high = (float(task.control(a, y, k, task.dt, np)) for a in (-1.0, 1.0))
-    return low, high
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:

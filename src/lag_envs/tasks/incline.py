@@ -278,7 +278,7 @@ class Brake(Task):
     | radius | 0.05 | m | rolling radius R |
     | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
     | damping | 0 | N s/m | constant drag; adds to the brake |
-    | tilt | 0.261799 | rad | the slope φ, 0 or more and below π/2 |
+    | tilt | 0.261799 | rad | the slope φ, from 0 to π/2 |
     | gravity | 9.81 | m/s² | field g, downward |
     | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
     | duration | 10 | s | length of an episode, `math.inf` for one without an end |
