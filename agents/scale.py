@@ -1,27 +1,37 @@
 """Measure the mean returns that `lag_envs.scores` and the leaderboard's `REFERENCES` are set to.
 
-``python -m agents.scale`` prints, for each environment, what random actions, the reference and the best
-policy known return, beside the numbers in use. A policy that takes long plays 1,000 episodes, less its luck
-in them as far as the reference tells (`ranking.corrected`).
+``python -m agents.scale`` plays, for each environment, random actions, the board's reference and the best
+policy known, and prints means and standard errors beside the numbers in use; all of it in the same starts. A
+policy that takes long plays the first 1,000 of these episodes only: what it gets there above the reference is
+added to what the reference gets in all. `agents/results/scale.json` keeps the numbers (``--output``).
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import math
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
+from agents.analysis import rounded
 from agents.evaluate import evaluate_batch
 from agents.optimum import Optimal
-from agents.run import UserError, check_env
+from agents.results import to_json
+from agents.run import UserError, check_env, write
 from lag_envs import TASKS
-from lag_envs.controllers import make_controller
+from lag_envs.benchmark import machine
+from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.leaderboard.protocol import REFERENCES
-from lag_envs.leaderboard.ranking import corrected
 from lag_envs.scores import KNOWN_RETURNS
+
+Array = NDArray[np.float64]
 
 #: Seeds of nobody else; episodes that are played together, and of policies that take long.
 FIRST_SEED, BATCH, FEW = 4_000_000_000, 65_536, 1_000
@@ -29,11 +39,12 @@ SLOW = ("iLQR", "optimal")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 for an environment that does not exist."""
+    """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
-    p.add_argument("--batches", type=int, default=1, help=f"of {BATCH:,} episodes (default %(default)s)")
+    p.add_argument("--batches", type=int, default=8, help=f"of {BATCH:,} episodes (default %(default)s)")
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
+    p.add_argument("--output", type=Path, metavar="FILE", help="keep the numbers as JSON")
     args = p.parse_args(arguments)
     try:
         envs = [check_env(name) for name in args.env] or list(TASKS)
@@ -42,39 +53,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"agents.scale: error: {error}", file=sys.stderr)
         return 2
-    for env_id in envs:
-        known = KNOWN_RETURNS[env_id]
-        reference, mean = REFERENCES.get(env_id, (None, None))
-        show(env_id, "random", many(env_id, "random", args.batches), known.random)
-        if reference is not None:
-            show(env_id, reference, many(env_id, reference, args.batches), mean)
-        if known.policy in SLOW and not args.quick:
-            show(env_id, known.policy, few(env_id, known.policy, reference), known.best)
-        elif known.policy not in (*SLOW, reference):
-            show(env_id, known.policy, many(env_id, known.policy, args.batches), known.best)
+    found = {env_id: measured(env_id, args.batches, args.quick) for env_id in envs}
+    if args.output:
+        about = {"date": datetime.date.today().isoformat(), "machine": machine(), "first_seed": FIRST_SEED}
+        write(args.output, to_json(about | {"envs": rounded(found)}))
     return 0
 
 
-def many(env_id: str, name: str, batches: int) -> np.ndarray:
+def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
+    """Measure an environment's policies, and print a line for each.
+
+    Returns
+    -------
+    dict
+        By policy ``mean``, standard ``error`` and the ``episodes`` that it played; for ``InclineBrake-v0``
+        also of the ``optimum``.
+    """
+    known = KNOWN_RETURNS[env_id]
+    reference, used = REFERENCES.get(env_id, (None, None))[:2]
+    found: dict[str, Any] = {}
+
+    def show(name: str, mean: float, error: float, episodes: int, used: float | None) -> None:
+        found[name] = {"mean": mean, "error": error, "episodes": episodes}
+        print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}   in use: {used}", flush=True)
+
+    quickly = {"random": known.random, reference: used, known.policy: known.best}
+    played = {}
+    for name, value in quickly.items():
+        if name is not None and name not in SLOW:
+            played[name] = many(env_id, name, batches)
+            show(name, *mean_and_error(played[name]), len(played[name]), value)
+    if known.policy in SLOW and not quick:
+        agent = Optimal(env_id) if known.policy == "optimal" else make_controller(env_id, known.policy)
+        returns = evaluate_batch(env_id, agent, FIRST_SEED, FEW)
+        mean, error = mean_and_error(returns)
+        if reference is not None:
+            ahead, error = mean_and_error(returns - played[reference][:FEW])
+            mean, its = mean_and_error(played[reference])
+            mean, error = mean + ahead, math.hypot(error, its)
+        show(known.policy, mean, error, FEW, known.best)
+    if env_id == "InclineBrake-v0":
+        best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
+        show("optimum", *mean_and_error(best), len(best), known.upper)
+    return found
+
+
+def many(env_id: str, name: str, batches: int) -> Array:
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
     firsts = (FIRST_SEED + k * BATCH for k in range(batches))
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 
-def few(env_id: str, name: str, reference: str | None) -> np.ndarray:
-    """Return a slow policy's returns, without its luck."""
-    agent = Optimal(env_id) if name == "optimal" else make_controller(env_id, name)
-    played = {"returns": evaluate_batch(env_id, agent, FIRST_SEED, FEW)}
-    if reference is not None:
-        played["reference"] = evaluate_batch(env_id, make_controller(env_id, reference), FIRST_SEED, FEW)
-    return corrected(env_id, [played])[0]
+def optima(first: int) -> Array:
+    """Return the largest returns of a batch of the braking task."""
+    envs = gym.make_vec("InclineBrake-v0", BATCH)
+    envs.reset(seed=first)
+    bare: Any = envs.unwrapped
+    best = optimal_return(bare.task, *bare.state.T)
+    envs.close()
+    return best
 
 
-def show(env_id: str, name: str, returns: np.ndarray, used: float | None) -> None:
-    """Print a line."""
-    error = returns.std() / math.sqrt(len(returns))
-    print(f"{env_id:28} {name:20} {returns.mean():10.4f} ± {error:.4f}   in use: {used}", flush=True)
+def mean_and_error(returns: Array) -> tuple[float, float]:
+    """Return the mean and its standard error."""
+    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(len(returns))
 
 
 if __name__ == "__main__":
