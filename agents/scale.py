@@ -1,9 +1,10 @@
 """Measure the mean returns that `lag_envs.scores` and the leaderboard's `REFERENCES` are set to.
 
 ``python -m agents.scale`` plays, for each environment, random actions, the board's reference and the best
-policy known, and prints means and standard errors beside the numbers in use; all of it in the same starts. A
-policy that takes long plays the first 1,000 of these episodes only: what it gets there above the reference is
-added to what the reference gets in all. `agents/results/scale.json` keeps the numbers (``--output``).
+policy known, and prints means and standard errors beside the numbers in use; all of it from the same starts.
+A policy that takes long plays the first of these episodes only, and the luck in them is taken out by what the
+reference gets there and in all (a control variate). ``agents/results/scale.json`` keeps the numbers
+(``--output``), and README shows them.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from lag_envs.scores import KNOWN_RETURNS
 
 Array = NDArray[np.float64]
 
-#: Seeds of nobody else; episodes that are played together, and of policies that take long.
-FIRST_SEED, BATCH, FEW = 4_000_000_000, 65_536, 1_000
-SLOW = ("iLQR", "optimal")
+#: Seeds of nobody else; episodes that are played together; those of policies that take long.
+FIRST_SEED, BATCH = 4_000_000_000, 65_536
+SLOW = {"iLQR": 1_000, "optimal": 16_384}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -85,13 +86,8 @@ def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
             show(name, *mean_and_error(played[name]), len(played[name]), value)
     if known.policy in SLOW and not quick:
         agent = Optimal(env_id) if known.policy == "optimal" else make_controller(env_id, known.policy)
-        returns = evaluate_batch(env_id, agent, FIRST_SEED, FEW)
-        mean, error = mean_and_error(returns)
-        if reference is not None:
-            ahead, error = mean_and_error(returns - played[reference][:FEW])
-            mean, its = mean_and_error(played[reference])
-            mean, error = mean + ahead, math.hypot(error, its)
-        show(known.policy, mean, error, FEW, known.best)
+        returns = evaluate_batch(env_id, agent, FIRST_SEED, SLOW[known.policy])
+        show(known.policy, *without_luck(returns, played.get(reference)), len(returns), known.best)
     if env_id == "InclineBrake-v0":
         best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
         show("optimum", *mean_and_error(best), len(best), known.upper)
@@ -113,6 +109,26 @@ def optima(first: int) -> Array:
     best = optimal_return(bare.task, *bare.state.T)
     envs.close()
     return best
+
+
+def without_luck(returns: Array, reference: Array | None) -> tuple[float, float]:
+    """Return mean and standard error of returns in the first of the episodes that a reference played.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> luck = np.random.default_rng(0).normal(size=10_000)
+    >>> mean, error = without_luck(5.0 + 2.0 * luck[:100], luck)
+    >>> abs(mean - 5.0) < 0.05, error < 0.03
+    (True, True)
+    """
+    if reference is None:
+        return mean_and_error(returns)
+    same = reference[: len(returns)]
+    slope = float(np.cov(returns, same)[0, 1] / same.var(ddof=1))
+    rest, its = mean_and_error(returns - slope * same)
+    mean, error = mean_and_error(reference)
+    return rest + slope * mean, math.hypot(its, slope * error)
 
 
 def mean_and_error(returns: Array) -> tuple[float, float]:

@@ -110,11 +110,11 @@ class SwitchingLine(Law):
 def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     """Return the largest return of the braking task: what no policy exceeds, however often it acts.
 
-    Of all motions that cross the line at a given speed, the one that rolls freely and then brakes fully is the
-    fastest at every place: before the switch nothing is faster, and after it nothing that still gets down to
-    that speed. So only the place of the switch is sought. The later it is, the more speed is left at the line,
-    and the less a further m/s there saves, while its price stays: one place is best. A policy that holds its
-    brake for a step at a time comes close, by braking partly in the step with the switch.
+    Of all motions that cross the line at a given speed, the one that rolls freely and then brakes fully is
+    the fastest at every place: before the switch nothing is faster, and after it nothing that still gets
+    down to that speed. So only the place of the switch is sought. The later it is, the more speed is left at
+    the line, and the less a further m/s there saves, while its price stays: one place is best. A policy that
+    holds its brake for a step at a time comes close, by braking partly in the step with the switch.
 
     Parameters
     ----------
