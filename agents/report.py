@@ -21,6 +21,7 @@ NOTES = Path(__file__).with_name("notes.toml")
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 OPTIMA = Path(__file__).with_name("results") / "optimum"
 BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
+SCALE = Path(__file__).with_name("results") / "scale.json"
 DOCS = Path(__file__).parents[1] / "docs"
 
 # --- figures -----------------------------------------------------------------------------------------------
@@ -279,17 +280,14 @@ def summary(data: Data) -> str:
         for name, agent in env["agents"].items():  # the best first
             text = f"{labelled(name, agent)}: {with_interval(agent['conditions'][NOMINAL])}"
             best.setdefault(agent["kind"], text)
-        known = KNOWN_RETURNS[env_id]
-        optimum = "" if known.upper is None else f"; optimum {known.upper:g}"
         rows.append(
             [
                 f"`{env_id}`",
-                f"{known.random:g}",
-                f"{known.best:g} ± {known.error:g}{optimum}",
+                *(f"{value:g}" for value in env["known"] or ("", "")),
                 *(best.get(kind, "") for kind in ("classical", "learned", "optimal")),
             ]
         )
-    head = ["environment", "random", "best known ± standard error"]
+    head = ["environment", "score 0", "score 1"]
     head += [f"best {kind} agent: score" for kind in ("classical", "learned")] + ["optimal policy: score"]
     return table(head, rows)
 
@@ -320,9 +318,19 @@ def _range(env_id: str, env: Data) -> str:
     if env["known"] is None:
         return "No range is set for scores; the numbers are mean returns."
     random, best = env["known"]
-    known = KNOWN_RETURNS.get(env_id)
-    error = f" ± {known.error:g} ({known.policy})" if known is not None and known.best == best else ""
-    return f"Mean return of random actions {random:g}, best known {best:g}{error}."
+    text = f"Score 0 is a mean return of {random:g}, score 1 one of {best:g}."
+    found = json.loads(SCALE.read_text(encoding="utf-8"))["envs"].get(env_id) if SCALE.exists() else None
+    if not found or env_id not in KNOWN_RETURNS:
+        return text
+    policy = KNOWN_RETURNS[env_id].policy
+    measured = [
+        f"{what} {plus_minus(row['mean'], row['error'])} in {row['episodes']:,} episodes"
+        for what, row in (
+            ("random actions", found["random"]),
+            (f"{policy}, the best policy known,", found[policy]),
+        )
+    ]
+    return f"{text} Measured (`python -m agents.scale`): {'; '.join(measured)}."
 
 
 def _env_table(env: Data, episodes: int) -> str:

@@ -90,7 +90,7 @@ def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
         show(known.policy, *without_luck(returns, played.get(reference)), len(returns), known.best)
     if env_id == "InclineBrake-v0":
         best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
-        show("optimum", *mean_and_error(best), len(best), known.upper)
+        show("optimum", *mean_and_error(best), len(best), known.optimum)
     return found
 
 

@@ -582,8 +582,8 @@ def markdown(report: dict[str, Any]) -> str:
     ]
     machine, settings = report["machine"], report["settings"]
     parts = [
-        "Time of a step, and how many times as fast that is as one of as many of Gymnasium's `CartPole-v1`:"
-        f" medians of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
+        "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
+        f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
         f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
         "\n".join("| " + " | ".join(line) + " |" for line in lines),
     ]
@@ -604,6 +604,7 @@ def claim(report: dict[str, Any]) -> str:
     ranges = ", ".join(
         f"{place} {ratios[0]:.1f} to {ratios[-1]:.1f} times"
         for place, ratios in zip(places, found, strict=True)
+        if ratios
     )
     missed = sum(
         ratio < target.ratio for target, ratios in zip(TARGETS, found, strict=True) for ratio in ratios

@@ -11,7 +11,9 @@ from typing import NamedTuple
 class Known(NamedTuple):
     """Mean returns that are known of an environment with its default parameters.
 
-    In a clone, ``python -m agents.scale`` measures them anew.
+    The first two are the scale, set once: what is measured later, and more precisely, does not change them.
+    In a clone, ``python -m agents.scale`` measures all of them anew; ``agents/results/scale.json`` has what
+    came out.
 
     Parameters
     ----------
@@ -20,19 +22,19 @@ class Known(NamedTuple):
     best : float
         Of the best policy known.
     error : float
-        Standard error of `best`: how far it may be off, as far as the luck of its episodes goes.
+        Standard error of `best`, as far as the luck of its episodes goes.
     policy : str
         Which policy that is.
-    upper : float, optional
-        The optimum, in the same episodes as `best`, where it is known; None elsewhere. What value iteration
-        estimates of it elsewhere, tells ``docs/agents.md``.
+    optimum : float, optional
+        The optimum, in the same episodes as `best`, where it is known; None elsewhere. What is estimated of
+        it there, tells ``docs/agents.md``.
     """
 
     random: float
     best: float
     error: float
     policy: str
-    upper: float | None = None
+    optimum: float | None = None
 
 
 KNOWN_RETURNS = {
@@ -40,7 +42,7 @@ KNOWN_RETURNS = {
     "PivotedBarFree-v0": Known(-2.41, 422.49, 0.02, "iLQR"),
     "PivotedBarBalance-v0": Known(21.4, 452.7, 0.14, "LQR"),
     "InclineTilt-v0": Known(9.41, 181.57, 0.03, "iLQR"),
-    "InclineBrake-v0": Known(-4.325, -1.724, 0.001, "switching line", upper=-1.7237),
+    "InclineBrake-v0": Known(-4.325, -1.724, 0.001, "switching line", optimum=-1.7238),
     "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.01, "iLQR"),
     "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.03, "optimal"),
     "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.2, "optimal"),
