@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from agents.analysis import rounded
 from agents.results import ROOT, to_json
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, write
+from agents.submit import AUTHORS
 from lag_envs import TASKS
 from lag_envs.controllers import CONTROLLERS
 from lag_envs.leaderboard.protocol import GOALS, make_task
@@ -200,14 +201,14 @@ MEASURES: dict[str, Callable[[Played], dict[str, float]]] = {
 
 
 def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, list[Any]]]:
-    """Yield the agents of an environment: name, and policies, one for each training seed."""
+    """Yield our quick agents of an environment: name, and policies, one for each training seed."""
     task = make_task(env_id)
     for name, make in CONTROLLERS[env_id].items():
         if name not in LEFT_OUT:
             yield name, [make(task)]
     for folder in sorted(submissions.glob(f"{env_id}-*")):
         found = load(folder)
-        if found.kind == "learned":
+        if found.kind == "learned" and list(found.authors) == AUTHORS:
             yield found.name.lower(), [policy.agent() for _, policy in found.policies]
 
 

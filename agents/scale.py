@@ -1,16 +1,17 @@
 """Measure the mean returns that `lag_envs.scores` and the leaderboard's `REFERENCES` are set to.
 
-``python -m agents.scale`` plays, for each environment, random actions, the board's reference and the best
-policy known, and prints means and standard errors beside the numbers in use; all of it from the same starts.
-A policy that takes long plays the first of these episodes only, and the luck in them is taken out by what the
-reference gets there and in all (a control variate). ``agents/results/scale.json`` keeps the numbers
-(``--output``), and README shows them.
+``python -m agents.scale`` plays, for each environment, random actions, the best policy known and the board's
+reference, and prints means and standard errors beside the numbers in use. A policy that takes long plays the
+first of the episodes only, and the luck in them is taken out by what the reference gets there and in all (a
+control variate); what the reference is set to comes from other episodes, independent of all that.
+``agents/results/scale.json`` keeps the numbers (``--output``), and README shows them.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import json
 import math
 import sys
 from collections.abc import Sequence
@@ -34,8 +35,9 @@ from lag_envs.scores import KNOWN_RETURNS
 
 Array = NDArray[np.float64]
 
-#: Seeds of nobody else; episodes that are played together; those of policies that take long.
-FIRST_SEED, BATCH = 4_000_000_000, 65_536
+#: Seeds of nobody else, and those of the references' own means; episodes that are played together; how many
+#: policies play that take long.
+FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 SLOW = {"iLQR": 1_000, "optimal": 16_384}
 
 
@@ -45,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     p.add_argument("--batches", type=int, default=8, help=f"of {BATCH:,} episodes (default %(default)s)")
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
-    p.add_argument("--output", type=Path, metavar="FILE", help="keep the numbers as JSON")
+    p.add_argument(
+        "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
+    )
     args = p.parse_args(arguments)
     try:
         envs = [check_env(name) for name in args.env] or list(TASKS)
@@ -54,10 +58,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"agents.scale: error: {error}", file=sys.stderr)
         return 2
-    found = {env_id: measured(env_id, args.batches, args.quick) for env_id in envs}
-    if args.output:
-        about = {"date": datetime.date.today().isoformat(), "machine": machine(), "first_seed": FIRST_SEED}
-        write(args.output, to_json(about | {"envs": rounded(found)}))
+    kept: dict[str, Any] = {}
+    if args.output and args.output.exists():
+        kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
+    for env_id in envs:
+        kept[env_id] = rounded(measured(env_id, args.batches, args.quick))
+        if args.output:
+            about = {"date": datetime.date.today().isoformat(), "machine": machine()}
+            seeds = {"first_seed": FIRST_SEED, "first_seed_of_references": REFERENCE_SEED}
+            in_order = {name: kept[name] for name in TASKS if name in kept}
+            write(args.output, to_json(about | seeds | {"envs": in_order}))
     return 0
 
 
@@ -67,37 +77,38 @@ def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
     Returns
     -------
     dict
-        By policy ``mean``, standard ``error`` and the ``episodes`` that it played; for ``InclineBrake-v0``
-        also of the ``optimum``.
+        By policy ``mean``, standard ``error`` and the ``episodes`` that it played; ``reference`` is the
+        board's, and ``optimum``, for ``InclineBrake-v0``, what is known of it.
     """
-    known = KNOWN_RETURNS[env_id]
-    reference, used = REFERENCES.get(env_id, (None, None))[:2]
+    known, reference = KNOWN_RETURNS[env_id], REFERENCES.get(env_id)
     found: dict[str, Any] = {}
 
     def show(name: str, mean: float, error: float, episodes: int, used: float | None) -> None:
         found[name] = {"mean": mean, "error": error, "episodes": episodes}
         print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}   in use: {used}", flush=True)
 
-    quickly = {"random": known.random, reference: used, known.policy: known.best}
-    played = {}
-    for name, value in quickly.items():
-        if name is not None and name not in SLOW:
-            played[name] = many(env_id, name, batches)
-            show(name, *mean_and_error(played[name]), len(played[name]), value)
+    for name, value in (("random", known.random), (known.policy, known.best)):
+        if name not in SLOW:
+            returns = many(env_id, name, batches)
+            show(name, *mean_and_error(returns), len(returns), value)
     if known.policy in SLOW and not quick:
         agent = Optimal(env_id) if known.policy == "optimal" else make_controller(env_id, known.policy)
         returns = evaluate_batch(env_id, agent, FIRST_SEED, SLOW[known.policy])
-        show(known.policy, *without_luck(returns, played.get(reference)), len(returns), known.best)
+        same = None if reference is None else many(env_id, reference[0], batches)
+        show(known.policy, *without_luck(returns, same), len(returns), known.best)
+    if reference is not None:
+        returns = many(env_id, reference[0], batches, REFERENCE_SEED)
+        show("reference", *mean_and_error(returns), len(returns), reference[1])
     if env_id == "InclineBrake-v0":
         best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
         show("optimum", *mean_and_error(best), len(best), known.optimum)
     return found
 
 
-def many(env_id: str, name: str, batches: int) -> Array:
+def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array:
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
-    firsts = (FIRST_SEED + k * BATCH for k in range(batches))
+    firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 

@@ -310,7 +310,7 @@ def test_checkout_takes_the_table_over(tmp_path):
     )
     assert "| CartPole-v1 | 100 ns | 100 ns | 100 ns | 100 ns |" in text
     assert "2020-02-20" in text and "took 1.23 s with its cache empty" in text
-    assert "alone 2.0 to 2.0 times" in text and "2 of 4 aims are missed" in text
+    assert "alone 2 to 2 times" in text and "2 of 4 aims are missed" in text
     assert "all aims are met" in benchmark.claim(report_of([2.0, 6.0, 3.0, 3.0]))
     assert "| failed: OSError: no luck |" in benchmark.markdown(report_of([2.0, 6.0, None, 3.0]))
 

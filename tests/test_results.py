@@ -26,7 +26,7 @@ from agents.analysis import (
 )
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
-from lag_envs.controllers import Constant, do_nothing
+from lag_envs.controllers import CONTROLLERS, Constant, do_nothing, make_controller
 from lag_envs.report.docs import replaced
 from lag_envs.tasks import TASKS, load_task
 
@@ -413,6 +413,32 @@ def test_page_and_figures_of_any_results(tmp_path):
     assert {file for file in linked if not file.startswith("value-")} == drawn
     for file in (tmp_path / results.PICTURES).iterdir():
         assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size < 120_000
+
+
+def assert_reproduced(env_id, name, policies):
+    """Play the committed episodes again."""
+    agents = summary(ROOT)["envs"][env_id]["agents"]
+    stated = agents[name]["conditions"][NOMINAL]["return"]
+    found = np.mean([evaluate_batch(env_id, policy, 1_000_000_000, 1000).mean() for policy in policies])
+    assert found == pytest.approx(stated, rel=1e-4, abs=1e-6), name
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_committed_results_of_controllers_come_out_again(env_id):
+    for name in CONTROLLERS[env_id]:
+        if name != "iLQR":  # it takes minutes
+            assert_reproduced(env_id, name, [make_controller(env_id, name)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", TASKS)
+def test_committed_results_of_learners_come_out_again(env_id):
+    learned = {
+        name: policies for name, policies in behaviour.agents(env_id) if name not in CONTROLLERS[env_id]
+    }
+    assert learned
+    for name, policies in learned.items():
+        assert_reproduced(env_id, name, policies)
 
 
 def test_how_agents_act_is_what_is_committed():

@@ -602,7 +602,7 @@ def claim(report: dict[str, Any]) -> str:
     ]
     places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
     ranges = ", ".join(
-        f"{place} {ratios[0]:.1f} to {ratios[-1]:.1f} times"
+        f"{place} {ratios[0]:.3g} to {ratios[-1]:.3g} times"
         for place, ratios in zip(places, found, strict=True)
         if ratios
     )
