@@ -564,7 +564,7 @@ def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
             continue
         assert (returns <= numbers(env_id)["bound"]["value"]).all()
         ahead, most_ahead = returns, most
-        if "reference" in policy:
+        if policy.get("reference"):
             ahead = returns - np.array(policy["reference"])
             most_ahead = most - summary[REFERENCES[env_id][0]]["conditions"]["nominal"]["return"]
         assert ahead.mean() <= most_ahead + 3.0 * ahead.std() / math.sqrt(len(ahead))
