@@ -12,7 +12,7 @@ OLDEST_GYMNASIUM := 1.2.2
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo baselines test test-slow test-libraries test-oldest lint types check bench report report-docs submissions site format clean
+.PHONY: help setup demo baselines test test-slow test-libraries test-oldest lint types check bench bench-docs report report-docs submissions site format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -61,6 +61,9 @@ check: lint types test  ## all that CI runs: lint, types, tests, doctests
 
 bench: setup  ## compare the speed with other environments
 	$(BIN)/lag-envs bench $(ARGS)
+
+bench-docs: setup  ## the same, taken over into docs and README; on a machine with nothing else to do
+	$(BIN)/lag-envs bench --checkout . $(ARGS)
 
 report: setup  ## measure errors and write a page about them, into the folder report
 	$(BIN)/lag-envs report $(ARGS)

@@ -176,6 +176,11 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--output", metavar="FILE", help="write everything, raw samples included, to this JSON file"
     )
     parser.add_argument(
+        "--checkout",
+        metavar="FOLDER",
+        help="take everything over into docs/speed.json and README.md of this checkout",
+    )
+    parser.add_argument(
         "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
     )
     parser.add_argument(
@@ -207,6 +212,17 @@ def run_bench(args: argparse.Namespace) -> int:
     )
     if args.output:
         _check_writable(Path(args.output))
+    if args.checkout is not None:
+        for option in ("ids", "quick", "cold", "sizes"):
+            if getattr(args, option):
+                raise UserError(
+                    "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes"
+                )
+        for name in ("README.md", "docs/speed.json"):
+            if not os.access(Path(args.checkout, name), os.W_OK):
+                raise UserError(
+                    f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
+                )
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
     given = {
         name: getattr(args, name)
@@ -219,6 +235,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "clock": args.clock,
         "date": args.date,
         "output": args.output,
+        "checkout": args.checkout,
     }
     return in_own_process(Settings(**(quick | given | plain)))
 
@@ -402,6 +419,7 @@ the cold start of whole processes. Ctrl-C ends the measurement and keeps what th
 examples:
   lag-envs bench --quick                             one environment, under a minute
   lag-envs bench --output speed.json                 everything, a few minutes
+  lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 InclineTilt-v0 --sizes 64,16384
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",

@@ -328,7 +328,8 @@ class Brake(Task):
     observation = ("distance", "v")
     limit_control = 6.0
     rest_action = -1.0
-    gentle = 0.5
+    #: Speed that costs nothing at the line [m/s], and what each m/s above it costs.
+    gentle, price = 0.5, 5.0
 
     def check(self) -> None:
         """Refuse the other controls, and a slope on which the cylinder would not roll down."""
@@ -362,13 +363,13 @@ class Brake(Task):
         return -dt
 
     def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return minus the time to the line, and -5 (v - v_s)₊ with the speed v there."""
+        """Return minus the time to the line, and minus the price of the speed there above the gentle one."""
         force = self.scene.drive(y, u, k, xp)
         assert isinstance(force, slope.Pull)
         time = slope.crossing_time(y[0], y[1], force, dt, xp)
         # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
         speed = y[1] + force.pull * time + force.drag * y[0]
-        return -time - 5.0 * xp.maximum(speed - self.gentle, 0.0)
+        return -time - self.price * xp.maximum(speed - self.gentle, 0.0)
 
     def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
         """Tell whether the line has been crossed."""
