@@ -68,6 +68,11 @@ class SciPy(Peer):
         """All but Radau."""
         return self.method != "Radau"
 
+    @property
+    def shared(self) -> bool:
+        """A batch is one system."""
+        return True
+
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the right-hand side."""
         equation, count, span = problems.equation, len(problems), dt * steps
@@ -169,6 +174,11 @@ class Heyoka(Peer):
 
     family = "heyoka"
     settings: ClassVar = {"Taylor": (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)}
+
+    @property
+    def changing(self) -> bool:
+        """The compiled loop goes through them."""
+        return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the integrator, and find its step."""
@@ -326,9 +336,7 @@ class Diffrax(Peer):
         def run() -> None:
             found[:] = [jax.block_until_ready(solve(y, p, span, setting))]
 
-        return Sample(
-            run, len(problems) * steps, ends=lambda: problems.states(np.asarray(found[0]).T, span)
-        )
+        return Sample(run, len(problems) * steps, ends=lambda: problems.states(np.asarray(found[0]).T, span))
 
 
 @cache
@@ -377,6 +385,11 @@ class Torchdiffeq(Peer):
     }  # fmt: skip
     stepped = ("rk4, fixed",)
 
+    @property
+    def shared(self) -> bool:
+        """A batch is one tensor."""
+        return True
+
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Import it."""
         import torch
@@ -387,6 +400,8 @@ class Torchdiffeq(Peer):
         numbers = torch.from_numpy(problems.p)
         times = torch.tensor([0.0, span], dtype=torch.float64)
         options: dict[str, Any] = {"rtol": self.setting, "atol": self.setting, "method": self.method}
+        # A step has to end at the end: its interpolation is of lower order than its steps.
+        options["options"] = {"step_t": times[1:], "first_step": dt}
         if self.fixed:
             step = span / self.substeps(steps)
             options = {"method": self.method.partition(",")[0], "options": {"step_size": step}}
@@ -480,6 +495,4 @@ class MuJoCo(Peer):
         return Sample(run, len(models) * steps, ends=lambda: ends[:, 1:].copy())
 
 
-PEERS: dict[str, type[Peer]] = {
-    peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)
-}
+PEERS: dict[str, type[Peer]] = {peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)}

@@ -79,17 +79,40 @@ class Rival(ABC):
             For an equation that it cannot solve.
         """
 
+    @property
+    def shared(self) -> bool:
+        """Whether the states of a batch share their steps, so that each one's error depends on the others."""
+        return False
+
+    @property
+    def changing(self) -> bool:
+        """Whether one call can go through many controls."""
+        return False
+
     def substeps(self, steps: int) -> int:
         """Return the number of steps over some control steps, for a fixed method."""
         return max(1, round(self.setting * steps))
 
 
 class Ours(Rival):
-    """The stepping that the package ships: a scene's own flow, and no other order or tolerance."""
+    """The stepping that the package ships: a scene's own flow, and no other order or tolerance.
+
+    The setting is 1: there is none.
+    """
 
     family = "ours"
     METHOD = "lag_envs"  #: control step by control step, as an environment takes them
     ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
+
+    @property
+    def fixed(self) -> bool:
+        """Over a long time as over a short one, but in one call."""
+        return self.method == self.METHOD
+
+    @property
+    def changing(self) -> bool:
+        """A trajectory has a control for each step."""
+        return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the scene's own step; scenes with other parameters are batches of their own."""
@@ -135,6 +158,11 @@ class Compiled(Rival):
     @property
     def fixed(self) -> bool:
         """All steps are alike."""
+        return True
+
+    @property
+    def changing(self) -> bool:
+        """Its loop goes through them."""
         return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
