@@ -1,7 +1,7 @@
-"""Problems as every rival is given them: y' = rate(t, y, p) on generic numbers, starts and parameters as arrays.
+"""Problems as every rival is given them: y' = rate(t, y, p) on generic numbers; arrays of starts.
 
-`Problems` makes them of a scene's cases by the scene's own flow and coefficients, so rivals and ours solve the
-same equation. Any other equation will do as well: what a rival needs is an `Equation`, the arrays, and a way
+`Problems` makes them of a scene's cases by the scene's own flow and coefficients, so that all solve the same
+equation. Any other equation will do as well: what a rival needs is an `Equation`, the arrays, and a way
 back from its unknowns to states.
 
 Examples

@@ -7,7 +7,6 @@ scene's parameters.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -368,7 +367,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
     def several(y: Any, p: Any, span: Any, setting: Any) -> Any:
         if together:
             return jax.vmap(one, (0, 0, None, None))(y, p, span, setting)
-        return jax.lax.map(lambda given: one(*given, span, setting), (y, p))
+        return jax.lax.map(lambda given: one(given[0], given[1], span, setting), (y, p))
 
     return jax.jit(several)
 

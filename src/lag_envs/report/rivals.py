@@ -235,7 +235,7 @@ def _alone(equation: Equation, method: str, carried: bool) -> Callable:
 
 @cache
 def _batch(equation: Equation, method: str, carried: bool) -> Callable:
-    """Compile ``batch(rows, count, n, h)``: so many blocks one after the other, n steps of all their states."""
+    """Compile ``batch(rows, count, n, h)``: block by block, n steps of all states."""
     y, p = _names(equation)
     numbers = [*y, *p]
     at = {name: f"rows[base + np.uint64({BLOCK * j}) + i]" for j, name in enumerate(numbers)}

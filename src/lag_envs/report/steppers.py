@@ -117,7 +117,7 @@ class Problem(NamedTuple):
 def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = False) -> Problem:
     """Return the equation of motion of a flow with these coefficients, from its variables at the start.
 
-    If carried, cosines and sines are turned from those at the start, which is exact to rounding up to 0.6 rad.
+    If carried, cosines and sines are turned from those at the start: exact to rounding up to 0.6 rad.
     """
     if isinstance(coefficients, pendulum.Drive):
         push = coefficients._replace(gamma=0.0)
@@ -127,10 +127,11 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
         def cos_sin(q: Any) -> Sequence:
             if q is start:
                 return pair
-            return pendulum.rotate(*pair, q - start) if carried else cosine_sine(q, xp)
+            return pendulum.rotate(pair[0], pair[1], q - start) if carried else cosine_sine(q, xp)
 
         def force(q: Any, t: Any) -> Any:
-            return pendulum.acceleration(0.0, *cos_sin(q), push) + coefficients.ramp * t
+            c, s = cos_sin(q)
+            return pendulum.acceleration(0.0, c, s, push) + coefficients.ramp * t
 
         def gradient(q: Any, t: Any) -> Any:
             c, s = cos_sin(q)
@@ -347,12 +348,14 @@ def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
         p = problem(coefficients, variables, xp, carried)
         start = variables[:2]
         if method.tableau:
-            q, v = explicit(method.tableau(), lambda t, y: (y[1], p.acceleration(*y, t)), start, dt)
+            q, v = explicit(method.tableau(), lambda t, y: (y[1], p.acceleration(y[0], y[1], t)), start, dt)
         else:
             assert method.step
             q, v = method.step(p, *start, dt, xp)
         if isinstance(coefficients, pendulum.Drive):
-            turned = pendulum.rotate(*variables[2:], q - start[0]) if carried else cosine_sine(q, xp)
+            turned = (
+                pendulum.rotate(variables[2], variables[3], q - start[0]) if carried else cosine_sine(q, xp)
+            )
             return q, v, *turned
         if isinstance(coefficients, slope.Turn):
             return q, v, *slope.rotate(variables[2], variables[3], coefficients.rate * dt)
@@ -363,7 +366,6 @@ def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
 
 def _lifted(tableau: Tableau, variables: Sequence, coefficients: Any, dt: Any) -> tuple:
     """Step a flow's variables, the pair of cosine and sine among them, and restore the pair's length."""
-
     q, v, c, s = explicit(tableau, lambda t, y: rate(coefficients, t, y, None), variables, dt)
     longer = 1.5 - 0.5 * (c * c + s * s)
     return q, v, c * longer, s * longer

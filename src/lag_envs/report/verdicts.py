@@ -186,9 +186,9 @@ def _text(rows: Sequence[Row]) -> list[str]:
     sizes = {r["members"] for r in rows if r["kind"] == "point" and "members" in r}
     members = f" (from {min(sizes)} to {max(sizes)} of them)" if len(sizes) > 1 else ""
     return [
-        f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and over "
-        "the entries of the state, each relative to its size as the README defines accuracy; over 10 s and "
-        "1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there is "
+        f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
+        "over the entries of the state, each relative to its size as the README defines accuracy; over 10 s "
+        "and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there is "
         "one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and drive), else "
         "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
         "there is no control, and pendulums have no damping.",
@@ -291,7 +291,7 @@ def _near(points: Sequence[Point]) -> Table:
 
 
 def _rivals(points: Sequence[Point]) -> Table:
-    """Return every rival's own best at each error, on one step: not only the fastest of all is of interest."""
+    """Return every rival's own shortest time to each error, on one step."""
     rows = []
     here = [p for p in points if p.horizon == "one step" and not p.ours]
     for variant in VARIANTS:
@@ -333,9 +333,9 @@ def _summary(points: Sequence[Point], found: Sequence[Duel]) -> Table:
     sentences = [f"To {t:.0e}: {_finding([d for d in steps if d.target == t])}." for t in SHOWN if steps]
     return Table(
         "work_precision",
-        "One control step of each scene, alone and in a batch of 1,024: largest error and time of lag_envs as "
-        "shipped, and the fastest of its rivals, each in its fastest form, that reaches an error, with its time "
-        "as a multiple of ours; below 1 the rival is faster. " + " ".join(sentences),
+        "One control step of each scene, alone and in a batch of 1,024: largest error and time of lag_envs "
+        "as shipped, and the fastest of its rivals, each in its fastest form, that reaches an error, with "
+        "its time as a multiple of ours; below 1 the rival is faster. " + " ".join(sentences),
         ["scene", "mode", "error", "ns", *(f"to {target:.0e}" for target in SHOWN)],
         rows,
     )
@@ -428,8 +428,8 @@ def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Duel]) 
     off = [f"{name} on {where}: {error:.1e}" for (name, where), error in finest.items() if error > ACCURATE]
     made.append(
         _claim(
-            f"Every library, and every stepper of order 4 and more, errs by at most {ACCURATE:.0e} in one step "
-            "at its finest setting, in every form: no form is fast because it is broken",
+            "No form is fast because it is broken: at its finest setting every library, and every stepper of "
+            f"order 4 and more, errs by at most {ACCURATE:.0e} in one step",
             finest,
             lambda: not off,
             lambda: _listed(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",
@@ -450,7 +450,7 @@ def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Duel]) 
     same = _same_bits(rows)
     made.append(
         _claim(
-            "Batches that are timed end where single trajectories do, bit for bit, ours and the usual steppers",
+            "The batches that are timed end where single trajectories do, bit for bit, ours and the others",
             same,
             lambda: all(same),
             lambda: f"{sum(same)} of {len(same)}",
@@ -478,11 +478,12 @@ def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
             return f"{len(here) - len(lost)} of {len(here)}; faster: {faster}"
         if not ratios:
             return f"{len(here)} of {len(here)}; nobody else gets there"
-        return f"{len(here)} of {len(here)}; the fastest rivals take {min(ratios):.2g} to {max(ratios):.2g} × our time"
+        low, high = min(ratios), max(ratios)
+        return f"{len(here)} of {len(here)}; the fastest rivals take {low:.2g} to {high:.2g} × our time"
 
     return _claim(
-        f"{horizon.capitalize()}: nobody reaches an error of {target:.0e} in less time than lag_envs as shipped, "
-        "alone or in a batch",
+        f"{horizon.capitalize()}: nobody reaches an error of {target:.0e} in less time than lag_envs as "
+        "shipped, alone or in a batch",
         here,
         lambda: not lost,
         evidence,

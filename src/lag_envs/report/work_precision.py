@@ -184,8 +184,8 @@ def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
     }  # fmt: skip
 
 
-def errors(some: Sequence[Truth], ends: Sequence[Array]) -> Row:
-    """Return errors, the largest and median of those below 1, and how many members are lost."""
+def errors(some: Sequence[Truth], ends: Array) -> Row:
+    """Return errors of states, the largest and median of those below 1, and how many members are lost."""
     found = [t.error(end) for t, end in zip(some, ends, strict=True)]
     kept = [error for error in found if error < 1.0]
     return {
@@ -204,7 +204,6 @@ def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
     """Return a family's methods at all settings; ours are with those that our machinery compiles."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
-        scene = VARIANTS[variant].scene()
         equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
         methods = [m for m in Compiled.methods(equation) if not quick or m in QUICK_METHODS]
         ours = [Ours.METHOD] if plan.seconds is None else [Ours.METHOD, Ours.ONE_CALL]
@@ -270,7 +269,7 @@ def point(
         Where a hundredth of the work tells that the whole would take too long.
     """
     members = [t.case for t in some]
-    # Where the states of a batch share their steps, the errors are those of a batch as large as the timed one.
+    # Where states share their steps, the errors are those of a batch as large as the one that is timed.
     cases = [*members, *base[len(members) :]] if together and rival.shared else members
     if rival.family != "ours":
         _guard(rival, cases, dt, steps, together)
