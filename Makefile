@@ -58,7 +58,7 @@ check: lint types test  ## all that CI runs: lint, types, tests, doctests
 bench: setup  ## compare the speed with other environments
 	$(BIN)/lag-envs bench $(ARGS)
 
-report: setup  ## measure errors and write a page about them, into the folder report
+report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs and README too
 	$(BIN)/lag-envs report $(ARGS)
 
 report-docs: setup  ## take the folder report over into docs and README

@@ -188,8 +188,8 @@ def _text(rows: Sequence[Row]) -> list[str]:
     return [
         f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
         "over the entries of the state, each relative to its size as the README defines accuracy; over 10 s "
-        "and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there is "
-        "one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and drive), else "
+        "and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there "
+        "is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and drive), else "
         "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
         "there is no control, and pendulums have no damping.",
         "Ours is what the package ships: each scene's own order and tolerance, control step by control step, "
