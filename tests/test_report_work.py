@@ -66,11 +66,12 @@ def test_ours_is_what_simulate_does(name):
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
-    for method, length, count in ((Ours.METHOD, dt, steps), (Ours.ONE_CALL, steps * dt, 1)):
+    found = ((Ours.METHOD, 1, dt, 3), (Ours.METHOD, 2, dt / 2, 6), (Ours.ONE_CALL, 1, steps * dt, 1))
+    for method, n, length, count in found:
         ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
         for together in (False, True):
-            sample = Ours(method, 1).build(Problems(cases), dt, steps, together)
-            assert np.array_equal(sample.end(), ends), (method, together)
+            sample = Ours(method, n).build(Problems(cases), dt, steps, together)
+            assert np.array_equal(sample.end(), ends), (method, n, together)
 
 
 @pytest.mark.parametrize("quick", [True, False])

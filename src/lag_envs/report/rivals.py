@@ -97,7 +97,7 @@ class Rival(ABC):
 class Ours(Rival):
     """The stepping that the package ships: a scene's own flow, and no other order or tolerance.
 
-    The setting is 1: there is none.
+    The setting is the number of steps per control step: whoever wants another accuracy takes another `dt`.
     """
 
     family = "ours"
@@ -117,7 +117,8 @@ class Ours(Rival):
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Compile the scene's own step; scenes with other parameters are batches of their own."""
         cases = problems.cases
-        length, count = (dt * steps, 1) if self.method == self.ONE_CALL else (dt, steps)
+        count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
+        length = dt * steps / count
         kernels = Kernels(cases[0].scene, cases[0].scene.flow)
         alike: dict[Scene, list[Case]] = {}
         for case in cases:

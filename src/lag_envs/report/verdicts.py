@@ -78,9 +78,9 @@ class Point(NamedTuple):
     @property
     def label(self) -> str:
         """The method and its setting in words."""
-        if self.ours:
+        if self.ours and self.setting == 1:
             return self.method
-        if self.family in ("compiled", "mujoco") or self.method.endswith("fixed"):
+        if self.family in ("ours", "compiled", "mujoco") or self.method.endswith("fixed"):
             if self.setting < 1.0:
                 return f"{self.name}, a step for {1.0 / self.setting:g}"
             return f"{self.name}, {self.setting:g} substep{'s' if self.setting > 1 else ''}"
@@ -193,8 +193,8 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
         "there is no control, and pendulums have no damping.",
         "Ours is what the package ships: each scene's own order and tolerance, control step by control step, "
-        "and over 10 s and 1,000 s also as one step that `simulate` divides ('lag_envs, one call'). The test "
-        "whether a step is certified is part of it.",
+        "and over 10 s and 1,000 s also with steps of half and of twice that length, and as one step that "
+        "`simulate` divides ('lag_envs, one call'). The test whether a step is certified is part of it.",
         "Everybody is given the scene's own equation and the fastest form there is, and the errors are those "
         "of the calls that are timed. The usual steppers are compiled by the same compiler at the same "
         "vector width as ours, with coefficients that come ready; 'carried' ones have cosine and sine as "
