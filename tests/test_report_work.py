@@ -1,10 +1,12 @@
 """Work-precision: orders of convergence, rivals in their best forms, what is said of who is faster."""
 
 import dataclasses
+import json
 import re
 import sys
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,7 +64,7 @@ def test_a_step_is_exact(name, mode):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_ours_is_what_simulate_does(name):
     """What is timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
-    dt, steps = VARIANTS[name].dt, 3
+    dt, steps = work_precision.control_step(name), 3
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
@@ -394,6 +396,38 @@ def assert_sentences_agree(text, columns, rows):
                 assert (f"{words} in {count} (" in sentence) == bool(count)
             seen += 1
     assert seen == len({(r["horizon"], r["error"]) for r in found}) > 0
+
+
+def committed():
+    """Return the section that docs/accuracy.md and the README show."""
+    path = Path(__file__).parents[1] / "docs" / "accuracy.json"
+    sections = json.loads(path.read_text(encoding="utf-8"))["sections"]
+    return next(section for section in sections if section["name"] == "work_precision")
+
+
+def test_committed_sentences_count_what_the_table_has():
+    section = committed()
+    table = next(t for t in section["tables"] if t["name"].endswith("targets"))
+    assert_sentences_agree(section["text"], table["columns"], table["rows"])
+
+
+def test_committed_claims_follow_from_the_table():
+    section = committed()
+    table = next(t for t in section["tables"] if t["name"].endswith("targets"))
+    rows = [dict(zip(table["columns"], line, strict=True)) for line in table["rows"]]
+    for horizon, target in verdicts.CLAIMED.items():
+        here = [r for r in rows if (r["horizon"], r["error"]) == (horizon, target)]
+        lost = [r for r in here if r["fastest other"] and (r["other / ours"] or 0.0) < 1.0]
+        claim = next(c for c in section["claims"] if c["text"].startswith(f"{horizon.capitalize()}: nobody"))
+        assert claim["holds"] is not bool(lost)
+        assert all(r["fastest other"] in claim["evidence"] for r in lost)
+
+
+def test_only_what_is_shipped_is_committed_as_ours():
+    table = next(t for t in committed()["tables"] if t["name"].endswith("targets"))
+    ours = {line[table["columns"].index("ours")] for line in table["rows"]} - {None}
+    words = {Ours.METHOD, Ours.ONE_CALL, f"{Ours.METHOD}, 2 substeps", f"{Ours.METHOD}, a step for 2"}
+    assert OURS in ours <= words
 
 
 def test_jobs_are_brought_to_one_scale():

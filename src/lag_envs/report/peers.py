@@ -196,19 +196,11 @@ class Heyoka(Peer):
                 loop(step, rows, p, work, span, changes)
 
         else:
-            if changes > 1:
-                raise ValueError("heyoka's compiled step is not to be had here")
 
             def run() -> None:
-                for block, numbers in zip(rows, p, strict=True):
-                    if width == 1:
-                        integrator.time = 0.0
-                    else:
-                        integrator.set_time(0.0)
-                    integrator.state[:] = block[:, 0] if width == 1 else block
-                    integrator.pars[: len(numbers)] = numbers[:, 0] if width == 1 else numbers
-                    integrator.propagate_until(span)
-                    block[:] = integrator.state.reshape(block.shape)
+                for change in range(changes):
+                    for i, block in enumerate(rows):
+                        self._propagate(integrator, block, p[(i + change) % len(p)], span)
 
         return Sample(
             run,
@@ -216,6 +208,17 @@ class Heyoka(Peer):
             lambda: np.copyto(rows, start),
             lambda: problems.states(unblocked(rows, count), span),
         )
+
+    @staticmethod
+    def _propagate(integrator: Any, block: Array, numbers: Array, span: float) -> None:
+        if block.shape[-1] == 1:
+            integrator.time = 0.0
+            integrator.state[:], integrator.pars[: len(numbers)] = block[:, 0], numbers[:, 0]
+        else:
+            integrator.set_time(0.0)
+            integrator.state[:], integrator.pars[: len(numbers)] = block, numbers
+        integrator.propagate_until(span)
+        block[:] = integrator.state.reshape(block.shape)
 
     def _integrator(self, equation: Equation, width: int) -> Any:
         import heyoka
