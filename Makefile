@@ -65,7 +65,7 @@ bench: setup  ## compare the speed with other environments
 bench-docs: setup  ## the same, taken over into docs and README; on a machine with nothing else to do
 	$(BIN)/lag-envs bench --checkout . $(ARGS)
 
-report: setup  ## measure errors and write a page about them, into the folder report
+report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs and README too
 	$(BIN)/lag-envs report $(ARGS)
 
 report-docs: setup  ## take the folder report over into docs and README

@@ -360,7 +360,9 @@ def test_make_targets(file):
 def test_generated_parts_are_as_generated():
     """README's tables and docs/accuracy.md follow from the JSON files beside them."""
     for path, text in generated(ROOT).items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name}: make report-docs writes it anew"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: `make report ARGS='--docs .'` writes it anew"
+        )
 
 
 def test_speeds():

@@ -293,6 +293,9 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
     )
+    parser.add_argument(
+        "--docs", metavar="PROJECT", help="then write docs/accuracy and README's part of it in this checkout"
+    )
 
 
 def run_report(args: argparse.Namespace) -> int:
@@ -306,9 +309,17 @@ def run_report(args: argparse.Namespace) -> int:
     for name in names:
         if name not in SECTIONS:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
+    if args.docs and (args.quick or names != SECTIONS):
+        raise UserError("--docs takes a whole report: leave out --quick and --sections")
     settings = Settings(args.folder, args.quick, names, args.processes, args.date)
     try:
-        return 0 if make_report(settings) else 130
+        if not make_report(settings):
+            return 130
+        if args.docs:
+            from lag_envs.report import docs
+
+            return docs.main([args.folder, args.docs])
+        return 0
     except (NotAReport, OSError) as error:
         raise UserError(str(error)) from error
 
@@ -436,7 +447,8 @@ Ctrl-C the same command goes on. heyoka, diffrax, torchdiffeq and MuJoCo take pa
 
 examples:
   lag-envs report --quick                            a first look, under a minute
-  lag-envs report                                    everything, under 15 minutes on two cores
+  lag-envs report                                    everything, about half an hour on two cores
+  lag-envs report --docs .                           the same, and what this checkout says of it
   lag-envs report --sections bound,stability maps    two parts, into the folder maps""",
         declare_report,
         run_report,
