@@ -273,7 +273,8 @@ def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]
     first = protocol.first_seed(entry.digest, entry.nonce, middle)
     returns = result["policies"][middle]["returns"]
     recorded = {replay["label"]: replay for replay in result["replays"]}
-    if {label: replay["reset_seed"] - first for label, replay in recorded.items()} != chosen:
+    seeds = {label: replay["reset_seed"] - first for label, replay in recorded.items()}
+    if seeds != chosen or len(result["replays"]) > len(seeds):
         yield "has recorded other episodes than the median, the best and the worst"
     elif result.get("build") is not None:  # before, those of random actions were drawn anew
         for label, i in chosen.items():

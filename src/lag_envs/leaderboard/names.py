@@ -99,12 +99,10 @@ def skeleton(text: str) -> str:
 
 
 def lookalike(text: str, earlier: Iterable[str]) -> str:
-    """Return the first of some earlier texts that looks like a text, and is another; empty for none.
+    """Return the first of some earlier texts that looks like a text, if it is another; empty for none.
 
     Capitals and small letters count as alike.
     """
     looks = {skeleton(text), skeleton(text.casefold())}
-    for other in earlier:
-        if other != text and looks & {skeleton(other), skeleton(other.casefold())}:
-            return other
-    return ""
+    first = next((e for e in earlier if looks & {skeleton(e), skeleton(e.casefold())}), text)
+    return "" if first == text else first

@@ -8,7 +8,7 @@ import io
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
@@ -37,7 +37,7 @@ class PolicyResult(Strict):
 class Replay(Strict):
     """A recorded episode."""
 
-    label: Text
+    label: Literal["median", "best", "worst"]
     seed: Count
     reset_seed: Count
     return_: Number = Field(alias="return")
