@@ -442,7 +442,8 @@ AT = '"at": "2026-01-01T00:00:00.000000+00:00"'
         f'{{{AT}, "event": "withdrawn", "id": "a"}}',
         f'{{{AT}, "event": "withdrawn", "id": "a", "reason": "\\ud800"}}',
         f'{{{AT}, "event": "withdrawn", "id": "a", "reason": "", "also": 1}}',
-        f'{{{AT}, "event": "verified", "id": "a", "nonce": "n", "sha256": "{"0" * 64}", "supersedes": [{{}}]}}',
+        f'{{{AT}, "event": "verified", "id": "a", "nonce": "n", "sha256": "{64 * "0"}",'
+        ' "supersedes": [{}]}',
         '{"at": "yesterday", "event": "nonce", "value": "a"}',
         '{"at": "9999-12-31T23:59:59.999999+00:00", "event": "nonce", "value": "a"}',
         '{"at": "2026-13-31T23:59:59.999999+00:00", "event": "nonce", "value": "a"}',

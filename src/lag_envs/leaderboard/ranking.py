@@ -114,7 +114,7 @@ def normalised(scale: Scale, returns: ArrayLike) -> Array:
 
 def slope(policies: Sequence[Mapping[str, Any]]) -> float:
     """Return by how much policies' returns go with the reference's in the same episodes; 0 without one."""
-    if not all(p.get("reference") for p in policies):
+    if any(p.get("reference") is None for p in policies):
         return 0.0
     luck = np.array([p["reference"] for p in policies], np.float64)
     apart = luck - luck.mean(axis=1, keepdims=True)
