@@ -349,7 +349,9 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
     """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
 
     def call(given: Any) -> Any:
-        for package in ("jinja2", "safetensors", "scipy", "sympy", "tqdm"):
+        for package in (
+            "confusable_homoglyphs", "jinja2", "pydantic", "safetensors", "scipy", "sympy", "tqdm",
+        ):  # fmt: skip
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
         from lag_envs.leaderboard.board import BoardError
