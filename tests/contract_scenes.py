@@ -4,7 +4,7 @@ from lag_envs.scenes.contract import Scene, parameter
 
 
 class ChargedParticle(Scene):
-    """A charge in a plane, in a magnetic field that grows with x and an electric potential: T has a linear part."""
+    """A charge in a plane, in a magnetic field that grows with x: T has a linear part."""
 
     mass: float = parameter(1.0, "kg", above=0.0)
     field: float = parameter(0.7, "T")
@@ -119,7 +119,9 @@ class Trolley(Scene):
 
     def potential(self, q, xp):
         first, second = self.masses
-        return -self.gravity * (first * (self.length + q.h) * xp.cos(q.alpha) + second * self.short * xp.cos(q.beta))
+        return -self.gravity * (
+            first * (self.length + q.h) * xp.cos(q.alpha) + second * self.short * xp.cos(q.beta)
+        )
 
     def dissipation(self, q, v, u, xp):
         return self.damping * (v.alpha**2 + v.beta**2) / 2
@@ -139,7 +141,11 @@ class Functions(Scene):
 
     def kinetic(self, q, v, xp):
         inertia = self.mass * (self.size**2 + q.r**2) / (2 + xp.sin(q.theta))
-        return inertia * v.theta**2 / 2 + self.mass * v.r**2 * (1 + xp.exp(-q.r)) + v.r * v.theta * xp.tanh(q.r) / 7
+        return (
+            inertia * v.theta**2 / 2
+            + self.mass * v.r**2 * (1 + xp.exp(-q.r))
+            + v.r * v.theta * xp.tanh(q.r) / 7
+        )
 
     def potential(self, q, xp):
         well = xp.log(self.size + q.r**2) + xp.atan(q.r - q.z) + xp.sqrt(1 + q.theta**2)

@@ -8,7 +8,10 @@ import mpmath
 import sympy
 
 XP = SimpleNamespace(
-    **{name: getattr(sympy, name) for name in ("sin", "cos", "tan", "atan", "tanh", "exp", "log", "sqrt", "pi")},
+    **{
+        name: getattr(sympy, name)
+        for name in ("sin", "cos", "tan", "atan", "tanh", "exp", "log", "sqrt", "pi")
+    },
     arctan=sympy.atan,
 )
 
@@ -30,7 +33,7 @@ class Oracle:
         self.coordinates = self.free + self.prescribed
         modes = scene.modes.values() if scene.modes else [scene.controls]
         self.controls = tuple(dict.fromkeys(name for controls in modes for name in controls))
-        self.active = tuple((scene.modes[scene.control] if scene.modes else scene.controls))
+        self.active = tuple(scene.modes[scene.control] if scene.modes else scene.controls)
         twin = object.__new__(cls)
         self.parameters = {}
         for field in dataclasses.fields(scene):
@@ -66,7 +69,7 @@ class Oracle:
         return sympy.lambdify(self.symbols, expression, modules="mpmath")
 
     def point(self, scene, generator):
-        """Return random numbers for places, velocities, accelerations, controls and parameters, as they may be.
+        """Return random numbers for places, velocities, accelerations, controls and parameters.
 
         Accelerations of free coordinates are missing.
         """
@@ -83,7 +86,11 @@ class Oracle:
             else:
                 v[name] = a[name] = zero
                 at_rest = self.rests.get(name, lambda *numbers: zero)
-                q[name] = u[name] if name in self.active else at_rest(*[zero] * (len(self.symbols) - len(p)), *p.values())
+                q[name] = (
+                    u[name]
+                    if name in self.active
+                    else at_rest(*[zero] * (len(self.symbols) - len(p)), *p.values())
+                )
         for name in self.free:
             del a[name]
         return SimpleNamespace(q=q, v=v, a=a, u=u, p=p)

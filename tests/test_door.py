@@ -1,4 +1,4 @@
-"""What a scene may not do is refused when its class is used, by name and with the remedy; nothing gives a number."""
+"""What a scene may not do is refused when its class is used, by name and with the remedy."""
 
 import dataclasses
 import math
@@ -72,7 +72,7 @@ def kinetic(formula):
     return changed("kinetic", lambda self, q, v, xp: formula(self, q, v, xp))
 
 
-# --- numbers that cannot be followed ---------------------------------------------------------------------------
+# --- numbers that cannot be followed -----------------------------------------------------------------------
 
 
 @mistake("potential", "math", "functions of xp")
@@ -323,7 +323,7 @@ def chance():
     return potential(lambda self, q, xp: random.random() * q.x**2)
 
 
-# --- energies that are none ------------------------------------------------------------------------------------
+# --- energies that are none --------------------------------------------------------------------------------
 
 
 @mistake("kinetic", "degree 3", "two at most")
@@ -354,7 +354,6 @@ def coordinate_without_mass():
 @mistake("kinetic", "'x'", "mass")
 def energy_without_velocities():
     return kinetic(lambda self, q, v, xp: q.x**2 / 2 + q.y**2)
-
 
 
 @mistake("kinetic", "singular", "x, y")
@@ -422,7 +421,7 @@ def body_without_a_pose():
     return changed("bodies", lambda self: {"wheel": []})
 
 
-# --- names -----------------------------------------------------------------------------------------------------
+# --- names -------------------------------------------------------------------------------------------------
 
 
 @mistake("kinetic", "not defined")
@@ -754,7 +753,7 @@ def structural_field_that_is_a_list():
     return lambda: Bad(lengths=[1.0, 2.0])
 
 
-# --- the test --------------------------------------------------------------------------------------------------
+# --- the test ----------------------------------------------------------------------------------------------
 
 
 def test_the_good_one_is_good():

@@ -3,11 +3,12 @@
 import dataclasses
 import functools
 
+import contract_scenes
 import mpmath
 import numpy as np
 import pytest
+from lagrange_oracle import Oracle
 
-import contract_scenes
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter
@@ -19,7 +20,6 @@ from lag_envs.scenes.new_incline import Incline
 from lag_envs.scenes.new_pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
-from lagrange_oracle import Oracle
 
 PACKAGE = [
     (PivotedBar, {}),
@@ -56,7 +56,9 @@ def _oracle(scene):
 
 
 def symbols(point):
-    values = {place(name): x for name, x in point.q.items()} | {velocity(name): x for name, x in point.v.items()}
+    values = {place(name): x for name, x in point.q.items()} | {
+        velocity(name): x for name, x in point.v.items()
+    }
     values |= {control(name): x for name, x in point.u.items()}
     return values | {parameter(name): x for name, x in point.p.items()}
 
@@ -88,14 +90,17 @@ def test_accelerations_and_forces_solve_lagranges_equations(case):
             for m, name in enumerate(oracle.prescribed, start=len(mechanics.free)):
                 entries = [full.entry(m, j) for j in range(len(full.coordinates))]
                 numbers = evaluate([*entries, full.force[m]], values, mpmath)
-                force = mpmath.fsum(g * point.a[c] for g, c in zip(numbers, full.coordinates, strict=False)) - numbers[-1]
+                force = (
+                    mpmath.fsum(g * point.a[c] for g, c in zip(numbers, full.coordinates, strict=False))
+                    - numbers[-1]
+                )
                 expected, size = oracle.residual(name, point)
                 assert abs(force - expected) < 1e-25 * size
 
 
 @scenes
 def test_energy_changes_by_what_power_says(case):
-    """dE/dt along the motion, by the chain rule in 40 digits, is drive + applied - drag as `power` gives them."""
+    """dE/dt along the motion, by differences, is drive + applied - drag as `power` gives them."""
     scene = complete(case)
     generator = np.random.default_rng(4)
     states = generator.uniform(0.1, 1.0, (4, len(scene.state_names)))
@@ -152,7 +157,7 @@ def test_held_rate_carries_what_stays_continuous():
             values = symbols(point)
             a = solved(scene.mechanics, values)
 
-            def carried(t, point=point, a=a):
+            def carried(t, oracle=oracle, point=point, a=a):
                 """Return w at the time t along the parabola of the motion."""
                 q, v = dict(point.q), dict(point.v)
                 for name, x in zip(("alpha", "beta"), a, strict=True):
@@ -161,16 +166,27 @@ def test_held_rate_carries_what_stays_continuous():
                     q[name] = q[name] + t * v[name]
                 numbers = [*q.values(), *v.values(), *point.u.values(), *point.p.values()]
                 mass = mpmath.matrix([[oracle.mass[i][j](*numbers) for j in (0, 1)] for i in (0, 1)])
-                drive = mpmath.matrix([sum(oracle.mass[i][j](*numbers) * v[c] for j, c in ((2, "s"), (3, "h"))) for i in (0, 1)])
+                drive = mpmath.matrix(
+                    [sum(oracle.mass[i][j](*numbers) * v[c] for j, c in ((2, "s"), (3, "h"))) for i in (0, 1)]
+                )
                 shift = mpmath.lu_solve(mass, drive)
                 return [v["alpha"] + shift[0], v["beta"] + shift[1]]
 
             w = [float(x) for x in carried(mpmath.mpf(0))]
-            state = [float(point.q["s"]), float(point.q["h"]), float(point.q["alpha"]), w[0], float(point.q["beta"]), w[1]]
+            state = [
+                float(point.q["s"]),
+                float(point.q["h"]),
+                float(point.q["alpha"]),
+                w[0],
+                float(point.q["beta"]),
+                w[1],
+            ]
             held = [float(point.u[name]) for name in scene.control_names]
             found = rate(scene, np.array([state]), np.array([held]))[0]
             step = mpmath.mpf("1e-12")
             ahead, behind = carried(step), carried(-step)
             expected = [float((x - y) / (2 * step)) for x, y in zip(ahead, behind, strict=True)]
             np.testing.assert_allclose(found[[3, 5]], expected, rtol=1e-9)
-            np.testing.assert_allclose(found[[2, 4]], [float(point.v[c]) for c in ("alpha", "beta")], rtol=1e-12)
+            np.testing.assert_allclose(
+                found[[2, 4]], [float(point.v[c]) for c in ("alpha", "beta")], rtol=1e-12
+            )

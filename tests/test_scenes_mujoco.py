@@ -32,7 +32,8 @@ def rod(mass, com, inertia, along=(0, 0, -1)):
 def pair(m1, c1, i1, l1, m2, c2, i2, b, along=(0, 0, -1)):
     end = " ".join(str(l1 * x) for x in along)
     hinge = HINGE.format(b=b)
-    return f"<body>{hinge}{rod(m1, c1, i1, along)}<body pos='{end}'>{hinge}{rod(m2, c2, i2, along)}</body></body>"
+    second = f"<body pos='{end}'>{hinge}{rod(m2, c2, i2, along)}</body>"
+    return f"<body>{hinge}{rod(m1, c1, i1, along)}{second}</body>"
 
 
 def answers(engine, q, v, force):
@@ -65,12 +66,16 @@ def compare(scene, engine, force_of, turn=None, seed=0):
 def test_cart_pole():
     scene = CartPole(friction=0.2)
     pole = f'<joint type="hinge" axis="0 1 0"/>{rod(0.1, 0.5, 0.1 * 0.25 / 3, (0, 0, 1))}'
-    cart = '<joint type="slide" axis="1 0 0" damping="0.2"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    cart = (
+        '<joint type="slide" axis="1 0 0" damping="0.2"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    )
     compare(scene, model(f"<body>{cart}<body>{pole}</body></body>", 9.8), lambda u: [u[0], 0.0])
 
 
 def test_acrobot():
-    scene = Acrobot(mass_2=0.7, com_distance_2=0.3, inertia_1=0.2, inertia_2=0.05, damping=0.1, control="both")
+    scene = Acrobot(
+        mass_2=0.7, com_distance_2=0.3, inertia_1=0.2, inertia_2=0.05, damping=0.1, control="both"
+    )
     engine = model(pair(1.0, 0.5, 0.2, 1.0, 0.7, 0.3, 0.05, 0.1))
     compare(scene, engine, lambda u: u)
 
@@ -87,7 +92,8 @@ def test_two_link_arm():
 def test_rotary_pendulum():
     """The arm lies along x and turns about the vertical, the pendulum about the arm."""
     scene = RotaryPendulum(arm_damping=0.002, damping=0.001)
-    arm = '<joint type="hinge" axis="0 0 1" damping="0.002"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 .001"/>'
+    arm = '<joint type="hinge" axis="0 0 1" damping="0.002"/>'
+    arm += '<inertial pos="0 0 0" mass="1" diaginertia="1 1 .001"/>'
     swing = f'<joint type="hinge" axis="1 0 0" damping="0.001"/>{rod(0.1, 0.15, 0.1 * 0.15**2 / 3)}'
     compare(scene, model(f'<body>{arm}<body pos=".2 0 0">{swing}</body></body>'), lambda u: [u[0], 0.0])
 

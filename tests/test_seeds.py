@@ -66,7 +66,10 @@ def test_seeds_are_what_they_were(old, new, keywords):
         for call in ("energy", "forces", "power"):
             mine, theirs = getattr(after, call)(states, controls), getattr(before, call)(states, controls)
             assert set(theirs) <= set(mine) <= set(theirs) | {"applied"}
-            bound = max(float(np.max(np.abs(v[np.isfinite(v)]), initial=1.0)) for v in map(np.asarray, theirs.values()))
+            bound = max(
+                float(np.max(np.abs(v[np.isfinite(v)]), initial=1.0))
+                for v in map(np.asarray, theirs.values())
+            )
             for name, value in theirs.items():
                 if name != "needed_friction":
                     agree(mine[name], value, bound)
@@ -88,7 +91,9 @@ def test_one_state_is_a_row_of_many(old, new, keywords):
             np.testing.assert_array_equal(many[name], column[name])
     A, B = scene.linearise(states, controls)
     assert A.shape == (3, 5, len(scene.state_names), len(scene.state_names)) and B.shape[-1] == 1
-    np.testing.assert_allclose(A[1, 2], scene.linearise(states[1, 2], controls[1, 2])[0], rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        A[1, 2], scene.linearise(states[1, 2], controls[1, 2])[0], rtol=1e-13, atol=1e-13
+    )
 
 
 @variants
@@ -96,7 +101,12 @@ def test_pictures_are_what_they_were(old, new, keywords):
     for before, after, generator in pairs(old, new, keywords):
         for _ in range(3):
             state = generator.uniform(-1.0, 1.0, len(after.state_names)).tolist()
-            now = Moment(state, generator.uniform(0.1, 1.0), 0.4, turned=0.3 if keywords.get("control") == "tilt" else 0.0)
+            now = Moment(
+                state,
+                generator.uniform(0.1, 1.0),
+                0.4,
+                turned=0.3 if keywords.get("control") == "tilt" else 0.0,
+            )
             assert np.allclose(after.window(now), before.window(now))
             mine, theirs = after.shapes(now), before.shapes(now)
             assert sorted(map(_summary, mine)) == sorted(map(_summary, theirs))

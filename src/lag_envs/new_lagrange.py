@@ -27,12 +27,13 @@ class Symbolic:
 
     pi = sympy.pi
     sin, cos, tan, exp, log, sqrt, tanh = (
-        staticmethod(f) for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.sqrt, sympy.tanh)
+        staticmethod(f)
+        for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.sqrt, sympy.tanh)
     )
     atan = arctan = staticmethod(sympy.atan)
 
 
-# --- a scene as expressions ----------------------------------------------------------------------------------
+# --- a scene as expressions --------------------------------------------------------------------------------
 
 
 def symbolic(scene: Scene) -> Any:
@@ -40,13 +41,15 @@ def symbolic(scene: Scene) -> Any:
     ranges = {f.name: f.metadata for f in dataclasses.fields(scene)}  # type: ignore[arg-type]
     symbols = {}
     for name in scene._numbers():
-        positive = any(ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least"))
+        positive = any(
+            ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
+        )
         symbols[name] = sympy.Symbol(name, positive=True) if positive else sympy.Symbol(name, real=True)
     return twin(scene, symbols)
 
 
 def motion(scene: Scene) -> tuple[Values, Values, Values]:
-    """Return places, velocities and controls as SymPy's functions of time; what rests stands where it rests."""
+    """Return places, velocities and controls as SymPy's functions of time; what rests is where it rests."""
     layout, rests = scene._layout, symbolic(scene).rests()
     q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
     for p in layout.at("rest"):
@@ -87,7 +90,7 @@ def equations(scene: Scene) -> list[sympy.Eq]:
     return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in scene._layout.free]
 
 
-# --- expressions as a scene ----------------------------------------------------------------------------------
+# --- expressions as a scene --------------------------------------------------------------------------------
 
 
 def from_sympy(
@@ -103,15 +106,24 @@ def from_sympy(
     parameters: Mapping,
 ) -> Scene:
     """Return a scene of SymPy expressions; see `Scene.from_sympy`."""
-    maps = {"coordinates": coordinates, "controls": controls, "prescribed": prescribed, "parameters": parameters}
+    maps = {
+        "coordinates": coordinates,
+        "controls": controls,
+        "prescribed": prescribed,
+        "parameters": parameters,
+    }
     items = []
     for what, given in {**maps, "applied": applied or {}}.items():
         try:
             items.append((what, tuple(dict(given).items())))
         except (TypeError, ValueError):
-            raise FormulaError(f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}") from None
-    formulas = tuple((what, sympy.sympify(e)) for what, e in
-                     (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation)))
+            raise FormulaError(
+                f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}"
+            ) from None
+    formulas = tuple(
+        (what, sympy.sympify(e))
+        for what, e in (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation))
+    )
     return _scene_type(name, tuple(items), formulas)()
 
 
@@ -184,7 +196,9 @@ def _name(symbol: Any) -> str:
     raise FormulaError(f"{symbol!r} is no SymPy symbol or function of time; it cannot be a name")
 
 
-_FUNCTIONS = {f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)}
+_FUNCTIONS = {
+    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
+}
 
 
 def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
@@ -221,16 +235,18 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
         if exponent.is_Rational and exponent.q == 2:
             root = xp.sqrt(of(base)) ** abs(int(exponent.p))
             return root if exponent > 0 else 1 / root
-        raise FormulaError(f"{expression} has the power {exponent}; only whole numbers and halves can be powers")
+        raise FormulaError(
+            f"{expression} has the power {exponent}; only whole numbers and halves can be powers"
+        )
     if expression.func in _FUNCTIONS:
         return getattr(xp, _FUNCTIONS[expression.func])(of(expression.args[0]))
     if expression.is_Symbol or isinstance(expression, AppliedUndef | sympy.Derivative):
         time = " (time is no symbol of an energy)" if str(expression) == "t" else ""
         raise FormulaError(
-            f"{expression} is neither a coordinate, its velocity, a control nor a parameter that this formula has{time}; "
-            "declare it"
+            f"{expression} is neither a coordinate, its velocity, a control nor a parameter of this "
+            f"formula{time}; declare it"
         )
     raise FormulaError(
-        f"{expression.func.__name__} in {str(expression):.40} is none of sin, cos, tan, atan, tanh, sqrt, exp, log; "
-        "rewrite it in these"
+        f"{expression.func.__name__} in {expression!s:.40} is none of sin, cos, tan, atan, tanh, sqrt, exp, "
+        "log; rewrite it in these"
     )

@@ -96,7 +96,12 @@ class Point:
     """
 
     def __init__(
-        self, mechanics: Mechanics, parameters: Mapping[Atom, float], state: Sequence, controls: Sequence, xp: Any
+        self,
+        mechanics: Mechanics,
+        parameters: Mapping[Atom, float],
+        state: Sequence,
+        controls: Sequence,
+        xp: Any,
     ) -> None:
         """Work out velocities and accelerations.
 
@@ -162,9 +167,13 @@ class Point:
             return list(np.moveaxis(solved, -1, 0))
         width = slopes[0].shape[-1]
         flat = [x.slope if isinstance(x, Dual) else np.zeros(width) for x in numbers]
-        parts = np.stack(np.broadcast_arrays(*flat, np.zeros((*solved.shape[:-1], width))), axis=-2)[..., :-1, :]
+        parts = np.stack(np.broadcast_arrays(*flat, np.zeros((*solved.shape[:-1], width))), axis=-2)[
+            ..., :-1, :
+        ]
         bend = parts[..., : n * n, :].reshape(*parts.shape[:-2], n, n, width)
-        slope = np.linalg.solve(matrix, parts[..., n * n :, :] - np.einsum("...ijk,...j->...ik", bend, solved))
+        slope = np.linalg.solve(
+            matrix, parts[..., n * n :, :] - np.einsum("...ijk,...j->...ik", bend, solved)
+        )
         return [Dual(solved[..., i], slope[..., i, :]) for i in range(n)]
 
     @staticmethod
@@ -172,7 +181,7 @@ class Point:
         stacked = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in numbers)), axis=-1)
         return stacked[..., : n * n].reshape(*stacked.shape[:-1], n, n), stacked[..., n * n :]
 
-    # --- what follows ----------------------------------------------------------------------------------------
+    # --- what follows --------------------------------------------------------------------------------------
 
     def rates(self) -> list:
         """Return the time derivatives of the state's entries."""
@@ -183,7 +192,10 @@ class Point:
             turned = self.of(self.mechanics.mass_rate)
             n = range(len(layout.free))
             right = self._drive(self.mechanics.coupling_rate)
-            right = [r - sum(turned[len(n) * i + j] * self.shift[j] for j in n) for i, r in zip(n, right, strict=True)]
+            right = [
+                r - sum(turned[len(n) * i + j] * self.shift[j] for j in n)
+                for i, r in zip(n, right, strict=True)
+            ]
             drift = dict(zip(layout.free, self.solve(right), strict=True))
         rates = []
         for entry in layout.state:
@@ -211,7 +223,9 @@ class Point:
     def power(self) -> dict[str, Any]:
         """Return the powers of drive and applied forces and that lost to drag [W]."""
         layout = self.mechanics.layout
-        carried = [p.name for p in layout.at("acceleration", "rate") if f"{p.name}_dot" not in layout.left_out]
+        carried = [
+            p.name for p in layout.at("acceleration", "rate") if f"{p.name}_dot" not in layout.left_out
+        ]
         moving = [*layout.free, *carried]
         speeds = [self.values[velocity(name)] for name in moving]
         drive = sum(f * self.values[velocity(m)] for m, f in zip(carried, self.force(carried), strict=True))

@@ -1,7 +1,7 @@
 """What a scene declares: coordinates, controls and state, with every name and unit checked or derived.
 
-No unit is ever read: what a control does follows from its name, ``s_ddot``, ``s_dot`` or ``s`` of a prescribed
-coordinate ``s``, and the unit of a rate is the coordinate's with ``/s`` behind it.
+No unit is ever read: what a control does follows from its name, ``s_ddot``, ``s_dot`` or ``s`` of a
+prescribed coordinate ``s``, and the unit of a rate is the coordinate's with ``/s`` behind it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,12 @@ class Layout:
 
 def check_name(where: str, name: Any) -> str:
     """Return a name that can follow a dot in a formula, or raise a FormulaError."""
-    if not isinstance(name, str) or not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+    if (
+        not isinstance(name, str)
+        or not name.isidentifier()
+        or keyword.iskeyword(name)
+        or name.startswith("_")
+    ):
         why = "a keyword of Python" if isinstance(name, str) and keyword.iskeyword(name) else "no name"
         raise FormulaError(f"{where}: {name!r} is {why}; use letters, digits and _ as in q.theta_1")
     return name
@@ -103,7 +108,11 @@ def units(where: str, value: Any) -> dict[str, str]:
 
 
 def _names(where: str, value: Any) -> tuple[str, ...]:
-    if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(n, str) for n in value):
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence)
+        or not all(isinstance(n, str) for n in value)
+    ):
         raise FormulaError(f'{where} must be names in order, as in ("theta", "theta_dot"), got {value!r:.80}')
     return tuple(value)
 
@@ -146,7 +155,8 @@ def make_layout(
     if sorted(order) != sorted(entry.name for entry in kept):
         names = ", ".join(entry.name for entry in kept)
         raise FormulaError(
-            f"{of}.state must be an order of {names}, got {', '.join(order)}; left_out names what it leaves out"
+            f"{of}.state must be an order of {names}, got {', '.join(order)}; "
+            "left_out names what it leaves out"
         )
     by_name = {entry.name: entry for entry in kept}
     if len(by_name) < len(kept):
@@ -228,7 +238,9 @@ def _check_left_out(of: str, omitted: Sequence[str], full: Sequence[Entry], free
         if entry.kind == "place":
             continue
         if entry.coordinate in free:
-            raise FormulaError(f"{of}.left_out: {name!r} is the rate of a free coordinate, which moves by itself")
+            raise FormulaError(
+                f"{of}.left_out: {name!r} is the rate of a free coordinate, which moves by itself"
+            )
         if entry.coordinate not in omitted:
             raise FormulaError(
                 f"{of}.left_out: {entry.coordinate!r} follows from {name!r}; leave out both, or neither"
@@ -237,7 +249,7 @@ def _check_left_out(of: str, omitted: Sequence[str], full: Sequence[Entry], free
 
 def _reactions(of: str, declared: Any, moved: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
     if not isinstance(declared, Mapping):
-        raise FormulaError(f'{of}.reactions must map names to prescribed coordinates, got {declared!r:.80}')
+        raise FormulaError(f"{of}.reactions must map names to prescribed coordinates, got {declared!r:.80}")
     for name, coordinate in declared.items():
         check_name(f"{of}.reactions", name)
         if coordinate not in moved:
@@ -252,7 +264,7 @@ def _ratios(of: str, declared: Any, forces: Sequence[tuple[str, str]]) -> tuple[
     names = [name for name, _ in forces]
     found = []
     if not isinstance(declared, Mapping):
-        raise FormulaError(f'{of}.ratios must map names to (friction, normal), got {declared!r:.80}')
+        raise FormulaError(f"{of}.ratios must map names to (friction, normal), got {declared!r:.80}")
     for name, pair in declared.items():
         check_name(f"{of}.ratios", name)
         if isinstance(pair, str) or not isinstance(pair, Sequence) or len(pair) != 2:

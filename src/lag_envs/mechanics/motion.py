@@ -1,7 +1,7 @@
-"""The motion of a scene as expressions: what a stepper steps, and what energies, forces and powers follow from.
+"""The motion of a scene as expressions: what a stepper steps, and what forces and powers follow from.
 
-A resting coordinate, a held place and a held rate are put in before anything is derived or after it, whichever
-leaves less: what rests leaves no code.
+A resting coordinate, a held place and a held rate are put in before anything is derived or after it,
+whichever leaves less: what rests leaves no code.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from lag_envs.mechanics.recording import Record, control, parameter
 class Mechanics:
     """The equations of motion of a scene, for its mode and its structural fields.
 
-    The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. Symbols in these are places and velocities of
-    the free coordinates, places and velocities of prescribed ones whose acceleration is controlled, places of
-    those whose rate is, controls, and parameters. A held acceleration, rate or place stands as
-    the control that sets it.
+    The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. Symbols in these are places and
+    velocities of the free coordinates, places and velocities of prescribed ones whose acceleration is
+    controlled, places of those whose rate is, controls, and parameters. A held acceleration,
+    rate or place stands as the control that sets it.
 
     Attributes
     ----------
@@ -39,8 +39,8 @@ class Mechanics:
     force : tuple of Expr
         Right-hand sides, one for each free coordinate.
     coupling : dict
-        For a prescribed coordinate m whose rate is held, entries G_im of the mass matrix by (i, name of m): the
-        state carries w = v + M⁻¹ Σ_m G_im ṡ_m.
+        For a prescribed coordinate m whose rate is held, entries G_im of the mass matrix by (i, name of m):
+        the state carries w = v + M⁻¹ Σ_m G_im ṡ_m.
     zeros : tuple of str
         Parameters that are 0 and stand in a denominator or a function: they were put in before anything was
         derived. Others that are 0 leave out their terms when code is made.
@@ -110,7 +110,7 @@ class Mechanics:
 
     @cached_property
     def gyroscopic(self) -> tuple[Expr, Expr] | None:
-        """T₁ and T₀, the parts of T of first and of no degree in the velocities; None where there are none."""
+        """T₁ and T₀, the parts of T of first and of no degree in the velocities, or None."""
         parts: list[dict] = [{}, {}]
         for monomial, c in collect(self.record.energies.kinetic).terms.items():
             degree = sum(n for atom, n in monomial if atom.kind == "velocity")
@@ -122,7 +122,9 @@ class Mechanics:
 
     def weight(self, name: str) -> list[Expr]:
         """Return the terms of ∂V/∂q of a coordinate with sines and cosines left out, which are 1 at most."""
-        slope = substitute(derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record))
+        slope = substitute(
+            derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record)
+        )
         bare = []
         for monomial, c in slope.sorted_terms():
             bare.append(Expr({tuple((a, n) for a, n in monomial if a.function not in ("sin", "cos")): c}))
@@ -132,8 +134,8 @@ class Mechanics:
     def full(self) -> Equations:
         """Lagrange's equations of all coordinates, with what rests put in after they were derived.
 
-        The accelerations of the prescribed coordinates are not put in: see `Equations`. The force that moves or
-        holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
+        The accelerations of the prescribed coordinates are not put in: see `Equations`. The force that moves
+        or holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
         """
         moving = [p.name for p in self.layout.prescribed]
         found = derive(self.layout.free, moving, self.record.energies)
@@ -239,5 +241,6 @@ def _check_left_out(of: str, layout: Layout, mass: Mapping, force: list[Expr]) -
             name = {"place": symbol.name, "velocity": f"{symbol.name}_dot"}.get(symbol.kind)
             if name in omitted:
                 raise FormulaError(
-                    f"{of}.left_out: the motion of the free coordinates depends on {name!r}; keep it in the state"
+                    f"{of}.left_out: the motion of the free coordinates depends on {name!r}; "
+                    "keep it in the state"
                 )

@@ -67,7 +67,9 @@ class Values:
                 return found[name]
         if name.startswith("__"):
             raise AttributeError(name)
-        raise FormulaError(f"there is no {self._what} {name!r}, only {', '.join(self._items) or 'none at all'}")
+        raise FormulaError(
+            f"there is no {self._what} {name!r}, only {', '.join(self._items) or 'none at all'}"
+        )
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, str):
@@ -76,7 +78,9 @@ class Values:
         try:
             return values[index]
         except IndexError:
-            raise FormulaError(f"there is no {self._what} number {index}, only {len(values)} of them") from None
+            raise FormulaError(
+                f"there is no {self._what} number {index}, only {len(values)} of them"
+            ) from None
 
     def __iter__(self) -> Iterator[Any]:
         return iter(self._items.values())
@@ -169,8 +173,14 @@ def check_signature(scene: Any, name: str) -> None:
         return
     plain = [p for p in taken if p.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]
     if len(plain) != len(arguments) or len(plain) != len(taken):
-        time = "; time is no argument, a prescribed coordinate moves" if {"t", "time"} & {p.name for p in taken} else ""
-        raise FormulaError(f"{of}.{name} must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}")
+        time = (
+            "; time is no argument, a prescribed coordinate moves"
+            if {"t", "time"} & {p.name for p in taken}
+            else ""
+        )
+        raise FormulaError(
+            f"{of}.{name} must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}"
+        )
 
 
 def single(value: Any, what: str = "") -> Expr:
@@ -199,8 +209,8 @@ def record(scene: Any, layout: Layout) -> Record:
     for a, b in zip(first.exprs(), second.exprs(), strict=True):
         if not a.same(b):
             raise FormulaError(
-                f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
-                "place, velocity, controls and fields only, not on time or chance"
+                f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend "
+                "on place, velocity, controls and fields only, not on time or chance"
             )
     _check_controls(scene, layout, first)
     return first
@@ -241,8 +251,11 @@ def _record(scene: Any, layout: Layout) -> Record:
 
 def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:
     if not isinstance(values, Mapping):
-        raise FormulaError(f"it must return numbers by {what}, as in {{{names[0]!r}: ...}}, got {values!r:.60}" if names
-                           else f"it must return {{}}, since there is no {what}, got {values!r:.60}")
+        raise FormulaError(
+            f"it must return numbers by {what}, as in {{{names[0]!r}: ...}}, got {values!r:.60}"
+            if names
+            else f"it must return {{}}, since there is no {what}, got {values!r:.60}"
+        )
     for name in values:
         if name not in names:
             raise FormulaError(f"there is no {what} {name!r}, only {', '.join(names) or 'none at all'}")

@@ -1,7 +1,7 @@
 """Physics: parameters and energies of the scenes, and what follows from them.
 
-`Scene` is what a scene of one's own derives from: it states its energies, and everything else follows. The first
-three scenes have hand-made flows (`lag_envs.scenes.base`).
+`Scene` is what a scene of one's own derives from: it states its energies, and everything else follows. The
+first three scenes have hand-made flows (`lag_envs.scenes.base`).
 """
 
 from lag_envs.scenes.acrobot import Acrobot

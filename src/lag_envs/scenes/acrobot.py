@@ -52,8 +52,8 @@ class Acrobot(Scene):
     -----
     State (theta_1, theta_1_dot, theta_2, theta_2_dot). The controls are the torques `shoulder_torque`, on the
     first link, and `elbow_torque`, on the second with its reaction on the first. The zero of the potential
-    energy lies at the shoulder. With ``inertia_1=inertia_2=1`` and ``gravity=9.8`` it is the model of Gymnasium's
-    `Acrobot-v1`, as in Sutton and Barto's book.
+    energy lies at the shoulder. With ``inertia_1=inertia_2=1`` and ``gravity=9.8`` it is the model of
+    Gymnasium's `Acrobot-v1`, as in Sutton and Barto's book.
     """
 
     mass_1: float = parameter(1.0, "kg", above=0.0)
@@ -118,4 +118,8 @@ def link(length: float) -> list[Shape]:
     """Return a link that hangs down from its joint [m]."""
     half = 0.05 * length
     outline = [(-half, half), (-half, -length - half), (half, -length - half), (half, half)]
-    return [Polygon(outline), Circle((0.0, 0.0), 0.5 * half, "hole"), Circle((0.0, -length), 0.5 * half, "mark")]
+    return [
+        Polygon(outline),
+        Circle((0.0, 0.0), 0.5 * half, "hole"),
+        Circle((0.0, -length), 0.5 * half, "mark"),
+    ]

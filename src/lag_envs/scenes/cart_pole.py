@@ -89,7 +89,9 @@ class CartPole(Scene):
         size, long = 0.2 * self.half_length, 2.0 * self.half_length
         wide = 0.3 * size
         return {
-            "cart": [Polygon([(-2 * size, -size), (2 * size, -size), (2 * size, size), (-2 * size, size)], "frame")],
+            "cart": [
+                Polygon([(-2 * size, -size), (2 * size, -size), (2 * size, size), (-2 * size, size)], "frame")
+            ],
             "pole": [
                 Polygon([(-wide, -wide), (wide, -wide), (wide, long), (-wide, long)]),
                 Circle((0.0, 0.0), 0.5 * wide, "hole"),

@@ -112,5 +112,7 @@ class Chain(Scene):
     def bodies(self) -> dict[str, list[Shape]]:
         """Return the support, and the bars as they hang down."""
         wide, high = 0.2 * self.length, 0.08 * self.length
-        support: list[Shape] = [Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame")]
+        support: list[Shape] = [
+            Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame")
+        ]
         return {"support": support, **{f"bar_{i + 1}": link(self.length) for i in range(self.bars)}}

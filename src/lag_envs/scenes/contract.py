@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import dataclasses
 import inspect
 import math
@@ -9,7 +10,7 @@ import numbers
 import sys
 import weakref
 from abc import ABCMeta
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeVar, dataclass_transform
 
@@ -17,14 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.mechanics import motion, recording
-from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, evaluate
+from lag_envs.mechanics.algebra import Atom, FormulaError, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import Carrying, Dual, Numeric, Point
 from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
-from lag_envs.scenes.base import StepRefused
 from lag_envs.scenes import picture
+from lag_envs.scenes.base import StepRefused
 from lag_envs.scenes.shapes import Moment, Shape, Window
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shap
 
 
 def parameter(
-    default: float | None | Callable[[Any], float | None],
+    default: float | Callable[[Any], float | None] | None,
     unit: str,
     *,
     above: float | None = None,
@@ -114,6 +115,10 @@ def real_array(name: str, values: ArrayLike) -> Array:
     return array.astype(np.float64)
 
 
+# A class that goes to another process by value before it is used takes its fields along, and in them this
+# mark, which is known by its identity: as a copy it would be taken for a default.
+copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
+
 #: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
 _admitted: weakref.WeakKeyDictionary[type, set] = weakref.WeakKeyDictionary()
 
@@ -132,14 +137,16 @@ class SceneType(ABCMeta):
     def __signature__(cls) -> inspect.Signature:
         """The signature of a call, for help."""
         _complete(cls)
-        signature = inspect.signature(cls.__init__)
+        signature = inspect.signature(cls.__init__)  # type: ignore[misc]
         return signature.replace(parameters=list(signature.parameters.values())[1:])
 
 
 def _complete(cls: type) -> None:
     """Make the class a frozen dataclass, unless a decorator has."""
     if cls is Scene:
-        raise FormulaError("Scene is the base of scenes; derive a class with coordinates, kinetic and potential")
+        raise FormulaError(
+            "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
+        )
     if "__dataclass_fields__" not in vars(cls):
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
@@ -178,8 +185,8 @@ class Scene(metaclass=SceneType):
     prescribed : mapping from str to str
         Coordinates that are moved from outside.
     controls : mapping from str to str
-        Controls and their units. ``s_ddot``, ``s_dot`` or ``s`` sets the acceleration, the rate or the place of a
-        prescribed coordinate ``s``; any other acts in `applied` or `dissipation`.
+        Controls and their units. ``s_ddot``, ``s_dot`` or ``s`` sets the acceleration, the rate or the place
+        of a prescribed coordinate ``s``; any other acts in `applied` or `dissipation`.
     modes : mapping from str to mapping
         In place of `controls`: several sets of them, chosen by the keyword ``control``.
     reactions : mapping from str to str
@@ -247,12 +254,18 @@ class Scene(metaclass=SceneType):
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         for parent in cls.__mro__[1:]:
-            if isinstance(parent, SceneType) and parent is not Scene and "__dataclass_fields__" not in vars(parent):
+            if (
+                isinstance(parent, SceneType)
+                and parent is not Scene
+                and "__dataclass_fields__" not in vars(parent)
+            ):
                 _complete(parent)
         own, annotations = vars(cls), dict(inspect.get_annotations(cls))
         faults = []
         for name in (*MAPPINGS, *SEQUENCES):
-            if name in annotations and not str(annotations[name]).replace("typing.", "").startswith("ClassVar"):
+            if name in annotations and not str(annotations[name]).replace("typing.", "").startswith(
+                "ClassVar"
+            ):
                 # A dataclass would take it for a field; what is wrong is said when the class is used.
                 if isinstance(own.get(name), dataclasses.Field):
                     faults.append(f"{name} is part of every scene; give the parameter another name")
@@ -297,7 +310,9 @@ class Scene(metaclass=SceneType):
             key = self._structure
             known = key in _admitted.setdefault(type(self), set())
         except TypeError as error:
-            raise FormulaError(f"{type(self).__name__}: {error}; structural fields must be hashable") from error
+            raise FormulaError(
+                f"{type(self).__name__}: {error}; structural fields must be hashable"
+            ) from error
         if not known:
             _check_names(self)
             _check_motion(self, self.mechanics)
@@ -311,7 +326,7 @@ class Scene(metaclass=SceneType):
 
     @property
     def _structure(self) -> tuple:
-        """All that decides which code steps the scene: scenes of a class that agree in it differ in numbers only."""
+        """All that decides which code steps the scene; scenes that agree in it differ in numbers only."""
         cls, numbers = type(self), self._numbers()
         formulas = tuple(getattr(cls, name) for name in ("rests", *recording.ARGUMENTS))
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
@@ -325,8 +340,11 @@ class Scene(metaclass=SceneType):
     def __delattr__(self, name: str) -> NoReturn:
         raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+    def __reduce__(self) -> tuple:
+        return _restore, (
+            type(self),
+            {name: value for name, value in vars(self).items() if not name.startswith("_")},
+        )
 
     # --- what follows: names -------------------------------------------------------------------------------
 
@@ -355,7 +373,9 @@ class Scene(metaclass=SceneType):
     def mechanics(self) -> Mechanics:
         """The derived equations, as expressions."""
         if TWIN in vars(self):
-            raise FormulaError("a formula calls what is derived from it; it may use parameters and other formulas")
+            raise FormulaError(
+                "a formula calls what is derived from it; it may use parameters and other formulas"
+            )
         found = vars(self).get("_cached_mechanics")
         if found is None:
             found = motion.derive_motion(self, self._layout, recording.record(self, self._layout))
@@ -388,7 +408,9 @@ class Scene(metaclass=SceneType):
         """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
         array = self._check_states(state)
         if array.ndim != 1:
-            raise ValueError(f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}")
+            raise ValueError(
+                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+            )
         return array
 
     def _check_states(self, states: ArrayLike) -> Array:
@@ -410,7 +432,9 @@ class Scene(metaclass=SceneType):
         array, names = real_array("the control", control), self.control_names
         bad = ~np.isfinite(array)
         if bad.any():
-            raise ValueError(f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}")
+            raise ValueError(
+                f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
+            )
         if array.ndim == 0 and (len(names) == 1 or array == 0.0):
             return np.full(len(names), float(array))
         if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):
@@ -434,8 +458,8 @@ class Scene(metaclass=SceneType):
     def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
         states, controls, shape = self._check_both(state, control)
-        columns = [np.moveaxis(array, -1, 0) for array in (states, controls)]
-        return Point(self.mechanics, self._symbols(), *columns, Numeric), shape
+        y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
+        return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
 
     def _symbols(self) -> dict[Atom, float]:
         """Return the parameters' values by symbol."""
@@ -488,7 +512,8 @@ class Scene(metaclass=SceneType):
         """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
 
         Those of `reactions` have the names that it gives; what moves another coordinate s is ``drive_s``. A
-        ratio |F|/N is infinite where N is not above 1e-12 of the weight: the contact carries nothing, or pulls.
+        ratio |F|/N is infinite where N is not above 1e-12 of the weight: the contact carries nothing, or
+        pulls.
 
         Parameters
         ----------
@@ -514,8 +539,8 @@ class Scene(metaclass=SceneType):
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the powers of ``drive`` and ``applied`` forces and that lost to ``drag`` [W].
 
-        Energy changes by drive + applied - drag. What drives a coordinate whose rate the state leaves out is the
-        inertial force of its frame.
+        Energy changes by drive + applied - drag. What drives a coordinate whose rate the state leaves out is
+        the inertial force of its frame.
         """
         point, shape = self._point(state, control)
         return {name: _shaped(value, shape) for name, value in point.power().items()}
@@ -562,7 +587,9 @@ class Scene(metaclass=SceneType):
             found = self._stepper.constants({name: getattr(self, name) for name in self._numbers()})
             for name, value in found.items():
                 if not math.isfinite(value):
-                    raise ValueError(f"these parameters make a coefficient of the motion, {name}, {value}: {self}")
+                    raise ValueError(
+                        f"these parameters make a coefficient of the motion, {name}, {value}: {self}"
+                    )
             vars(self)["_cached_constants"] = found
         return found
 
@@ -573,7 +600,9 @@ class Scene(metaclass=SceneType):
         return usual_order(dt)
 
     def _code(self) -> StepCode:
-        return self._stepper.code(frozenset(name for name, value in self._constants().items() if value == 0.0))
+        return self._stepper.code(
+            frozenset(name for name, value in self._constants().items() if value == 0.0)
+        )
 
     def simulate(self, state: ArrayLike, controls: ArrayLike | int, dt: float) -> Array:
         """Step the equations of motion with each control held for one step.
@@ -630,7 +659,9 @@ class Scene(metaclass=SceneType):
             raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
         bad = ~np.isfinite(array)
         if bad.any():
-            raise ValueError(f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}")
+            raise ValueError(
+                f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}"
+            )
         return array
 
     def step_bound(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> StepBound:
@@ -752,8 +783,8 @@ class Scene(metaclass=SceneType):
         kinetic, potential, dissipation : SymPy expression
             The energies [J], and Rayleigh's function [W].
         coordinates, prescribed, controls : dict from symbol to str
-            Free and prescribed coordinates and controls with their units. The velocity of a function of time is its
-            derivative, ``theta.diff(t)``, that of a plain symbol ``theta`` the symbol ``theta_dot``.
+            Free and prescribed coordinates and controls with their units. The velocity of a function of time
+            is its derivative, ``theta.diff(t)``, that of a plain symbol ``theta`` the symbol ``theta_dot``.
         applied : dict from symbol to expression, optional
             Generalised forces by coordinate.
         parameters : dict from symbol to float
@@ -762,7 +793,7 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         Scene
-            A scene with these numbers. Called with keywords it gives one with other numbers: ``scene(m=2.0)``.
+            A scene with these numbers. Called with keywords it gives one with others: ``scene(m=2.0)``.
 
         Examples
         --------
@@ -770,8 +801,8 @@ class Scene(metaclass=SceneType):
         >>> theta, theta_dot, m, l, tau = sympy.symbols("theta theta_dot m l tau")
         >>> pendulum = Scene.from_sympy(
         ...     "Pendulum", m * l**2 * theta_dot**2 / 2, -9.81 * m * l * sympy.cos(theta),
-        ...     coordinates={theta: "rad"}, controls={tau: "N m"}, applied={theta: tau}, parameters={m: 1.0, l: 2.0},
-        ... )
+        ...     coordinates={theta: "rad"}, controls={tau: "N m"}, applied={theta: tau}, parameters={m: 1.0,
+        ... l: 2.0}, )
         >>> pendulum.acceleration([0.0, 0.0], 1.0)["theta"].item(), pendulum(m=0.5).m
         (0.25, 0.5)
         """
@@ -821,7 +852,8 @@ class Scene(metaclass=SceneType):
         states = np.array([self.simulate(state, held, t)[1] for t in [*times, dt]])
         power = self.power(states[:-1], controls)
         work, loss = (
-            float(np.sum(0.5 * dt * weights * value)) for value in (power["drive"] + power["applied"], power["drag"])
+            float(np.sum(0.5 * dt * weights * value))
+            for value in (power["drive"] + power["applied"], power["drag"])
         )
         name = "total" if self.mechanics.gyroscopic is None else "jacobi"
         change = float(self.energy(states[-1], controls)[name] - self.energy(state, controls)[name])
@@ -831,6 +863,15 @@ class Scene(metaclass=SceneType):
 def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
     """Return a float64 array of a shape, or a number where the shape is empty."""
     return np.broadcast_to(np.asarray(value, dtype=np.float64), shape).copy()[()]
+
+
+def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
+    """Return a scene from a pickle, perhaps the first of its class in this process."""
+    _complete(cls)
+    scene = object.__new__(cls)
+    vars(scene).update(state)
+    scene._admit()
+    return scene
 
 
 def _controls(scene: Scene) -> tuple[Any, tuple[str, ...]]:
@@ -855,7 +896,9 @@ def _check_class(cls: type[Scene]) -> None:
     if faults:
         raise FormulaError(f"{of}.{faults[0]}")
     if not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-        raise FormulaError(f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)")
+        raise FormulaError(
+            f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)"
+        )
 
 
 def _check_names(scene: Scene) -> None:
@@ -882,10 +925,14 @@ def _check_names(scene: Scene) -> None:
     for field in dataclasses.fields(scene):  # type: ignore[arg-type]
         check_name(of, field.name)
         if field.name in taken:
-            raise FormulaError(f"{of}: the field {field.name!r} has the name of {taken[field.name]}; choose another")
+            raise FormulaError(
+                f"{of}: the field {field.name!r} has the name of {taken[field.name]}; choose another"
+            )
     others = set(layout.controls) - {p.control for p in layout.prescribed}
     for name in sorted(others & {e.name for e in layout.state}):
-        raise FormulaError(f"{of}: the control {name!r} has the name of an entry of the state; choose another")
+        raise FormulaError(
+            f"{of}: the control {name!r} has the name of an entry of the state; choose another"
+        )
 
 
 def _check_bodies(scene: Scene) -> None:
@@ -897,7 +944,9 @@ def _check_bodies(scene: Scene) -> None:
         raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
     for body in bodies:
         if body not in found.record.poses:
-            raise FormulaError(f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})")
+            raise FormulaError(
+                f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
+            )
     try:
         found.full  # noqa: B018
     except FormulaError as error:
@@ -925,8 +974,8 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
     if seen and max(seen) < 1e-13:
         what = "singular" if max(seen) > -1e-13 else "not positive"
         raise FormulaError(
-            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; every "
-            "motion of the free coordinates needs a positive kinetic energy"
+            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; "
+            "every motion of the free coordinates needs a positive kinetic energy"
         )
 
 

@@ -13,9 +13,9 @@ Rolling, the cylinder turns at Omega = (R psi' - a theta' + slip')/r::
 
     T = m ((a - gap)² theta'² + gap'²)/2 + I Omega²/2,   V = -m g (a - gap) cos(theta)
 
-`gap` and `slip` rest at 0; they are there so that the contact's forces follow. A round shell has no orientation:
-a static tilt does nothing, its acceleration drives. Drag acts at the small cylinder's axis, as of a medium that
-turns with the shell. The shell's own inertia is not part of the scene.
+`gap` and `slip` rest at 0; they are there so that the contact's forces follow. A round shell has no
+orientation: a static tilt does nothing, its acceleration drives. Drag acts at the small cylinder's axis, as
+of a medium that turns with the shell. The shell's own inertia is not part of the scene.
 """
 
 from __future__ import annotations
@@ -25,7 +25,19 @@ import math
 from typing import Any
 
 from lag_envs.scenes.contract import Scene, parameter
-from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window, arc, polar, roller
+from lag_envs.scenes.shapes import (
+    Arrow,
+    Circle,
+    Line,
+    Moment,
+    Point,
+    Polygon,
+    Shape,
+    Window,
+    arc,
+    polar,
+    roller,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,7 +77,9 @@ class CylinderInCylinder(Scene):
     mass: float = parameter(1.0, "kg", above=0.0)
     shell_radius: float = parameter(0.5, "m", above=0.0)
     radius: float = parameter(0.1, "m", above=0.0)
-    inertia: float = parameter(lambda shell: 0.5 * shell.mass * shell.radius * shell.radius, "kg m²", least=0.0)
+    inertia: float = parameter(
+        lambda shell: 0.5 * shell.mass * shell.radius * shell.radius, "kg m²", least=0.0
+    )
     damping: float = parameter(0.0, "N m s", least=0.0)
     gravity: float = parameter(9.81, "m/s²", least=0.0)
     control: str = "tilt"

@@ -13,8 +13,8 @@ The cylinder's centre is at x along the surface and h = R + lift above it, its r
 
 `lift` and `slip` rest at 0; they are there so that the contact's forces follow.
 
-While the rate phi' is held, the state carries w = x' + R phi' in place of x': it stays continuous when the rate is
-switched, whereas x' jumps by -R times the switch.
+While the rate phi' is held, the state carries w = x' + R phi' in place of x': it stays continuous when the
+rate is switched, whereas x' jumps by -R times the switch.
 """
 
 from __future__ import annotations
@@ -64,10 +64,15 @@ class Incline(Scene):
 
     mass: float = parameter(1.0, "kg", above=0.0)
     radius: float = parameter(0.05, "m", above=0.0)
-    inertia: float = parameter(lambda incline: 0.5 * incline.mass * incline.radius * incline.radius, "kg m²", least=0.0)
+    inertia: float = parameter(
+        lambda incline: 0.5 * incline.mass * incline.radius * incline.radius, "kg m²", least=0.0
+    )
     damping: float = parameter(0.0, "N s/m", least=0.0)
     tilt: float | None = parameter(
-        lambda incline: 0.26 if incline.control == "damping" else None, "rad", above=-math.pi / 2, below=math.pi / 2
+        lambda incline: 0.26 if incline.control == "damping" else None,
+        "rad",
+        above=-math.pi / 2,
+        below=math.pi / 2,
     )
     gravity: float = parameter(9.81, "m/s²", least=0.0)
     control: str = "damping"
@@ -117,7 +122,9 @@ class Incline(Scene):
     def poses(self, q: Any, xp: Any) -> Any:
         """Return place and angle of the cylinder; rolling ties its own angle to its place."""
         c, s = xp.cos(q.phi), xp.sin(q.phi)
-        return {"cylinder": (q.x * c + self.radius * s, self.radius * c - q.x * s, -q.x / self.radius - q.phi)}
+        return {
+            "cylinder": (q.x * c + self.radius * s, self.radius * c - q.x * s, -q.x / self.radius - q.phi)
+        }
 
     def bodies(self) -> dict[str, list[Shape]]:
         """Return the cylinder."""

@@ -61,7 +61,9 @@ class PivotedBar(Scene):
 
     mass: float = parameter(0.2, "kg", above=0.0)
     com_distance: float = parameter(0.3, "m", above=0.0)
-    inertia: float = parameter(lambda bar: bar.mass * bar.com_distance * bar.com_distance / 3.0, "kg m²", least=0.0)
+    inertia: float = parameter(
+        lambda bar: bar.mass * bar.com_distance * bar.com_distance / 3.0, "kg m²", least=0.0
+    )
     damping: float = parameter(0.0, "N m s", least=0.0)
     gravity: float = parameter(9.81, "m/s²", least=0.0)
     track: float | None = parameter(0.5, "m", above=0.0, infinite=True, optional=True)

@@ -22,7 +22,7 @@ Pose = tuple[float, float, float]
 
 
 def turning(scene: Scene, state: Sequence[float]) -> tuple[float, ...]:
-    """Return the rates of the places that the state leaves out, in the order of `left_out`; unknown ones are 0."""
+    """Return the rates of the places that the state leaves out, in their order; unknown ones are 0."""
     layout = scene._layout
     rates = {entry.coordinate: state[i] for i, entry in enumerate(layout.state) if entry.kind == "velocity"}
     return tuple(float(rates.get(name, 0.0)) for name in layout.left_out if name in layout.names)
@@ -37,7 +37,13 @@ def poses(scene: Scene, now: Moment) -> dict[str, Pose]:
     rests = scene.rests()
     q = dict.fromkeys(layout.names, 0.0)
     for name, level, by in layout.prescribed:
-        q[name] = rests.get(name, 0.0) if level == "rest" else controls.get(by or "", 0.0) if level == "place" else 0.0
+        q[name] = (
+            rests.get(name, 0.0)
+            if level == "rest"
+            else controls.get(by or "", 0.0)
+            if level == "place"
+            else 0.0
+        )
     q |= {name: turned[name] for name in turned if name in q}
     q |= {entry.coordinate: now.state[i] for i, entry in enumerate(layout.state) if entry.kind == "place"}
     return _poses(scene, q)
@@ -75,7 +81,10 @@ def _reach(scene: Scene) -> float:
     generator, far = np.random.default_rng(5), 0.0
     scale = max(sizes.values(), default=1.0) or 1.0
     for _ in range(256):
-        q = {n: generator.uniform(-scale, scale) if n in lengths else generator.uniform(-math.pi, math.pi) for n in names}
+        q = {
+            n: generator.uniform(-scale, scale) if n in lengths else generator.uniform(-math.pi, math.pi)
+            for n in names
+        }
         found = _poses(scene, q)
         x, y, _ = next(iter(found.values()), (0.0, 0.0, 0.0))
         for body, pose in found.items():

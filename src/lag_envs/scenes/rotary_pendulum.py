@@ -48,8 +48,8 @@ class RotaryPendulum(Scene):
 
     Notes
     -----
-    State (phi, phi_dot, theta, theta_dot). Control: torque [N m]. The zero of the potential energy lies at the
-    hinge. The defaults are of the size of desktop apparatus.
+    State (phi, phi_dot, theta, theta_dot). Control: torque [N m]. The zero of the potential energy lies at
+    the hinge. The defaults are of the size of desktop apparatus.
     """
 
     arm_length: float = parameter(0.2, "m", above=0.0)

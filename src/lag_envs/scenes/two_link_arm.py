@@ -8,10 +8,10 @@ r"""A robot's arm of two links in a vertical plane, with a motor in each joint a
                    theta_2   angle of the forearm against the upper arm,
                              both positive counter-clockwise
 
-With l the lengths of the uniform links, m their masses, p the load's and w = theta_1' + theta_2', centres of mass
-G at half length::
+With l the lengths of the uniform links, m their masses and p the load's, G their centres at half length, and
+w = theta_1' or theta_1' + theta_2' their rates::
 
-    T = Σ (m |G'|² + m l²/12 ω²)/2 + p |C'|²/2,   V = g (Σ m y(G) + p y(C))
+    T = Σ (m |G'|² + m l² w²/12)/2 + p |C'|²/2,   V = g (Σ m y(G) + p y(C))
 
 ``gravity=0`` is an arm that moves in a horizontal plane.
 """
@@ -44,8 +44,9 @@ class TwoLinkArm(Scene):
 
     Notes
     -----
-    State (theta_1, theta_1_dot, theta_2, theta_2_dot). Controls `shoulder` and `elbow` [N m]; the elbow's torque
-    acts on the forearm, with its reaction on the upper arm. The zero of the potential energy lies at the shoulder.
+    State (theta_1, theta_1_dot, theta_2, theta_2_dot). Controls `shoulder` and `elbow` [N m]; the elbow's
+    torque acts on the forearm, with its reaction on the upper arm. The zero of the potential energy lies at
+    the shoulder.
     """
 
     mass_1: float = parameter(2.0, "kg", above=0.0)
@@ -68,7 +69,9 @@ class TwoLinkArm(Scene):
             a, b = upper * first, fore * second
             return mass * (a**2 + b**2 + 2 * a * b * xp.cos(q.theta_2))
 
-        turning = self.mass_1 * (self.length_1 * first) ** 2 / 12 + self.mass_2 * (self.length_2 * second) ** 2 / 12
+        turning = (
+            self.mass_1 * (self.length_1 * first) ** 2 / 12 + self.mass_2 * (self.length_2 * second) ** 2 / 12
+        )
         return 0.5 * (
             point(self.mass_1, self.length_1 / 2, 0)
             + point(self.mass_2, self.length_1, self.length_2 / 2)
@@ -98,7 +101,10 @@ class TwoLinkArm(Scene):
     def bodies(self) -> dict[str, list[Shape]]:
         """Return the links along the horizontal, the forearm with its hand."""
         upper, fore = (self._link(length) for length in (self.length_1, self.length_2))
-        return {"upper_arm": upper, "forearm": [*fore, Circle((self.length_2, 0.0), 0.07 * self.length_2, "mark")]}
+        return {
+            "upper_arm": upper,
+            "forearm": [*fore, Circle((self.length_2, 0.0), 0.07 * self.length_2, "mark")],
+        }
 
     @staticmethod
     def _link(length: float) -> list[Shape]:
