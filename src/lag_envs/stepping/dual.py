@@ -56,7 +56,9 @@ class Dual:
         return Number(self._t.add(a.value, b.value), self._map(self._sum, a.slopes, b.slopes))
 
     def neg(self, a: Number) -> Number:
-        return Number(self._t.neg(a.value), self._map(lambda s: None if s is None else self._t.neg(s), a.slopes))
+        return Number(
+            self._t.neg(a.value), self._map(lambda s: None if s is None else self._t.neg(s), a.slopes)
+        )
 
     def sub(self, a: Number, b: Number) -> Number:
         t = self._t

@@ -64,7 +64,9 @@ class SeriesStepper:
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
         values = {parameter(name): value for name, value in parameters.items()}
-        return _evaluated(self._whole, values) | {f"p_{name}": float(parameters[name]) for name in self._parameters}
+        return _evaluated(self._whole, values) | {
+            f"p_{name}": float(parameters[name]) for name in self._parameters
+        }
 
     # --- from the state and back -----------------------------------------------------------------------------
 
@@ -178,7 +180,9 @@ class SeriesStepper:
         from lag_envs.stepping.driver import compile_advance_tangents
 
         record, n = self._tangents, len(self._layout.free)
-        columns = tuple(x for x in record.inputs if x.startswith(("control_", "start_")) and x != "start_elapsed")
+        columns = tuple(
+            x for x in record.inputs if x.startswith(("control_", "start_")) and x != "start_elapsed"
+        )
         k: dict[str, Any] = {f"p_{name}": parameters[name] for name in self._parameters}
         constants = _evaluated(record, {parameter(name): value for name, value in parameters.items()})
         count, wide = len(states), states.shape[1] + controls.shape[1]
@@ -284,7 +288,10 @@ class StepCode:
         names = [*stepper._whole.constants, *(f"p_{name}" for name in stepper._parameters)]
         given = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
-        self._inputs = [name if not name.startswith("c") or name.startswith("control_") else f"k_{name}" for name in record.inputs]
+        self._inputs = [
+            name if not name.startswith("c") or name.startswith("control_") else f"k_{name}"
+            for name in record.inputs
+        ]
         wanted = [name for name in record.inputs if not name.startswith("c") or name.startswith("control_")]
         wanted = [name for name in wanted if name != "start_elapsed"]
 
@@ -308,18 +315,33 @@ class StepCode:
         def finish(xp: Any, values: Sequence, k: Mapping) -> dict[str, Any]:
             rest = values[2 * n :]
             ends = stepper.finish(
-                xp, values[:n], values[n : 2 * n], rest[:states], rest[states : states + controls], rest[-1], k
+                xp,
+                values[:n],
+                values[n : 2 * n],
+                rest[:states],
+                rest[states : states + controls],
+                rest[-1],
+                k,
             )
             return dict(zip(self.end, ends, strict=True))
 
         self.prepare, prepared = run(prepare, [*self.start, *self.controls])
         self.prepare += [
-            f"{name} = {value}" for name, value in zip((*wanted, *q, *v), prepared, strict=True) if name != value
+            f"{name} = {value}"
+            for name, value in zip((*wanted, *q, *v), prepared, strict=True)
+            if name != value
         ]
         self.finish, finished = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
-        self.finish += [f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value]
+        self.finish += [
+            f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value
+        ]
         used = " ".join([*self.prepare, *self.finish, *self._inputs])
-        self.constants = [value for value in given.values() if isinstance(value, str) and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()]
+        self.constants = [
+            value
+            for value in given.values()
+            if isinstance(value, str)
+            and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
+        ]
         self.rows = [*self._inputs, *q, *v, "status"]
         #: Those of them that the rest of the step needs afterwards.
         self.results = [*q, *v, "status"]
@@ -359,10 +381,17 @@ class StepCode:
             *self.finish,
             f"return {', '.join(self.end)}, status",
         ]
-        return compile_function("advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance))
+        return compile_function(
+            "advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance)
+        )
 
     def bounded(
-        self, state: Sequence[float], controls: Sequence[float], dt: float, order: int, constants: Sequence[float]
+        self,
+        state: Sequence[float],
+        controls: Sequence[float],
+        dt: float,
+        order: int,
+        constants: Sequence[float],
     ) -> tuple[int, tuple[Any, Any]]:
         """Take a step; return its status, and the sums of bounds on places and velocities."""
         rows = np.zeros(self.scratch)

@@ -82,7 +82,14 @@ class SeriesRecord:
     @cached_property
     def digest(self) -> str:
         """All that decides the code, in short: not what the constants are made of."""
-        parts: tuple = (self.size, self.inputs, self.scalars, self.nodes, sorted(self.mass.items()), self.force)
+        parts: tuple = (
+            self.size,
+            self.inputs,
+            self.scalars,
+            self.nodes,
+            sorted(self.mass.items()),
+            self.force,
+        )
         if self.tangents:
             parts += (sorted((name, sorted(slopes.items())) for name, slopes in self.tangents.items()),)
         return hashlib.sha256(repr(parts).encode()).hexdigest()
@@ -268,7 +275,9 @@ class Lowering:
             if n == 1:
                 break
             inner = {
-                tuple(f for f in key if f[0] != node): e for key, e in rest.items() if len(key) > 1 and (node, 1) in key
+                tuple(f for f in key if f[0] != node): e
+                for key, e in rest.items()
+                if len(key) > 1 and (node, 1) in key
             }
             rest = {key: e for key, e in rest.items() if not (len(key) > 1 and (node, 1) in key)}
             factor, weight = self._single(self._factored(inner))
@@ -323,7 +332,9 @@ class Lowering:
             entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
         return right, entries
 
-    def record(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True) -> SeriesRecord:
+    def record(
+        self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True
+    ) -> SeriesRecord:
         """Return the record of ``Σ_j mass[i, j] a_j = force[i]``; see `parts` and `without`."""
         return self.without(*self.parts(mass, force), fused=fused)
 
@@ -372,7 +383,9 @@ class Lowering:
                     now[i] = pairs[0][0]
                 else:
                     now[i] = len(nodes)
-                    nodes.append(Node("sum", tuple(a for a, _ in pairs), (*(w for _, w in pairs), numbers[-1])))
+                    nodes.append(
+                        Node("sum", tuple(a for a, _ in pairs), (*(w for _, w in pairs), numbers[-1]))
+                    )
                 continue
             if (op == "product" and any(now[a] < 0 for a in args)) or (
                 op == "polynomial" and all(w == 0.0 for w in numbers)
@@ -384,7 +397,14 @@ class Lowering:
         mass = {place: (now[node], next(value)) for place, (node, _) in entries.items()}
         mass = {place: (n, w) for place, (n, w) in mass.items() if n >= 0 or w != 0.0}
         return _needed(
-            len(self._free), tuple(self._inputs), self.constants, operations, nodes, mass, [now[r] for r in right], tangents
+            len(self._free),
+            tuple(self._inputs),
+            self.constants,
+            operations,
+            nodes,
+            mass,
+            [now[r] for r in right],
+            tangents,
         )
 
 

@@ -290,7 +290,9 @@ def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     return tangent
 
 
-def _write_tangent(module: ir.Module, name: str, record: SeriesRecord, columns: tuple[str, ...]) -> ir.Function:
+def _write_tangent(
+    module: ir.Module, name: str, record: SeriesRecord, columns: tuple[str, ...]
+) -> ir.Function:
     """Write the function ``name(rows, order)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
     width = 2 * n + len(columns)
@@ -306,7 +308,9 @@ def _write_tangent(module: ir.Module, name: str, record: SeriesRecord, columns: 
         return builder.gep(rows, [ir.Constant(_INT, row)])
 
     def moving(row: int, i: int) -> dual.Number:
-        return dual.Number(builder.load(at(row)), tuple(builder.load(at(layout.done + i * width + k)) for k in range(width)))
+        return dual.Number(
+            builder.load(at(row)), tuple(builder.load(at(layout.done + i * width + k)) for k in range(width))
+        )
 
     inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
     q = [moving(layout.q + i, i) for i in range(n)]
