@@ -92,7 +92,9 @@ class Model:
         refused = self._step(states, actions[:, None], targets[:, None], self._numbers, ends, rewards, ended)
         if refused:
             state, action = states[refused - 1], float(actions[refused - 1])
-            raise self.task.formulas.refusal(state, action, self.task.dt, None, f"the step of row {refused - 1}")
+            raise self.task.formulas.refusal(
+                state, action, self.task.dt, None, f"the step of row {refused - 1}"
+            )
         return ends, rewards, ended
 
     def kicked(self, states: ArrayLike, draws: ArrayLike) -> Array:

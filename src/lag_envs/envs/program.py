@@ -17,8 +17,6 @@ blocks and so stay in the processor's nearest cache.
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -130,7 +128,9 @@ class Program:
         def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
             return _lines(formula, inputs, outputs, formulas.trace)
 
-        clip = [f"{a} = select({a} < -1.0, -1.0, select({a} > 1.0, 1.0, {a}))" for a in self.a if formulas.clipped]
+        clip = [
+            f"{a} = select({a} < -1.0, -1.0, select({a} > 1.0, 1.0, {a}))" for a in self.a if formulas.clipped
+        ]
         self.control = clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]
         self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._stepper.fast)]
@@ -172,7 +172,10 @@ class Program:
 
     @property
     def _advance_one(self) -> list[str]:
-        slow = [*(f"{self._at_one(h)} = {u}" for h, u in zip(self.held, self.u, strict=True)), f"return 0.0, {SLOW}"]
+        slow = [
+            *(f"{self._at_one(h)} = {u}" for h, u in zip(self.held, self.u, strict=True)),
+            f"return 0.0, {SLOW}",
+        ]
         if not self.general:
             return ["if not within:", *_indent(slow)]
         call = ", ".join([*self.y, *self.u, "dt", str(self._x), *self._stepper.constants])

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -22,7 +21,6 @@ from lag_envs.envs.single import (
     diagnostics,
     observation_space,
     start_options,
-    true_spec,
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.base import real_array

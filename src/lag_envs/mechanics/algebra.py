@@ -94,7 +94,9 @@ class Expr:
         if isinstance(value, Atom):
             return Expr({((value, 1),): 1})
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
-            raise FormulaError(f"a formula combines a recorded number with {value!r}; it must be a real number")
+            raise FormulaError(
+                f"a formula combines a recorded number with {value!r}; it must be a real number"
+            )
         exact = value if isinstance(value, int | Fraction) else _exact(float(value))
         return Expr({(): exact} if exact else {})
 
@@ -244,7 +246,9 @@ class Expr:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
 
     def __float__(self) -> float:
-        self._refuse("float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp")
+        self._refuse(
+            "float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp"
+        )
 
     def __int__(self) -> int:
         self._refuse("int()", "a formula must be smooth")
@@ -300,7 +304,9 @@ class Expr:
 
 def _scalar(value: Any) -> float:
     if getattr(value, "ndim", 0):
-        raise FormulaError("a formula combines a recorded number with an array; it must return single numbers")
+        raise FormulaError(
+            "a formula combines a recorded number with an array; it must return single numbers"
+        )
     return float(value)
 
 
@@ -372,7 +378,10 @@ def _root(square: Expr) -> Expr | None:
     for monomial, c in square.sorted_terms():
         whole = Fraction(c)
         roots = [math.isqrt(n) if n > 0 else 0 for n in (whole.numerator, whole.denominator)]
-        if all(n % 2 == 0 for _, n in monomial) and [r * r for r in roots] == [whole.numerator, whole.denominator]:
+        if all(n % 2 == 0 for _, n in monomial) and [r * r for r in roots] == [
+            whole.numerator,
+            whole.denominator,
+        ]:
             parts[tuple((a, n // 2) for a, n in monomial)] = Fraction(*roots)
     root = Expr({})
     for monomial, c in parts.items():
@@ -431,7 +440,11 @@ class Functions:
     def __getattr__(self, name: str) -> Any:
         raise FormulaError(
             f"a formula uses xp.{name}; an energy has xp.sin, cos, tan, atan, tanh, sqrt, exp, log and pi"
-            + (": it must be smooth" if name in ("where", "abs", "sign", "minimum", "maximum", "floor") else "")
+            + (
+                ": it must be smooth"
+                if name in ("where", "abs", "sign", "minimum", "maximum", "floor")
+                else ""
+            )
         )
 
 

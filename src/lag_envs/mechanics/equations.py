@@ -119,9 +119,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
                 f"kinetic does not contain the rate of {name!r} squared, so nothing determines its acceleration; "
                 f"give it a mass, or prescribe {name!r}"
             )
-    linear = tuple(
-        Expr({m: c for m, c in momentum.terms.items() if _degree(m) == 0}) for momentum in momenta
-    )
+    linear = tuple(Expr({m: c for m, c in momentum.terms.items() if _degree(m) == 0}) for momentum in momenta)
     force = []
     for name, momentum in zip(names, momenta, strict=True):
         q, v = place(name), velocity(name)

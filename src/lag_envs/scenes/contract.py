@@ -712,6 +712,45 @@ class Scene(metaclass=SceneType):
         by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in self._layout.state}
         return StepBound(status, order, by_state, "proved with the step")
 
+    def jacobian(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> tuple[Array, Array]:
+        """Return the derivatives of the state after a control step by the state before it and by the controls.
+
+        The derivatives go through the same series and substeps as the step itself.
+
+        Parameters
+        ----------
+        state : array_like, shape (..., n_state)
+            Where the step begins.
+        control : array_like, shape (..., n_controls), or (...) for one control
+            The controls that are held.
+        dt : float
+            Length of the step [s].
+
+        Returns
+        -------
+        A : ndarray, shape (..., n_state, n_state)
+            By the state.
+        B : ndarray, shape (..., n_state, n_controls)
+            By the controls.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As `simulate` does.
+        """
+        states, controls, shape = self._check_both(state, control)
+        dt = check_step(dt)
+        n, m = states.shape[-1], controls.shape[-1]
+        states = np.broadcast_to(states, (*shape, n)).reshape(-1, n)
+        controls = np.broadcast_to(controls, (*shape, m)).reshape(-1, m)
+        parameters = {name: getattr(self, name) for name in self._numbers()}
+        found, refused = self._stepper.jacobian(states, controls, parameters, dt, self._order(dt))
+        if refused:
+            i = refused - 1
+            raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")
+        found = found.reshape(*shape, n, n + m)
+        return found[..., :n], found[..., n:]
+
     def _refusal(
         self, state: Array, control: ArrayLike, dt: float, trajectory: Array | None, where: str
     ) -> StepRefused:

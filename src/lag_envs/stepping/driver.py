@@ -14,7 +14,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import Layout, compile_attempt
+from lag_envs.stepping.machine import Layout, compile_attempt, compile_tangent
 from lag_envs.stepping.series import TOLERANCE
 
 #: A control step that would need more attempts than this is refused.
@@ -162,3 +162,83 @@ def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) ->
     """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`."""
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": LANES}
     return compile_python("advance_block", _advance_block, compile_attempt(record, LANES), **numbers)
+
+
+def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step and its derivatives; return the number of attempts, negative where refused.
+
+    `rows` are those of an attempt. `slopes` begin with inputs, places, velocities and the step, as they do, and
+    go on with the matrix of derivatives, which is that of unit vectors to begin with.
+    """
+    remaining, h, count = dt, dt, 0
+    while True:
+        rows[wish] = h
+        if elapsed >= 0:
+            rows[elapsed] = dt - remaining
+            slopes[elapsed] = dt - remaining
+        attempt(rows, 0, order, tolerance)
+        count += 1
+        if rows[done] > 0.0:
+            slopes[wish] = rows[used]
+            tangent(slopes, 0, order)
+            for i in range(2 * n):
+                rows[q + i] = rows[after + i]
+                slopes[q + i] = rows[after + i]
+            if not rows[used] < remaining:
+                return count
+            remaining -= rows[used]
+            h = min(remaining, 2.0 * rows[used])
+        else:
+            h *= 0.0625
+            if not h > SMALLEST_PART * dt:
+                return -count
+        if count >= LARGEST_COUNT:
+            return -count
+
+
+def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
+    """Take a control step from each row of `values`, see `_advance_tangent`; return the row that was refused, or 0.
+
+    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` becomes the
+    matrix of derivatives of places and velocities, row by row.
+    """
+    rows = np.zeros(size)
+    moving = np.zeros(done + 2 * n * width)
+    for i in range(values.shape[0]):
+        for j in range(q + 2 * n):
+            rows[j] = moving[j] = values[i, j]
+        for j in range(2 * n * width):
+            moving[done + j] = 0.0
+        for j in range(2 * n):
+            moving[done + j * width + j] = 1.0
+        if advance(rows, moving, dt, order) < 0:
+            return i + 1
+        for j in range(2 * n):
+            values[i, q + j] = rows[q + j]
+        for j in range(2 * n * width):
+            slopes[i, j] = moving[done + j]
+            if not abs(slopes[i, j]) < np.inf:
+                return i + 1
+    return 0
+
+
+@cache
+def compile_advance_tangents(
+    record: SeriesRecord, columns: tuple[str, ...], tolerance: float = TOLERANCE
+) -> Callable:
+    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents`.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    columns : tuple of str
+        Inputs by which derivatives are taken, besides places and velocities.
+    tolerance : float
+        What a substep may leave out, relative to the size of the velocities.
+    """
+    helpers = compile_attempt(record, 1), compile_tangent(record, columns)
+    numbers = _numbers(record, tolerance)
+    advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
+    width = 2 * record.size + len(columns)
+    return compile_python("advance_tangents", _advance_tangents, advance, width=width, **numbers)

@@ -19,6 +19,7 @@ from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
@@ -36,6 +37,15 @@ class SeriesStepper:
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
         self._layout = mechanics.layout
+        self._lowering = Lowering(self._layout.free, self._moving())
+        self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
+        self._whole = self._lowering.without(*self._parts)
+        converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
+        self._codes: dict[frozenset[str], StepCode] = {}
+        self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
+
+    def _moving(self) -> dict[str, list[Expr]]:
+        """Return the moving prescribed coordinates as polynomials in time."""
         elapsed = Expr.of(Atom("start", "elapsed"))
         moving: dict[str, list[Expr]] = {}
         for p in self._layout.at("acceleration", "rate"):
@@ -47,22 +57,16 @@ class SeriesStepper:
                 rate = Expr.of(Atom("start", f"{p.name}_dot"))
                 half = held / 2
                 moving[p.name] = [s + elapsed * (rate + elapsed * half), rate + elapsed * held, half]
-        self._lowering = Lowering(self._layout.free, moving)
-        self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
-        self._whole = self._lowering.without(*self._parts)
-        converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
-        self._codes: dict[frozenset[str], StepCode] = {}
-        self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
+        return moving
 
     # --- constants -------------------------------------------------------------------------------------------
 
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
         values = {parameter(name): value for name, value in parameters.items()}
-        names = list(self._whole.constants)
-        numbers = evaluate([self._whole.constants[name] for name in names], values, math)
-        made = {name: float(value) for name, value in zip(names, numbers, strict=True)}
-        return made | {f"p_{name}": float(parameters[name]) for name in self._parameters}
+        return _evaluated(self._whole, values) | {
+            f"p_{name}": float(parameters[name]) for name in self._parameters
+        }
 
     # --- from the state and back -----------------------------------------------------------------------------
 
@@ -141,6 +145,69 @@ class SeriesStepper:
                     after[entry.name] = v[i] if entry.kind == "velocity" else v[i] + shift[i]
         return [after[entry.name] for entry in self._layout.state]
 
+    # --- derivatives ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def _tangents(self) -> SeriesRecord:
+        lowering = Lowering(self._layout.free, self._moving(), tangents=True)
+        return lowering.record(self.mechanics.mass, self.mechanics.force)
+
+    def jacobian(
+        self, states: Any, controls: Any, parameters: Mapping[str, float], dt: float, order: int
+    ) -> tuple[Any, int]:
+        """Return the derivatives of the states at the step's end by states and controls.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n, n_state)
+            Where the steps begin.
+        controls : ndarray, shape (n, n_controls)
+            The controls that are held.
+        parameters : mapping
+            The scene's parameters.
+        dt : float
+            Length of the step [s].
+        order : int
+            Order of the series.
+
+        Returns
+        -------
+        derivatives : ndarray, shape (n, n_state, n_state + n_controls)
+            The derivatives.
+        refused : int
+            The row whose step was refused, counted from 1; 0 where there is none.
+        """
+        from lag_envs.stepping.driver import compile_advance_tangents
+
+        record, n = self._tangents, len(self._layout.free)
+        columns = tuple(
+            x for x in record.inputs if x.startswith(("control_", "start_")) and x != "start_elapsed"
+        )
+        k: dict[str, Any] = {f"p_{name}": parameters[name] for name in self._parameters}
+        constants = _evaluated(record, {parameter(name): value for name, value in parameters.items()})
+        count, wide = len(states), states.shape[1] + controls.shape[1]
+        unit = np.eye(wide)[:, :, None] * np.ones(count)
+        given = [Variable(x, unit[i]) for i, x in enumerate([*states.T, *controls.T])]
+        y, u = given[: states.shape[1]], given[states.shape[1] :]
+        before = self.prepare(VariableFunctions(), y, u, k)
+        moving = [f"q{i}" for i in range(n)] + [f"v{i}" for i in range(n)]
+        values = np.zeros((count, len(record.inputs) + 2 * n))
+        for i, name in enumerate([*record.inputs, *moving]):
+            if name in before:
+                values[:, i] = before[name].value
+            elif name in constants:
+                values[:, i] = constants[name]
+        slopes = np.empty((count, 2 * n * (2 * n + len(columns))))
+        refused = compile_advance_tangents(record, columns)(values, slopes, dt, order)
+        if refused:
+            return None, refused
+        core = slopes.reshape(count, 2 * n, -1)
+        inner = np.stack([before[name].slopes for name in [*moving, *columns]])
+        ends = np.einsum("bik,kjb->ijb", core, inner)
+        after = [Variable(values[:, len(record.inputs) + i], ends[i]) for i in range(2 * n)]
+        finished = self.finish(VariableFunctions(), after[:n], after[n:], y, u, dt, k)
+        return np.stack([z.slopes for z in finished]).transpose(2, 0, 1), 0
+
     # --- code ------------------------------------------------------------------------------------------------
 
     def code(self, absent: frozenset[str] = frozenset()) -> StepCode:
@@ -148,6 +215,13 @@ class SeriesStepper:
         if absent not in self._codes:
             self._codes[absent] = StepCode(self, self._lowering.without(*self._parts, absent), absent)
         return self._codes[absent]
+
+
+def _evaluated(record: SeriesRecord, parameters: Mapping[Atom, float]) -> dict[str, float]:
+    """Return the values of a record's constants."""
+    names = list(record.constants)
+    numbers = evaluate([record.constants[name] for name in names], parameters, math)
+    return {name: float(value) for name, value in zip(names, numbers, strict=True)}
 
 
 def _solve(matrix: Sequence[Sequence], right: Sequence) -> list:
@@ -214,7 +288,10 @@ class StepCode:
         names = [*stepper._whole.constants, *(f"p_{name}" for name in stepper._parameters)]
         given = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
-        self._inputs = [name if not name.startswith("c") or name.startswith("control_") else f"k_{name}" for name in record.inputs]
+        self._inputs = [
+            name if not name.startswith("c") or name.startswith("control_") else f"k_{name}"
+            for name in record.inputs
+        ]
         wanted = [name for name in record.inputs if not name.startswith("c") or name.startswith("control_")]
         wanted = [name for name in wanted if name != "start_elapsed"]
 
@@ -238,18 +315,33 @@ class StepCode:
         def finish(xp: Any, values: Sequence, k: Mapping) -> dict[str, Any]:
             rest = values[2 * n :]
             ends = stepper.finish(
-                xp, values[:n], values[n : 2 * n], rest[:states], rest[states : states + controls], rest[-1], k
+                xp,
+                values[:n],
+                values[n : 2 * n],
+                rest[:states],
+                rest[states : states + controls],
+                rest[-1],
+                k,
             )
             return dict(zip(self.end, ends, strict=True))
 
         self.prepare, prepared = run(prepare, [*self.start, *self.controls])
         self.prepare += [
-            f"{name} = {value}" for name, value in zip((*wanted, *q, *v), prepared, strict=True) if name != value
+            f"{name} = {value}"
+            for name, value in zip((*wanted, *q, *v), prepared, strict=True)
+            if name != value
         ]
         self.finish, finished = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
-        self.finish += [f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value]
+        self.finish += [
+            f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value
+        ]
         used = " ".join([*self.prepare, *self.finish, *self._inputs])
-        self.constants = [value for value in given.values() if isinstance(value, str) and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()]
+        self.constants = [
+            value
+            for value in given.values()
+            if isinstance(value, str)
+            and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
+        ]
         self.rows = [*self._inputs, *q, *v, "status"]
         #: Those of them that the rest of the step needs afterwards.
         self.results = [*q, *v, "status"]
@@ -289,10 +381,17 @@ class StepCode:
             *self.finish,
             f"return {', '.join(self.end)}, status",
         ]
-        return compile_function("advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance))
+        return compile_function(
+            "advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance)
+        )
 
     def bounded(
-        self, state: Sequence[float], controls: Sequence[float], dt: float, order: int, constants: Sequence[float]
+        self,
+        state: Sequence[float],
+        controls: Sequence[float],
+        dt: float,
+        order: int,
+        constants: Sequence[float],
     ) -> tuple[int, tuple[Any, Any]]:
         """Take a step; return its status, and the sums of bounds on places and velocities."""
         rows = np.zeros(self.scratch)

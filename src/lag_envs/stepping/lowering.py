@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
-from lag_envs.mechanics.algebra import Atom, Expr
+from lag_envs.mechanics.algebra import Atom, Expr, derivative
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import Number, Operation, Trace
 
@@ -66,6 +66,8 @@ class SeriesRecord:
         Mass matrix: a node, or a weight that does not change within the step.
     force : tuple of int
         Nodes of the right-hand side; -1 where it vanishes.
+    tangents : mapping from str to mapping
+        For scalars that depend on controls or starts their derivatives by input; empty unless asked for.
     """
 
     size: int
@@ -75,11 +77,21 @@ class SeriesRecord:
     nodes: tuple[Node, ...]
     mass: Mapping[tuple[int, int], tuple[int, Weight]]
     force: tuple[int, ...]
+    tangents: Mapping[str, Mapping[str, Weight]] = dataclasses.field(default_factory=dict)
 
     @cached_property
     def digest(self) -> str:
         """All that decides the code, in short: not what the constants are made of."""
-        parts = (self.size, self.inputs, self.scalars, self.nodes, sorted(self.mass.items()), self.force)
+        parts: tuple = (
+            self.size,
+            self.inputs,
+            self.scalars,
+            self.nodes,
+            sorted(self.mass.items()),
+            self.force,
+        )
+        if self.tangents:
+            parts += (sorted((name, sorted(slopes.items())) for name, slopes in self.tangents.items()),)
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def __eq__(self, other: object) -> bool:
@@ -99,9 +111,15 @@ class Lowering:
     prescribed : mapping from str to sequence of Expr
         For each moving prescribed coordinate its place as a polynomial in time, by coefficients in symbols of
         kind ``control`` (held) or ``start`` (its place and rate when the step begins).
+    tangents : bool, default False
+        Whether scalars come with their derivatives by controls and starts.
     """
 
-    def __init__(self, free: Sequence[str], prescribed: Mapping[str, Sequence[Expr]]) -> None:
+    def __init__(
+        self, free: Sequence[str], prescribed: Mapping[str, Sequence[Expr]], tangents: bool = False
+    ) -> None:
+        self._wanted = tangents
+        self._slopes: dict[str, dict[str, Any]] = {}
         self._free = list(free)
         self._prescribed = dict(prescribed)
         self._trace: Trace = ElementaryTrace()
@@ -148,6 +166,12 @@ class Lowering:
                         value = value * number if n > 0 else value / number
                 total = total + value
             self._scalars[expr.text] = total
+            if self._wanted and isinstance(total, Number):
+                self._slopes[total.name] = {
+                    f"{s.kind}_{s.name}": self.scalar(derivative(expr, s))
+                    for s in sorted(expr.symbols(), key=lambda s: s.text)
+                    if s.kind in ("control", "start") and s.name != "elapsed"
+                }
         return self._scalars[expr.text]
 
     def _held(self, atom: Atom) -> Any:
@@ -251,7 +275,9 @@ class Lowering:
             if n == 1:
                 break
             inner = {
-                tuple(f for f in key if f[0] != node): e for key, e in rest.items() if len(key) > 1 and (node, 1) in key
+                tuple(f for f in key if f[0] != node): e
+                for key, e in rest.items()
+                if len(key) > 1 and (node, 1) in key
             }
             rest = {key: e for key, e in rest.items() if not (len(key) > 1 and (node, 1) in key)}
             factor, weight = self._single(self._factored(inner))
@@ -306,7 +332,9 @@ class Lowering:
             entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
         return right, entries
 
-    def record(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True) -> SeriesRecord:
+    def record(
+        self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr], fused: bool = True
+    ) -> SeriesRecord:
         """Return the record of ``Σ_j mass[i, j] a_j = force[i]``; see `parts` and `without`."""
         return self.without(*self.parts(mass, force), fused=fused)
 
@@ -318,8 +346,18 @@ class Lowering:
         Terms are left out after products have been arranged: what is left rounds as it would with them.
         """
         weights = [w for _, _, ws, _ in self.nodes for w in ws] + [w for _, w in entries.values()]
-        operations, results = self._trace.operations(weights, zero, fused=fused)
+        slopes = [
+            (w.name, source, slope)
+            for w in {w.name: w for w in weights if isinstance(w, Number)}.values()
+            for source, slope in self._slopes.get(w.name, {}).items()
+        ]
+        operations, results = self._trace.operations([*weights, *(s for *_, s in slopes)], zero, fused=fused)
         value = iter(results)
+        called = {w.name: r for w, r in zip(weights, results, strict=False) if isinstance(w, Number)}
+        tangents: dict[str, dict[str, Weight]] = {}
+        for (name, source, _), slope in zip(slopes, results[len(weights) :], strict=True):
+            if isinstance(called[name], str) and slope != 0.0:
+                tangents.setdefault(str(called[name]), {})[source] = slope
         now: dict[int, int] = {-1: -1}  # -1: the series vanishes
         nodes: list[Node] = []
 
@@ -345,7 +383,9 @@ class Lowering:
                     now[i] = pairs[0][0]
                 else:
                     now[i] = len(nodes)
-                    nodes.append(Node("sum", tuple(a for a, _ in pairs), (*(w for _, w in pairs), numbers[-1])))
+                    nodes.append(
+                        Node("sum", tuple(a for a, _ in pairs), (*(w for _, w in pairs), numbers[-1]))
+                    )
                 continue
             if (op == "product" and any(now[a] < 0 for a in args)) or (
                 op == "polynomial" and all(w == 0.0 for w in numbers)
@@ -357,11 +397,20 @@ class Lowering:
         mass = {place: (now[node], next(value)) for place, (node, _) in entries.items()}
         mass = {place: (n, w) for place, (n, w) in mass.items() if n >= 0 or w != 0.0}
         return _needed(
-            len(self._free), tuple(self._inputs), self.constants, operations, nodes, mass, [now[r] for r in right]
+            len(self._free),
+            tuple(self._inputs),
+            self.constants,
+            operations,
+            nodes,
+            mass,
+            [now[r] for r in right],
+            tangents,
         )
 
 
-def _needed(size: int, inputs: Any, constants: Any, operations: Any, nodes: Any, mass: Any, force: Any) -> SeriesRecord:
+def _needed(
+    size: int, inputs: Any, constants: Any, operations: Any, nodes: Any, mass: Any, force: Any, tangents: Any
+) -> SeriesRecord:
     used: set[int] = set()
     stack = [n for n, _ in mass.values()] + list(force)
     while stack:
@@ -375,6 +424,8 @@ def _needed(size: int, inputs: Any, constants: Any, operations: Any, nodes: Any,
     )
     weights = {w for node in kept for w in node.weights} | {w for _, w in mass.values()}
     names = {w for w in weights if isinstance(w, str)}
+    tangents = {name: slopes for name, slopes in tangents.items() if name in names}
+    names |= {w for slopes in tangents.values() for w in slopes.values() if isinstance(w, str)}
     lines = []
     for operation in reversed(operations):
         if operation.name in names:
@@ -389,6 +440,7 @@ def _needed(size: int, inputs: Any, constants: Any, operations: Any, nodes: Any,
         kept,
         {place: (renumber[n], w) for place, (n, w) in mass.items()},
         tuple(renumber[n] for n in force),
+        tangents,
     )
 
 

@@ -13,7 +13,8 @@ from numba import types
 from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
-from lag_envs.stepping import elementary, lowering, primitives, series, tracing
+from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping.dual import Dual
 from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.primitives import emit
 from lag_envs.stepping.series import LARGEST_ORDER, Series
@@ -180,7 +181,7 @@ class Machine:
 @cache
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
-    modules = (algebra, elementary, lowering, primitives, series, tracing)
+    modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(Machine)
     return hashlib.sha256(source.encode()).hexdigest()
 
@@ -253,5 +254,72 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
         write(layout.q_after + i, q[i])
         write(layout.v_after + i, v[i])
         write(layout.bound + i, bounds[i])
+    builder.ret_void()
+    return function
+
+
+def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
+    """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
+
+    The rows are inputs, places, velocities and the step, as in `Layout`, and then the derivatives of the
+    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places, velocities
+    and the matrix are replaced by those after the step.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    columns : tuple of str
+        Inputs by which derivatives are taken.
+    """
+    digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
+    name = f"tangent_{digest}"
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        first = builder.gep(array.data, [args[1]])
+        function = builder.module.globals.get(name) or _write_tangent(builder.module, name, record, columns)
+        builder.call(function, [first, args[2]])
+        return context.get_dummy_value()
+
+    @intrinsic
+    def tangent(typingctx, rows, at, order):  # type: ignore[no-untyped-def]
+        return types.void(rows, types.int64, types.int64), codegen
+
+    tangent.__name__ = name
+    return tangent
+
+
+def _write_tangent(
+    module: ir.Module, name: str, record: SeriesRecord, columns: tuple[str, ...]
+) -> ir.Function:
+    """Write the function ``name(rows, order)`` into a module."""
+    step, layout, n = Series(record), Layout(record), record.size
+    width = 2 * n + len(columns)
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT]), name)
+    function.linkage = "internal"
+    set.add(function.attributes, "noinline")
+    rows, order = function.args
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    plain = Machine(builder, step.slots * (width + 1), 1, True)
+    t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
+
+    def at(row: int) -> ir.Value:
+        return builder.gep(rows, [ir.Constant(_INT, row)])
+
+    def moving(row: int, i: int) -> dual.Number:
+        return dual.Number(
+            builder.load(at(row)), tuple(builder.load(at(layout.done + i * width + k)) for k in range(width))
+        )
+
+    inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
+    q = [moving(layout.q + i, i) for i in range(n)]
+    v = [moving(layout.v + i, n + i) for i in range(n)]
+    step.expand(t, inputs, q, v, t.plain(builder.load(at(layout.h))), order)
+    q, v = step.advance(t, order)
+    for i, number in enumerate([*q, *v]):
+        builder.store(number.value, at(layout.q + i))
+        for k, slope in enumerate(number.slopes):
+            builder.store(plain.number(0.0) if slope is None else slope, at(layout.done + i * width + k))
     builder.ret_void()
     return function

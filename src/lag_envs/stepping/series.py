@@ -171,7 +171,9 @@ class Series:
 
     # --- the series ----------------------------------------------------------------------------------------
 
-    def expand(self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any) -> Expansion:
+    def expand(
+        self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any
+    ) -> Expansion:
         """Fill the slots with coefficients: velocities up to the order N, places up to N + 1, the rest below N.
 
         Parameters
@@ -443,7 +445,9 @@ class Factors:
                     pivot = t.sub(pivot, t.mul(lower[j, k], scaled[j, k]))
             self._inverse.append(t.div(t.number(1.0), pivot))
             self.definite = (
-                t.less(t.number(0.0), pivot) if j == 0 else t.both(self.definite, t.less(t.number(0.0), pivot))
+                t.less(t.number(0.0), pivot)
+                if j == 0
+                else t.both(self.definite, t.less(t.number(0.0), pivot))
             )
             for i in range(j + 1, size):
                 entry = matrix.get((j, i))
@@ -567,7 +571,9 @@ class Certificate:
             some = slots[first : first + group]
 
             def accumulate(k: Any, carried: Sequence, some: Sequence = some) -> list:
-                return [t.add(total, t.abs(t.load(slot, k))) for slot, total in zip(some, carried, strict=True)]
+                return [
+                    t.add(total, t.abs(t.load(slot, k))) for slot, total in zip(some, carried, strict=True)
+                ]
 
             totals = t.loop(t.index(1), end, [t.number(0.0)] * len(some), accumulate)
             for slot, total in zip(some, totals, strict=True):
@@ -583,7 +589,9 @@ class Certificate:
             some = pairs[first : first + group]
             suffixes = list(dict.fromkeys(b for _, b in some))
 
-            def accumulate(j: Any, carried: Sequence, some: Sequence = some, suffixes: Sequence = suffixes) -> list:
+            def accumulate(
+                j: Any, carried: Sequence, some: Sequence = some, suffixes: Sequence = suffixes
+            ) -> list:
                 other = t.minus(self._order, j)
                 sums = dict(zip(suffixes, carried, strict=False))
                 sums = {b: t.add(total, t.abs(t.load(b, other))) for b, total in sums.items()}

@@ -148,7 +148,9 @@ class Number:
 
     def __pow__(self, exponent: Any) -> Any:
         if isinstance(exponent, bool) or not isinstance(exponent, numbers.Real) or exponent != int(exponent):
-            raise TypeError(f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others")
+            raise TypeError(
+                f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others"
+            )
         power: Any = 1.0
         for bit in bin(abs(int(exponent)))[2:]:
             power = power * power

@@ -7,6 +7,7 @@ import math
 import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -113,6 +114,30 @@ class Task(ABC):
     def largest_x(self) -> float:
         """The bound's x up to which one step is certified."""
         return self.scene.largest_x(self.dt)
+
+    @property
+    def control_range(self) -> tuple[float, float]:
+        """The controls of the actions -1 and 1 at the centre of the starts."""
+        k = SimpleNamespace(**self.constants())
+        y = self.scene.lift(self.centre)
+        low, high = (float(self.control(a, y, k, self.dt, np)) for a in (-1.0, 1.0))
+        return low, high
+
+    @property
+    def edges(self) -> Sequence[Sequence[float]]:
+        """States at the edge of what the task reaches, in all that drives the motion but θ and θ'."""
+        return [self.centre]
+
+    def certified_speed(self) -> float | None:
+        """Return the |θ'| up to which one series per step is certified, whatever the control [rad/s].
+
+        It is below 0 where one series is never enough, and None where the scene is not stepped by one. See
+        `Scene.certified_speed`.
+        """
+        found = [
+            self.scene.certified_speed(state, u, self.dt) for state in self.edges for u in self.control_range
+        ]
+        return min((speed for speed in found if speed is not None), default=None)
 
     def check_target(self, target: Any) -> float:
         """Return the target as float, or raise a ValueError."""

@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
-from lag_envs.scenes.base import StepRefused
 from lag_envs.scenes import picture
+from lag_envs.scenes.base import StepRefused
 from lag_envs.scenes.contract import Scene, check_number, real_array
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -97,7 +97,9 @@ class Task:
     ) -> None:
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
-            raise FormulaError(f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}")
+            raise FormulaError(
+                f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}"
+            )
         known = list(inspect.signature(kind).parameters)
         for name in sorted(set(parameters) - set(known)):
             options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else [])]
@@ -196,7 +198,9 @@ class Task:
                     f"{entry.name} must lie within ±{FASTEST_START:g} {entry.unit} at the start, "
                     f"got {value:g} {entry.unit}"
                 )
-        self.check_start(Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True))))
+        self.check_start(
+            Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
+        )
         return array
 
     def check_target(self, target: Any) -> Any:
@@ -244,7 +248,9 @@ class Task:
 
     def control_readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells of the controls."""
-        names = zip(self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True)
+        names = zip(
+            self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True
+        )
         return [Reading(name, float(value), unit, "action") for name, value, unit in names]
 
     def readings(self, now: Moment) -> list[Reading]:
@@ -345,7 +351,9 @@ class TaskFormulas:
         names = self._task.scene._numbers()
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
         task.dt = k.dt
-        vars(task)["_recorded_chance"] = lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
+        vars(task)["_recorded_chance"] = lambda p: getattr(
+            k, self._chances.setdefault(p, f"chance{len(self._chances)}")
+        )
         return task
 
     def _state(self, y: Sequence) -> Values:
@@ -403,7 +411,9 @@ class TaskFormulas:
             name, k, self._state(y), self._state(z), self._applied(u), self._targets(g), k.dt, xp
         )
         if value is None or isinstance(value, Mapping | Sequence):
-            raise FormulaError(f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number")
+            raise FormulaError(
+                f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
+            )
         return k.scale * value if self._task.scaled else value
 
     def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
@@ -516,9 +526,11 @@ def _acting(task: Task) -> list[Acting]:
                 raise FormulaError(f"{where} must list at least two values, got {given!r}")
             found.append(Acting(name, min(values), max(values), values))
             continue
-        low, high = _numbers_of(where, given if isinstance(given, tuple) else (given,)) if isinstance(
-            given, tuple
-        ) else (-check_number(where, given), check_number(where, given))
+        low, high = (
+            _numbers_of(where, given if isinstance(given, tuple) else (given,))
+            if isinstance(given, tuple)
+            else (-check_number(where, given), check_number(where, given))
+        )
         if not low < high:
             raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
         found.append(Acting(name, low, high))
@@ -550,6 +562,3 @@ def _starts(task: Task) -> dict[str, tuple[float, float]]:
         pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
         found[name] = pair[0], pair[1]
     return found
-
-
-
