@@ -55,6 +55,7 @@ def parameter(
     above: float | None = None,
     least: float | None = None,
     below: float | None = None,
+    most: float | None = None,
     optional: bool = False,
     infinite: bool = False,
 ) -> Any:
@@ -67,8 +68,8 @@ def parameter(
         ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
     unit : str
         Its unit, for tables and errors.
-    above, least, below : float, optional
-        The range that it must lie in: above, at least, below.
+    above, least, below, most : float, optional
+        The range that it must lie in: above, at least, below, at most.
     optional : bool
         Whether None may be given; a default of None says so too.
     infinite : bool
@@ -82,6 +83,7 @@ def parameter(
             "above": above,
             "least": least,
             "below": below,
+            "most": most,
             "made": default if made else None,
             "optional": optional or (default is None),
             "infinite": infinite,
@@ -992,11 +994,12 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
     number = check_number(field.name, value, unit, infinite=field.metadata["infinite"])
-    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
     for rule, limit, broken in (
         ("above", above, above is not None and not number > above),
         ("at least", least, least is not None and not number >= least),
         ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
         ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
         ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
     ):
