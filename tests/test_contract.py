@@ -86,6 +86,53 @@ def test_class_is_a_frozen_dataclass_with_and_without_the_decorator(decorate):
         cls(2.0)
 
 
+def test_other_ways_of_dataclasses():
+    """Slots, positional fields, an __init__ of one's own, an annotation that says it is none."""
+    from typing import ClassVar
+
+    @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+    class Slots(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+
+        def potential(self, q, xp):
+            return self.spring * (q.x - self.width) ** 2 / 2
+
+    @dataclasses.dataclass(frozen=True)
+    class Positional(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+        coordinates: ClassVar = {"x": "m"}
+
+    class Own(cart(False)):
+        def __init__(self, width):
+            for name, value in {"mass": width, "spring": 2.0, "springs": 1, "pair": ()}.items():
+                object.__setattr__(self, name, value)
+
+    slots = Slots(width=1.0)
+    assert slots.acceleration([1.5, 0.0])["x"] == -1.0 and pickle.loads(
+        pickle.dumps(copy.copy(Own(2.0)))
+    ) == Own(2.0)
+    assert dataclasses.replace(slots, mass=2.0).acceleration([1.5, 0.0])["x"] == -0.5
+    assert Positional(0.25).width == 0.25
+    assert Own(4.0).acceleration([1.0, 0.0])["x"] == -0.5
+
+
+def test_singular_state_is_its_own_affair():
+    class Polar(Scene):
+        coordinates = {"r": "m", "phi": "rad"}
+
+        def kinetic(self, q, v, xp):
+            return (v.r**2 + q.r**2 * v.phi**2) / 2
+
+        def potential(self, q, xp):
+            return -1 / q.r
+
+    scene = Polar()
+    found = scene.acceleration([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0], [2.0, 0.0, 0.0, 1.0]])["r"]
+    assert found[0] == 0.0 and found[2] == 1.75 and not np.isfinite(found[1])
+    A, _ = scene.linearise([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+    assert np.isfinite(A[0]).all() and not np.isfinite(A[1]).all()
+
+
 @both
 def test_derived_class_inherits_parameters_and_formulas(decorate):
     class Stiff(cart(decorate)):

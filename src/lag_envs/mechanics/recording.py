@@ -111,9 +111,11 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     numbers : mapping
         A number for each parameter that is not None.
     """
-    other = object.__new__(type(scene))
-    values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
-    vars(other).update(values | {name: numbers[name] for name in scene._numbers()}, **{TWIN: True})
+    other, given = object.__new__(type(scene)), scene._numbers()
+    for field in dataclasses.fields(scene):
+        value = numbers[field.name] if field.name in given else getattr(scene, field.name)
+        object.__setattr__(other, field.name, value)
+    vars(other)[TWIN] = True
     return other
 
 

@@ -121,6 +121,9 @@ def real_array(name: str, values: ArrayLike) -> Array:
 # mark, which is known by its identity: as a copy it would be taken for a default.
 copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 
+#: Where a motion is singular, or a number too large, that state's results are not finite; others are not touched.
+_QUIET = np.errstate(all="ignore")
+
 #: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
 _admitted: weakref.WeakKeyDictionary[type, set] = weakref.WeakKeyDictionary()
 
@@ -340,7 +343,8 @@ class Scene(metaclass=SceneType):
     def _structure(self) -> tuple:
         """All that decides which code steps the scene; scenes that agree in it differ in numbers only."""
         cls, numbers = type(self), self._numbers()
-        formulas = tuple(getattr(cls, name) for name in ("rests", *recording.ARGUMENTS))
+        # By identity: a formula that calls super() would keep its own class alive.
+        formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         plain = tuple((f.name, getattr(self, f.name)) for f in fields if "unit" not in f.metadata)
         zero = tuple(name for name in numbers if getattr(self, name) == 0.0)
@@ -353,10 +357,9 @@ class Scene(metaclass=SceneType):
         raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __reduce__(self) -> tuple:
-        return _restore, (
-            type(self),
-            {name: value for name, value in vars(self).items() if not name.startswith("_")},
-        )
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        others = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        return _restore, (type(self), others | fields)
 
     # --- what follows: names -------------------------------------------------------------------------------
 
@@ -477,6 +480,7 @@ class Scene(metaclass=SceneType):
         """Return the parameters' values by symbol."""
         return {recording.parameter(name): np.float64(getattr(self, name)) for name in self._numbers()}
 
+    @_QUIET
     def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the accelerations of the free coordinates, by name.
 
@@ -490,12 +494,14 @@ class Scene(metaclass=SceneType):
         point, shape = self._point(state, control)
         return {name: _shaped(point.acceleration[name], shape) for name in self._layout.free}
 
+    @_QUIET
     def mass_matrix(self, state: ArrayLike, control: ArrayLike = 0.0) -> Array:
         """Return the mass matrix of the free coordinates, shape (..., n, n)."""
         point, shape = self._point(state, control)
         n = len(self._layout.free)
         return np.stack([_shaped(x, shape) for x in point.mass], axis=-1).reshape(*shape, n, n)
 
+    @_QUIET
     def energy(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return kinetic, potential and total energy [J].
 
@@ -520,6 +526,7 @@ class Scene(metaclass=SceneType):
             energies["jacobi"] = kinetic - linear - 2.0 * rest + potential
         return {name: _shaped(value, shape) for name, value in energies.items()}
 
+    @_QUIET
     def forces(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
 
@@ -548,6 +555,7 @@ class Scene(metaclass=SceneType):
             forces[name] = np.divide(np.abs(forces[friction]), forces[normal], out=out, where=carries)[()]
         return forces
 
+    @_QUIET
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the powers of ``drive`` and ``applied`` forces and that lost to ``drag`` [W].
 
@@ -557,6 +565,7 @@ class Scene(metaclass=SceneType):
         point, shape = self._point(state, control)
         return {name: _shaped(value, shape) for name, value in point.power().items()}
 
+    @_QUIET
     def linearise(self, state: ArrayLike, control: ArrayLike = 0.0) -> tuple[Array, Array]:
         """Return the derivatives of the state's rate of change by state and control, (A, B).
 
@@ -881,7 +890,8 @@ def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
     """Return a scene from a pickle, perhaps the first of its class in this process."""
     _complete(cls)
     scene = object.__new__(cls)
-    vars(scene).update(state)
+    for name, value in state.items():
+        object.__setattr__(scene, name, value)
     scene._admit()
     return scene
 
