@@ -121,7 +121,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 # mark, which is known by its identity: as a copy it would be taken for a default.
 copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 
-#: Where a motion is singular, or a number too large, that state's results are not finite; others are not touched.
+#: Where a motion is singular, or a number too large, that state's results are not finite, and no others'.
 _QUIET = np.errstate(all="ignore")
 
 #: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
