@@ -309,7 +309,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         They are 0 after a reset.
         """
-        return single_number(np.stack([self._read(name) for name in self._program.u], axis=1))
+        return single_number(np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T)
 
     # --- the rest ------------------------------------------------------------------------------------------
 
