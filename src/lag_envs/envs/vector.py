@@ -430,6 +430,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}"
+            "the environments of a batch may differ in numbers only: they must agree in structural options, in "
+            f"having a finite track or a fixed target, and in zeros that a formula divides by; got {many}"
         )
     return tasks
