@@ -16,11 +16,11 @@ from lag_envs.mechanics import algebra
 from lag_envs.stepping import elementary, lowering, primitives, series, tracing
 from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.series import ZERO, Series
+from lag_envs.stepping.series import LARGEST_ORDER, Series
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
-#: Numbers that are set aside for one series.
-STRIDE = ZERO + 1
+#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
+STRIDE = LARGEST_ORDER + 3
 
 
 class Layout:
@@ -155,7 +155,7 @@ class Machine:
         b.cbranch(self.below(k, end), inside, after)
         b.position_at_end(inside)
         self._again(head, k, phis, body(k, list(phis)), step)
-        b.branch(head)
+        b.branch(head).set_metadata("llvm.loop", self._as_written())
         b.position_at_end(after)
         return phis
 
@@ -171,6 +171,14 @@ class Machine:
         b.cbranch(b.and_(going, self.below(k, self.index(times - 1))), head, after)
         b.position_at_end(after)
         return values
+
+    def _as_written(self) -> ir.MDValue:
+        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
+        module = self._b.module
+        request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
+        loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
+        loop.operands = (loop, request)  # a loop's first operand is itself
+        return loop
 
     def _phis(self, start: ir.Block, first: Any, carried: Sequence) -> tuple[ir.Value, list]:
         k = self._b.phi(_INT)
@@ -248,7 +256,7 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    t = Machine(builder, step.slots * STRIDE + step.rest, lanes, fused)
+    t = Machine(builder, step.slots * STRIDE + 1, lanes, fused)
 
     def pointer(row: int) -> ir.Value:
         return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())

@@ -38,8 +38,6 @@ from lag_envs.stepping.tracing import Operation, evaluate
 
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
-#: The entry of a slot that holds a zero, and so does the one before it.
-ZERO = LARGEST_ORDER + 2
 
 #: What a substep's truncation may be, relative to the size of the velocities.
 TOLERANCE = 1e-14
@@ -139,10 +137,6 @@ class Series:
         self._distinct = list(dict.fromkeys(self._pairs.values()))
         #: Number of series that are kept.
         self.slots = len(self._slots)
-        #: The slot after them: sums that wait for their order, and a number that waits.
-        self._sums, self._spare = self.slots, 2 * len(self._distinct)
-        #: Entries that the last slot needs.
-        self.rest = self._spare + 1
 
     # --- which series are kept -----------------------------------------------------------------------------
 
@@ -207,11 +201,6 @@ class Series:
         """
         record, zero = self.record, t.number(0.0)
         scalars = t.scalars(record, inputs)
-        for slot in range(self.slots):
-            t.store(slot, t.index(ZERO - 1), zero)
-            t.store(slot, t.index(ZERO), zero)
-        for k in range(self.rest):
-            t.store(self._sums, t.index(k), zero)
         known: dict[int, Any] = {}
         halves: dict[int, Any] = {}
         for n, node in enumerate(record.nodes):
@@ -232,14 +221,13 @@ class Series:
         rates = self._accelerate(t, inverse, right, h, t.index(0))
 
         def two_orders(k: Any, carried: Sequence) -> list:
-            t.when(t.below(t.index(3), k), lambda: self._convolve(t, k))
-            first = t.select(t.below(t.index(0), k), k, t.index(1))
-            after = t.plus(k, 2)
-            end = t.select(t.below(after, order), after, order)
-            t.loop(first, end, [], lambda m, _: self._one_order(t, start, halves, rates, h, m, t.minus(m, k)))
+            sums = self._convolve(t, k)
+            self._one_order(t, start, halves, rates, h, k, lambda pair: sums[pair][0])
+            self._one_order(t, start, halves, rates, h, t.plus(k, 1), lambda pair: self._newest(t, k, pair, sums[pair][1]))
             return []
 
-        t.loop(t.index(0), order, [], two_orders, step=2)
+        self._one_order(t, start, halves, rates, h, t.index(1), lambda pair: None)
+        t.loop(t.index(2), order, [], two_orders, step=2)
         return start
 
     def _keep(self, t: Target, n: int, k: Any, value: Any) -> None:
@@ -308,25 +296,23 @@ class Series:
                 total = t.mul(weight, x) if total is None else t.fma(weight, x, total)
         return t.number(0.0) if total is None else total
 
-    def _convolve(self, t: Target, k: Any) -> None:
-        """Store Σ_{1<j<m-1} A_j B_{m-j} for all pairs and the orders m = k and k + 1, for even k > 3.
+    def _convolve(self, t: Target, k: Any) -> dict:
+        """Return Σ_{0<j<k} A_j B_{k-j} and Σ_{1<j<k} A_j B_{k+1-j} for all pairs, k even.
 
-        Both orders share what they load: B_{k+1-j} is what B_{k-j} was for the j before.
+        Both share what they load: B_{k+1-j} is what B_{k-j} was for the j before.
         """
         unlike = [pair for pair in self._distinct if pair[0] != pair[1]]
         squares = [pair for pair in self._distinct if pair[0] == pair[1]]
-        before = t.plus(k, -1)
-        half = t.half(k)
-        for pairs, end in ((unlike, before), (squares, half)):
+        sums: dict = {}
+        for pairs, end in ((unlike, k), (squares, t.half(k))):
             for first in range(0, len(pairs), GROUP):
-                self._convolve_group(t, k, pairs[first : first + GROUP], end)
+                sums |= self._convolve_group(t, k, pairs[first : first + GROUP], end)
+        return sums
 
-    def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> None:
-        """Sum up to j = end for the order k + 1, and to one less for k."""
+    def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> dict:
         n = len(pairs)
         lower = list(dict.fromkeys(a for a, _ in pairs))
         upper = list(dict.fromkeys(b for _, b in pairs))
-        zero = t.number(0.0)
 
         def accumulate(j: Any, carried: Sequence) -> list:
             other = t.minus(k, j)
@@ -337,37 +323,39 @@ class Series:
             odd = [t.fma(x[a], last[b], total) for (a, b), total in zip(pairs, carried[n : 2 * n], strict=True)]
             return [*even, *odd, *y.values()]
 
-        newest = [b.load(t, t.plus(k, -1)) for b in upper]
-        totals = t.loop(t.index(2), end, [*[zero] * (2 * n), *newest], accumulate)
+        zeros = [t.number(0.0)] * (2 * n + len(upper))
+        totals = t.loop(t.index(1), end, zeros, accumulate)
         last = dict(zip(upper, totals[2 * n :], strict=True))
-        x = {a: a.load(t, end) for a in lower}
+        result = {}
         for (a, b), even, odd in zip(pairs, totals[:n], totals[n : 2 * n], strict=True):
-            odd = t.fma(x[a], last[b], odd)
-            if a == b:
-                even = t.fma(x[a], x[a], t.add(even, even))
+            if a == b:  # the sums so far are one half, without the middle
+                middle = a.load(t, end)
+                even = t.fma(middle, middle, t.add(even, even))
+                odd = t.fma(middle, last[b], odd)
                 odd = t.add(odd, odd)
-            at = 2 * self._distinct.index((a, b))
-            t.store(self._sums, t.index(at), even)
-            t.store(self._sums, t.index(at + 1), odd)
+            result[a, b] = even, odd
+        return result
+
+    def _newest(self, t: Target, k: Any, pair: tuple[Factor, Factor], total: Any) -> Any:
+        """Add A_1 B_k + A_k B_1."""
+        a, b = pair
+        total = t.fma(a.load(t, t.index(1)), b.load(t, k), total)
+        return t.fma(a.load(t, k), b.load(t, t.index(1)), total)
 
     def _one_order(
-        self, t: Target, start: Start, halves: dict, rates: list, h: Any, k: Any, parity: Any
+        self, t: Target, start: Start, halves: dict, rates: list, h: Any, k: Any, inner_of: Callable
     ) -> list:
         """Compute the coefficients of order k > 0, with sums from `_convolve`."""
-        record, zero = self.record, t.index(ZERO)
+        record = self.record
         before = t.plus(k, -1)
-        second = t.select(t.below(t.index(1), k), t.index(1), zero)
-        late = t.select(t.below(t.index(2), k), before, zero)
         per = t.reciprocal(k)
         step = t.mul(h, per)
         values: dict[int, Any] = {}
 
         def inner(key: Any) -> Any:
             """Return Σ_{0<j<k} A_j B_{k-j}."""
-            a, b = self._pairs[key]
-            total = t.load(self._sums, t.plus(parity, 2 * self._distinct.index((a, b))))
-            total = t.fma(a.load(t, second), b.load(t, before), total)
-            return t.fma(a.load(t, late), b.load(t, second), total)
+            total = inner_of(self._pairs[key])
+            return t.number(0.0) if total is None else total
 
         def compute(n: int, node: Node) -> Any:
             op, args = node.op, node.args
@@ -477,6 +465,7 @@ class Series:
         certificate = Certificate(self, t, start, order, tolerance)
         one = t.number(1.0)
         never = t.less(one, t.number(0.0))
+        t.store(self.slots, t.index(0), one)  # one number waits in a slot of its own
 
         def shortened(count: Any, carried: Sequence) -> tuple[Any, list]:
             _, h, factor, *_ = carried
@@ -484,8 +473,8 @@ class Series:
             h = t.mul(h, factor)
             passed, bounds = certificate.check(h)
             over = t.all(passed)
-            t.when(t.negated(over), lambda: t.store(self._sums, t.index(self._spare), certificate.part()))
-            factor = t.select(passed, one, t.load(self._sums, t.index(self._spare)))
+            t.when(t.negated(over), lambda: t.store(self.slots, t.index(0), certificate.part()))
+            factor = t.select(passed, one, t.load(self.slots, t.index(0)))
             return t.negated(over), [passed, h, factor, *bounds]
 
         none = [t.number(math.inf)] * self.size
