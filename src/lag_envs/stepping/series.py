@@ -106,7 +106,7 @@ class Start(NamedTuple):
     """What an expansion knows beside its slots: coefficients of order 0, the factors of M_0, weights."""
 
     zero: dict[int, Any]
-    inverse: Factors
+    inverse: Inverse
     scalars: dict[str, Any]
 
 
@@ -215,7 +215,7 @@ class Series:
         for i in range(self.size):
             t.store(self._slots["v", i], t.index(0), v[i])
         matrix = {place: self._entry(t, known, scalars, *entry) for place, entry in record.mass.items()}
-        inverse = Factors(t, matrix, self.size)
+        inverse = Inverse(t, matrix, self.size)
         start = Start(known, inverse, scalars)
         right = [known[f] if f >= 0 else None for f in record.force]
         rates = self._accelerate(t, inverse, right, h, t.index(0))
@@ -404,9 +404,9 @@ class Series:
         self._accelerate(t, start.inverse, right, h, k)
         return []
 
-    def _accelerate(self, t: Target, inverse: Factors, right: Sequence, h: Any, k: Any) -> list:
+    def _accelerate(self, t: Target, inverse: Inverse, right: Sequence, h: Any, k: Any) -> list:
         """Store a_k and v_{k+1}; return a_k."""
-        a = inverse.solve([t.number(0.0) if r is None else r for r in right])
+        a = [t.number(0.0) if x is None else x for x in _times(t, inverse.rows, right)]
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
         for i in range(self.size):
@@ -482,57 +482,41 @@ class Series:
         return done, h, *self.advance(t, q, h, order), bounds
 
 
-class Factors:
-    """M = L D Lᵀ, and what can be solved with it. Entries that are not there cost nothing."""
+class Inverse:
+    """The inverse of a symmetric matrix by symmetric sweeps. Entries that are not there cost nothing.
+
+    Attributes
+    ----------
+    rows : list of list
+        M⁻¹; None stands for zero.
+    definite : condition
+        Whether all pivots are positive, those of M = L D Lᵀ.
+    """
 
     def __init__(self, t: Target, matrix: dict[tuple[int, int], Any], size: int) -> None:
-        self._t, self._size = t, size
         self.matrix = matrix
-        lower: dict[tuple[int, int], Any] = {}
-        self._inverse: list = []
-        scaled: dict[tuple[int, int], Any] = {}
-        for j in range(size):
-            pivot = matrix[j, j]
-            for k in range(j):
-                if (j, k) in lower:
-                    pivot = t.sub(pivot, t.mul(lower[j, k], scaled[j, k]))
-            self._inverse.append(t.div(t.number(1.0), pivot))
-            self.definite = (
-                t.less(t.number(0.0), pivot) if j == 0 else t.both(self.definite, t.less(t.number(0.0), pivot))
-            )
-            for i in range(j + 1, size):
-                entry = matrix.get((j, i))
-                for k in range(j):
-                    if (i, k) in lower and (j, k) in lower:
-                        product = t.mul(lower[i, k], scaled[j, k])
-                        entry = t.neg(product) if entry is None else t.sub(entry, product)
-                if entry is not None:
-                    scaled[i, j] = entry
-                    lower[i, j] = t.mul(entry, self._inverse[j])
-        self._lower = lower
+        a = {place: entry for i, j in matrix for place, entry in (((i, j), matrix[i, j]), ((j, i), matrix[i, j]))}
+        self.definite: Any = None
+        for k in range(size):
+            positive = t.less(t.number(0.0), a[k, k])
+            self.definite = positive if k == 0 else t.both(self.definite, positive)
+            per = t.div(t.number(1.0), a[k, k])
+            row = {i: a[i, k] for i in range(size) if i != k and (i, k) in a}
+            scaled = {i: t.mul(x, per) for i, x in row.items()}
+            for i in row:
+                less = t.neg(scaled[i])
+                for j in row:
+                    if j >= i:
+                        a[i, j] = a[j, i] = _add_product(t, a.get((i, j)), less, row[j])
+                a[i, k] = a[k, i] = scaled[i]
+            a[k, k] = t.neg(per)
+        # Every sweep leaves the negative inverse of the part that was swept.
+        found = {(i, j): t.neg(x) for (i, j), x in a.items() if j >= i}
+        self.rows = [[found.get((min(i, j), max(i, j))) for j in range(size)] for i in range(size)]
 
-    def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a vector; None stands for zero."""
-        t, n = self._t, self._size
-        y: list = list(right)
-        for i in range(n):
-            for k in range(i):
-                if (i, k) in self._lower and y[k] is not None:
-                    product = t.mul(self._lower[i, k], y[k])
-                    y[i] = t.neg(product) if y[i] is None else t.sub(y[i], product)
-        x = [None if y[i] is None else t.mul(y[i], self._inverse[i]) for i in range(n)]
-        for i in reversed(range(n)):
-            for k in range(i + 1, n):
-                if (k, i) in self._lower and x[k] is not None:
-                    product = t.mul(self._lower[k, i], x[k])
-                    x[i] = t.neg(product) if x[i] is None else t.sub(x[i], product)
-        return x
 
-    def absolute_inverse(self) -> list[list]:
-        """Return |M⁻¹| by rows; None stands for zero."""
-        t, n = self._t, self._size
-        columns = [self.solve([t.number(1.0) if i == j else None for i in range(n)]) for j in range(n)]
-        return [[None if columns[j][i] is None else t.abs(columns[j][i]) for j in range(n)] for i in range(n)]
+def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
+    return t.mul(a, b) if total is None else t.fma(a, b, total)
 
 
 def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
@@ -542,7 +526,7 @@ def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
         total = None
         for entry, value in zip(row, vector, strict=True):
             if entry is not None and value is not None:
-                total = t.mul(entry, value) if total is None else t.fma(entry, value, total)
+                total = _add_product(t, total, entry, value)
         result.append(total)
     return result
 
@@ -570,7 +554,7 @@ class Certificate:
     def __init__(self, series: Series, t: Target, start: Start, order: Any, tolerance: Any) -> None:
         self._series, self._t, self._order, self._tolerance = series, t, order, tolerance
         self._start, self._n = start, series.size
-        self._inverse = start.inverse.absolute_inverse()
+        self._inverse = [[None if x is None else t.abs(x) for x in row] for row in start.inverse.rows]
         matrix = start.inverse.matrix
         self._roots = [t.sqrt(matrix[i, i]) for i in range(self._n)]
         self._per_root = [t.div(t.number(1.0), root) for root in self._roots]
