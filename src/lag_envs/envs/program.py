@@ -366,18 +366,7 @@ class Program:
             "wide_vectors()",
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            "bad = 0",
-            f"for i in range(second * np.uint64({len(self.a)})):", "    bad += not (abs(action[i]) < math.inf)",
-            "if bad > 0:",
-            "    for i in range(count):",
-            *(
-                line
-                for j in range(len(self.a))
-                for line in (
-                    f"        if not (abs(action[i * {len(self.a)} + {j}]) < math.inf) and {running}:",
-                    "            return -(i + 1), 0",
-                )
-            ),
+            *(self._check_finite(running) if self.a else []),
             "overs, refused = 0, np.uint64(0)",
             *self._each_block,
             *_indent([
@@ -400,6 +389,18 @@ class Program:
         ]  # fmt: skip
         arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
         return self._batch("step_all", arguments, body, *helpers)
+
+    def _check_finite(self, running: str) -> list[str]:
+        """Return the lines that look for actions that are not finite, before anything is stepped."""
+        n = len(self.a)
+        found = (f"        if not (abs(action[i * {n} + {j}]) < math.inf) and {running}:" for j in range(n))
+        return [
+            "bad = 0",
+            f"for i in range(second * np.uint64({n})):", "    bad += not (abs(action[i]) < math.inf)",
+            "if bad > 0:",
+            "    for i in range(count):",
+            *(line for test in found for line in (test, "            return -(i + 1), 0")),
+        ]  # fmt: skip
 
     def _action(self, j: int) -> str:
         """Return where action j of the environment at hand lies in the batch's array."""

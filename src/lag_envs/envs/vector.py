@@ -309,7 +309,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         They are 0 after a reset.
         """
-        return single_number(np.stack([self._read(name) for name in self._program.u], axis=1))
+        return single_number(np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T)
 
     # --- the rest ------------------------------------------------------------------------------------------
 
@@ -430,6 +430,7 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}"
+            "the environments of a batch may differ in numbers only: they must agree in structural options, in "
+            f"having a finite track or a fixed target, and in zeros that a formula divides by; got {many}"
         )
     return tasks

@@ -752,8 +752,9 @@ class Scene(metaclass=SceneType):
         states, controls, shape = self._check_both(state, control)
         dt = check_step(dt)
         n, m = states.shape[-1], controls.shape[-1]
-        states = np.broadcast_to(states, (*shape, n)).reshape(-1, n)
-        controls = np.broadcast_to(controls, (*shape, m)).reshape(-1, m)
+        count = math.prod(shape)
+        states = np.broadcast_to(states, (*shape, n)).reshape(count, n)
+        controls = np.broadcast_to(controls, (*shape, m)).reshape(count, m)
         parameters = {name: getattr(self, name) for name in self._numbers()}
         found, refused = self._stepper.jacobian(states, controls, parameters, dt, self._order(dt))
         if refused:

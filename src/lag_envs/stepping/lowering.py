@@ -28,6 +28,9 @@ Weight = str | float
 #: Kinds of symbols that change within a step.
 VARYING = frozenset({"place", "velocity"})
 
+#: Functions that are integrated along their argument.
+FUNCTIONS = frozenset({"sin", "cos", "exp", "log", "atan", "tanh"})
+
 
 @dataclasses.dataclass(frozen=True)
 class Node:
@@ -35,9 +38,8 @@ class Node:
 
     ``op`` is one of ``place``, ``velocity`` (of the free coordinate `index`), ``polynomial`` (known from the
     start: `weights` are its coefficients in powers of t), ``sum`` (`weights` times `args`, and a constant
-    `weights[-1]`), ``product``, ``reciprocal``, ``sin``, ``cos``, ``exp``, ``log``, ``sqrt``, ``atan``,
-    ``tanh`` (of `args`). Functions that need them name their companions as further arguments: ``sin`` its
-    cosine and back, ``atan`` and ``tanh`` their slope.
+    `weights[-1]`), ``product``, ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These obey
+    z' = w x', and their `args` are x, w (of a cosine: -w), and x' where x is a weighted sum of places.
     """
 
     op: str
@@ -62,8 +64,8 @@ class SeriesRecord:
         What computes the weights from the inputs.
     nodes : tuple of Node
         In an order in which each needs earlier ones only (at the same order of the series).
-    mass : mapping from (i, j), i <= j, to (node or None, number)
-        Mass matrix: a node, or a weight that does not change within the step.
+    mass : mapping from (i, j), i <= j, to (node, weight, constant)
+        Entries of the mass matrix, weight times node plus constant; the node is -1 where nothing changes.
     force : tuple of int
         Nodes of the right-hand side; -1 where it vanishes.
     tangents : mapping from str to mapping
@@ -75,7 +77,7 @@ class SeriesRecord:
     constants: Mapping[str, Expr]
     scalars: tuple[Operation, ...]
     nodes: tuple[Node, ...]
-    mass: Mapping[tuple[int, int], tuple[int, Weight]]
+    mass: Mapping[tuple[int, int], tuple[int, Weight, Weight]]
     force: tuple[int, ...]
     tangents: Mapping[str, Mapping[str, Weight]] = dataclasses.field(default_factory=dict)
 
@@ -211,28 +213,42 @@ class Lowering:
         if atom.function == "sum":
             return self.series(atom.argument)
         x = self.series(atom.argument)
-        if atom.function in ("sin", "cos"):
-            # The pair is made at once; each names the other.
+        if atom.function == "sqrt":
+            return self._node("sqrt", (x,))
+        rate = self._rate(atom.argument)
+        key = ("pair" if atom.function in ("sin", "cos") else atom.function, x)
+        if key not in self._known:
+            slope = None
+            if atom.function == "atan":
+                slope = self._node("reciprocal", (self._node("sum", (self._product(x, x),), (1.0, 1.0)),))
+            elif atom.function == "log":
+                slope = self._node("reciprocal", (x,))
             first = len(self.nodes)
-            key = ("pair", x)
-            if key not in self._known:
-                self._known[key] = first
-                self.nodes += [("sin", (x, first + 1), (), 0), ("cos", (x, first), (), 0)]
-            return self._known[key] + (atom.function == "cos")
-        if atom.function == "atan":
-            slope = self._node("reciprocal", (self._node("sum", (self._product(x, x),), (1.0, 1.0)),))
-            return self._node("atan", (x, slope))
-        if atom.function == "tanh":
-            key = ("tanh", x)
-            if key not in self._known:
-                # tanh' = 1 - tanh²: the value needs the slope at lower orders only, so it may come first.
-                value = len(self.nodes)
-                self._known[key] = value
-                self.nodes.append(("tanh", (x, value + 2), (), 0))
-                self.nodes.append(("product", (value, value), (), 0))
-                self.nodes.append(("sum", (value + 1,), (-1.0, 1.0), 0))
-            return self._known[key]
-        return self._node(atom.function, (x,))
+            self._known[key] = first
+            if key[0] == "pair":  # made at once; each is the other's slope
+                self.nodes += [("sin", (x, first + 1, *rate), (), 0), ("cos", (x, first, *rate), (), 0)]
+            elif atom.function == "tanh":  # the slope is 1 - tanh²
+                self.nodes += [
+                    ("tanh", (x, first + 2, *rate), (), 0),
+                    ("product", (first, first), (), 0),
+                    ("sum", (first + 1,), (-1.0, 1.0), 0),
+                ]
+            else:
+                self.nodes.append((atom.function, (x, first if slope is None else slope, *rate), (), 0))
+        return self._known[key] + (atom.function == "cos")
+
+    def _rate(self, argument: Expr) -> tuple[int, ...]:
+        """Return the node of an argument's rate if it is a weighted sum of places, else nothing."""
+        total = Expr({})
+        for monomial, c in argument.terms.items():
+            varying = [(atom, n) for atom, n in monomial if _varies(atom)]
+            if varying:
+                ((atom, n), *more) = varying
+                if more or n != 1 or atom.argument is not None or atom.kind != "place":
+                    return ()
+                rest = {tuple(f for f in monomial if f[0] is not atom): c}
+                total = total + Expr(rest) * Expr.of(Atom("velocity", atom.name))
+        return (self.series(total),)
 
     def series(self, expr: Expr) -> int:
         """Return the node of an expression that changes within a step."""
@@ -329,7 +345,7 @@ class Lowering:
         entries: dict[tuple[int, int], tuple[int, Any]] = {}
         for where, e in sorted(mass.items()):
             varying = any(_varies(a) for a in e.atoms())
-            entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))
+            entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))  # node, constant
         return right, entries
 
     def record(
@@ -371,7 +387,7 @@ class Lowering:
                 nodes.append(Node("sum", (), (0.0,)))
 
         arguments = {args[0] for op, args, _, _ in self.nodes if op not in ("sum", "product") and args}
-        # Companions are named before they are made; they follow their partner at a fixed distance.
+        # Slopes may be named before they are made; then they follow at a fixed distance.
         for i, (op, args, ws, index) in enumerate(self.nodes):
             numbers = tuple(next(value) for _ in ws)
             if op == "sum":
@@ -393,9 +409,16 @@ class Lowering:
                 vanish(i)
                 continue
             now[i] = len(nodes)
-            nodes.append(Node(op, tuple(now[a] if a < i else now[i] + a - i for a in args), numbers, index))
-        mass = {place: (now[node], next(value)) for place, (node, _) in entries.items()}
-        mass = {place: (n, w) for place, (n, w) in mass.items() if n >= 0 or w != 0.0}
+            found = [now[a] if a < i else now[i] + a - i for a in args]
+            nodes.append(Node(op, tuple(a for a in found if a >= 0), numbers, index))  # a rate may vanish
+        mass = {}
+        for place, (node, _) in entries.items():
+            weight, constant, node = 1.0, next(value), now[node]
+            if node >= 0 and nodes[node].op == "sum" and len(nodes[node].args) == 1:
+                weight, constant = nodes[node].weights
+                (node,) = nodes[node].args
+            if node >= 0 or constant != 0.0:
+                mass[place] = (node, weight, constant)
         return _needed(
             len(self._free),
             tuple(self._inputs),
@@ -412,7 +435,7 @@ def _needed(
     size: int, inputs: Any, constants: Any, operations: Any, nodes: Any, mass: Any, force: Any, tangents: Any
 ) -> SeriesRecord:
     used: set[int] = set()
-    stack = [n for n, _ in mass.values()] + list(force)
+    stack = [n for n, _, _ in mass.values()] + list(force)
     while stack:
         n = stack.pop()
         if n >= 0 and n not in used:
@@ -422,7 +445,7 @@ def _needed(
     kept = tuple(
         dataclasses.replace(nodes[n], args=tuple(renumber[a] for a in nodes[n].args)) for n in sorted(used)
     )
-    weights = {w for node in kept for w in node.weights} | {w for _, w in mass.values()}
+    weights = {w for node in kept for w in node.weights} | {w for _, *ws in mass.values() for w in ws}
     names = {w for w in weights if isinstance(w, str)}
     tangents = {name: slopes for name, slopes in tangents.items() if name in names}
     names |= {w for slopes in tangents.values() for w in slopes.values() if isinstance(w, str)}
@@ -438,7 +461,7 @@ def _needed(
         {name: e for name, e in constants.items() if name in given},
         tuple(lines[::-1]),
         kept,
-        {place: (renumber[n], w) for place, (n, w) in mass.items()},
+        {place: (renumber[n], *ws) for place, (n, *ws) in mass.items()},
         tuple(renumber[n] for n in force),
         tangents,
     )

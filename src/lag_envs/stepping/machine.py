@@ -20,8 +20,8 @@ from lag_envs.stepping.primitives import emit
 from lag_envs.stepping.series import LARGEST_ORDER, Series
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
-#: Coefficients of one series that are set aside: a place has one more than the order.
-STRIDE = LARGEST_ORDER + 2
+#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
+STRIDE = LARGEST_ORDER + 3
 
 
 class Layout:
@@ -48,11 +48,11 @@ class Layout:
 class Machine:
     """The target that writes LLVM's language: numbers are doubles, or vectors of them."""
 
-    def __init__(self, builder: ir.IRBuilder, slots: int, lanes: int, fused: bool) -> None:
+    def __init__(self, builder: ir.IRBuilder, entries: int, lanes: int, fused: bool) -> None:
         self._b, self._fused = builder, fused
         self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
         self._lanes = lanes
-        memory = builder.alloca(self.kind, slots * STRIDE)
+        memory = builder.alloca(self.kind, entries)
         memory.align = 8 * lanes
         self._memory = memory
 
@@ -95,16 +95,27 @@ class Machine:
     def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
         return self._b.select(condition, a, b)
 
-    def any(self, condition: Any) -> ir.Value:
+    def all(self, condition: Any) -> ir.Value:
         if self._lanes == 1:
             return condition
         kind = ir.IntType(self._lanes)
-        return self._b.icmp_unsigned("!=", self._b.bitcast(condition, kind), ir.Constant(kind, 0))
+        return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
+
+    def negated(self, condition: Any) -> ir.Value:
+        return self._b.not_(condition)
 
     def real(self, k: Any) -> ir.Value:
-        if isinstance(k, ir.Constant):
-            return self.number(float(k.constant))
         return self._splat(self._b.sitofp(k, _DOUBLE))
+
+    def reciprocal(self, k: Any) -> ir.Value:
+        table = self._b.module.globals.get("reciprocals")
+        if table is None:
+            values = [ir.Constant(_DOUBLE, 1.0 / max(i, 1)) for i in range(STRIDE + 1)]
+            kind = ir.ArrayType(_DOUBLE, len(values))
+            table = ir.GlobalVariable(self._b.module, kind, "reciprocals")
+            table.linkage, table.global_constant = "internal", True
+            table.initializer = ir.Constant(kind, values)
+        return self._splat(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
 
     def _splat(self, value: Any) -> ir.Value:
         return value if self._lanes == 1 else primitives.splat(self._b, value, self._lanes)
@@ -120,6 +131,12 @@ class Machine:
     def minus(self, a: Any, b: Any) -> ir.Value:
         return self._b.sub(a, b)
 
+    def half(self, k: Any) -> ir.Value:
+        return self._b.lshr(k, ir.Constant(_INT, 1))
+
+    def below(self, a: Any, b: Any) -> ir.Value:
+        return self._b.icmp_signed("<", a, b)
+
     def _at(self, slot: int, k: Any) -> ir.Value:
         return self._b.gep(self._memory, [self.plus(k, slot * STRIDE)])
 
@@ -129,42 +146,53 @@ class Machine:
     def store(self, slot: int, k: Any, value: Any) -> None:
         self._b.store(value, self._at(slot, k))
 
-    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable) -> list:
-        return self._repeat(first, end, None, carried, lambda k, values: (None, body(k, values)))
-
-    def repeat(self, times: int, going: Any, carried: Sequence, body: Callable) -> list:
-        return self._repeat(self.index(0), self.index(times), going, carried, body)
-
-    def _repeat(self, first: Any, end: Any, going: Any, carried: Sequence, body: Callable) -> list:
+    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
         b = self._b
         start = b.basic_block
         head, inside, after = (b.append_basic_block(name) for name in ("head", "inside", "after"))
         b.branch(head)
         b.position_at_end(head)
-        k = b.phi(_INT)
-        k.add_incoming(first, start)
-        phis = [b.phi(value.type) for value in carried]
-        for phi, value in zip(phis, carried, strict=True):
-            phi.add_incoming(value, start)
-        flag = None
-        if going is not None:
-            flag = b.phi(_BIT)
-            flag.add_incoming(going, start)
-        more = b.icmp_signed("<", k, end)
-        if flag is not None:
-            more = b.and_(more, flag)
-        b.cbranch(more, inside, after)
+        k, phis = self._phis(start, first, carried)
+        b.cbranch(self.below(k, end), inside, after)
         b.position_at_end(inside)
-        still, values = body(k, list(phis))
-        last = b.basic_block
-        k.add_incoming(b.add(k, ir.Constant(_INT, 1)), last)
-        for phi, value in zip(phis, values, strict=True):
-            phi.add_incoming(value, last)
-        if flag is not None:
-            flag.add_incoming(still, last)
-        b.branch(head)
+        self._again(head, k, phis, body(k, list(phis)), step)
+        b.branch(head).set_metadata("llvm.loop", self._as_written())
         b.position_at_end(after)
         return phis
+
+    def repeat(self, times: int, carried: Sequence, body: Callable) -> list:
+        b = self._b
+        start = b.basic_block
+        head, after = (b.append_basic_block(name) for name in ("head", "after"))
+        b.branch(head)
+        b.position_at_end(head)
+        k, phis = self._phis(start, self.index(0), carried)
+        going, values = body(k, list(phis))
+        self._again(head, k, phis, values, 1)
+        b.cbranch(b.and_(going, self.below(k, self.index(times - 1))), head, after)
+        b.position_at_end(after)
+        return values
+
+    def _as_written(self) -> ir.MDValue:
+        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
+        module = self._b.module
+        request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
+        loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
+        loop.operands = (loop, request)  # a loop's first operand is itself
+        return loop
+
+    def _phis(self, start: ir.Block, first: Any, carried: Sequence) -> tuple[ir.Value, list]:
+        k = self._b.phi(_INT)
+        k.add_incoming(first, start)
+        phis = [self._b.phi(value.type) for value in carried]
+        for phi, value in zip(phis, carried, strict=True):
+            phi.add_incoming(value, start)
+        return k, phis
+
+    def _again(self, head: ir.Block, k: Any, phis: Sequence, values: Sequence, step: int) -> None:
+        k.add_incoming(self._b.add(k, ir.Constant(_INT, step)), self._b.basic_block)
+        for phi, value in zip(phis, values, strict=True):
+            phi.add_incoming(value, self._b.basic_block)
 
     def when(self, condition: Any, body: Callable) -> None:
         with self._b.if_then(condition):
@@ -229,7 +257,7 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    t = Machine(builder, step.slots, lanes, fused)
+    t = Machine(builder, step.slots * STRIDE + 1, lanes, fused)
 
     def pointer(row: int) -> ir.Value:
         return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())

@@ -5,7 +5,7 @@ numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepp
 Python numbers (`Plain`).
 
 **Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by order
-(sums termwise, products by convolution, functions by their differential equations), with q_{k+1} = h v_k/(k+1),
+(sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
 v_{k+1} = h a_k/(k+1), and the accelerations from::
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
@@ -13,9 +13,9 @@ v_{k+1} = h a_k/(k+1), and the accelerations from::
 with one factorisation M_0 = L D Lᵀ.
 
 **Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and above.
-Known are the coefficients below N of every node, and v_N, q_N, q_{N+1}. Suppose that the velocities' beyond N
-sum up to E_v at most. Then those of the places do to |q_N| + |q_{N+1}| + hE_v/(N+2), and tails follow node by
-node, see `Certificate`. With R the tail of r - Ma, cut after N - 1, the step is accepted if for some E_a > 0::
+Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum up to E_v at
+most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after N - 1, the step is
+accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
@@ -33,12 +33,11 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.lowering import Node, SeriesRecord
+from lag_envs.stepping.lowering import FUNCTIONS, Node, SeriesRecord
 from lag_envs.stepping.tracing import Operation, evaluate
 
-#: The highest order that a series may have.
-LARGEST_ORDER = 24
-SMALLEST_ORDER = 4
+#: The orders that a series may have.
+SMALLEST_ORDER, LARGEST_ORDER = 4, 24
 
 #: What a substep's truncation may be, relative to the size of the velocities.
 TOLERANCE = 1e-14
@@ -46,9 +45,8 @@ TOLERANCE = 1e-14
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
 TRIES = 10
-
-
-ELEMENTARY = ("sin", "cos", "exp", "log", "atan", "tanh")
+#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its registers.
+GROUP = 8
 
 
 @cache
@@ -61,7 +59,7 @@ def elementary(name: str, fused: bool) -> tuple[tuple[Operation, ...], str]:
 
 
 class Target(Protocol):
-    """Numbers, slots and loops; see `Plain`, the simplest one."""
+    """Numbers, slots and loops; see `Plain`, the simplest one. An index is a whole number."""
 
     def number(self, value: float) -> Any: ...
     def add(self, a: Any, b: Any) -> Any: ...
@@ -75,25 +73,40 @@ class Target(Protocol):
     def less(self, a: Any, b: Any) -> Any: ...
     def both(self, a: Any, b: Any) -> Any: ...
     def select(self, condition: Any, a: Any, b: Any) -> Any: ...
-    def any(self, condition: Any) -> Any: ...
+    def all(self, condition: Any) -> Any: ...
+    def negated(self, condition: Any) -> Any: ...
     def real(self, k: Any) -> Any: ...
+    def reciprocal(self, k: Any) -> Any: ...
     def index(self, k: int) -> Any: ...
     def plus(self, k: Any, n: int) -> Any: ...
     def minus(self, a: Any, b: Any) -> Any: ...
+    def half(self, k: Any) -> Any: ...
+    def below(self, a: Any, b: Any) -> Any: ...
     def load(self, slot: int, k: Any) -> Any: ...
     def store(self, slot: int, k: Any, value: Any) -> None: ...
-    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable) -> list: ...
-    def repeat(self, times: int, going: Any, carried: Sequence, body: Callable) -> list: ...
+    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list: ...
+    def repeat(self, times: int, carried: Sequence, body: Callable) -> list: ...
     def when(self, condition: Any, body: Callable) -> None: ...
     def elementary(self, name: str, x: Any) -> Any: ...
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]: ...
 
 
-class Expansion(NamedTuple):
-    """Coefficients of order 0 and what was made of the mass matrix; the rest lies in the slots."""
+class Factor(NamedTuple):
+    """A factor of a convolution: its coefficient of order k is entry k - back of a slot."""
 
-    zero: list
-    inverse: Any
+    slot: int
+    back: int = 0
+
+    def load(self, t: Target, k: Any) -> Any:
+        """Return the coefficient of order k."""
+        return t.load(self.slot, t.plus(k, -self.back))
+
+
+class Start(NamedTuple):
+    """What an expansion knows beside its slots: coefficients of order 0, the factors of M_0, weights."""
+
+    zero: dict[int, Any]
+    inverse: Inverse
     scalars: dict[str, Any]
 
 
@@ -107,74 +120,78 @@ class Series:
     """
 
     def __init__(self, record: SeriesRecord) -> None:
-        self.record = record
-        self.size = record.size
+        self.record, self.size = record, record.size
         self._slots: dict[tuple[str, int], int] = {}
-        self._planned = False
+        #: Nodes of which more than the value is needed.
+        self._live = self._find_live()
+        #: Products of series, by what needs them: a node or a place (i, j) in the mass matrix.
+        self._pairs: dict[Any, tuple[Factor, Factor]] = {}
         for i in range(self.size):
             self._slot("v", i)
-            self._slot("q", i)
-        #: Pairs of slots (A, B) whose inner sums Σ_{0<j<k} A_j B_{k-j} an order needs, by what needs them.
-        self._pairs: dict[tuple, tuple[int, int]] = {}
-        for n, node in enumerate(record.nodes):
-            self._plan(n, node)
-        for place, (node, _) in record.mass.items():
+        for n in self._live:
+            self._plan(n, record.nodes[n])
+        for (i, j), (node, _, _) in record.mass.items():
             if node >= 0:
-                for row, column in {place, place[::-1]}:
-                    self._pair(("mass", row, column), self._x(node), self._slot("a", column))
-        self._planned = True
+                for row, column in {(i, j), (j, i)}:
+                    self._pairs[row, column] = self._factor(node), Factor(self._slot("a", column))
+        self._distinct = list(dict.fromkeys(self._pairs.values()))
+        #: Number of series that are kept.
+        self.slots = len(self._slots)
 
     # --- which series are kept -----------------------------------------------------------------------------
 
+    def _find_live(self) -> list[int]:
+        found: set[int] = set()
+        pending = [*self.record.force, *(node for node, _, _ in self.record.mass.values())]
+        while pending:
+            n = pending.pop()
+            if n >= 0 and n not in found:
+                found.add(n)
+                node = self.record.nodes[n]
+                pending += node.args[1:] if node.op in FUNCTIONS and len(node.args) > 2 else node.args
+        return sorted(found)
+
     def _slot(self, kind: str, i: int) -> int:
         if (kind, i) not in self._slots:
-            assert not self._planned, f"nobody planned for {kind}{i}"
+            assert not hasattr(self, "slots"), f"nobody planned for {kind}{i}"
             self._slots[kind, i] = len(self._slots)
         return self._slots[kind, i]
 
-    def _x(self, n: int) -> int:
-        """Return the slot of a node's coefficients."""
+    def _factor(self, n: int) -> Factor:
+        """Return where a node's coefficients are."""
         node = self.record.nodes[n]
-        if node.op in ("place", "velocity"):
-            return self._slot({"place": "q", "velocity": "v"}[node.op], node.index)
-        return self._slot("x", n)
+        return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
-    def _d(self, n: int) -> int:
-        """Return the slot of a node's coefficients times their orders."""
-        return self._slot("d", n)
-
-    def _pair(self, key: tuple, a: int, b: int) -> None:
-        self._pairs[key] = (a, b)
+    def _slope(self, n: int) -> Factor:
+        """Return where D_k = k x_k of a function's argument x is: a slot, or that of its rate, of which it is h times."""
+        args = self.record.nodes[n].args
+        if len(args) > 2:
+            return Factor(self._factor(args[2]).slot, back=1)
+        return Factor(self._slot("d", args[0]))
 
     def _plan(self, n: int, node: Node) -> None:
         if node.op == "product":
-            self._pair((n,), self._x(node.args[0]), self._x(node.args[1]))
+            self._pairs[n] = self._factor(node.args[0]), self._factor(node.args[1])
         elif node.op == "reciprocal":
-            self._pair((n,), self._x(node.args[0]), self._x(n))
-        elif node.op in ("sin", "cos"):
-            self._pair((n,), self._d(node.args[0]), self._x(node.args[1]))
-        elif node.op == "exp":
-            self._pair((n,), self._d(node.args[0]), self._x(n))
-        elif node.op == "log":
-            self._pair((n,), self._d(n), self._x(node.args[0]))
+            self._pairs[n] = self._factor(node.args[0]), self._factor(n)
         elif node.op == "sqrt":
-            self._pair((n,), self._x(n), self._x(n))
-        elif node.op in ("atan", "tanh"):
-            self._pair((n,), self._d(node.args[0]), self._x(node.args[1]))
+            self._pairs[n] = self._factor(n), self._factor(n)
+        elif node.op in FUNCTIONS:
+            self._pairs[n] = self._slope(n), self._factor(node.args[1])
         elif node.op == "polynomial":
-            self._x(n)
-
-    @property
-    def slots(self) -> int:
-        """Number of series that are kept."""
-        return len(self._slots)
+            self._factor(n)
 
     # --- the series ----------------------------------------------------------------------------------------
 
+<<<<<<< HEAD
     def expand(
         self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any
     ) -> Expansion:
         """Fill the slots with coefficients: velocities up to the order N, places up to N + 1, the rest below N.
+=======
+    def expand(self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any) -> Start:
+        """Fill the slots with coefficients: velocities up to the order N, the rest below N.
+>>>>>>> cert
 
         Parameters
         ----------
@@ -189,72 +206,51 @@ class Series:
         order : index
             N.
         """
-        record = self.record
+        record, zero = self.record, t.number(0.0)
         scalars = t.scalars(record, inputs)
-        for i in range(self.size):
-            t.store(self._slots["q", i], t.index(0), q[i])
-            t.store(self._slots["v", i], t.index(0), v[i])
-        zero: list = []
+        known: dict[int, Any] = {}
+        halves: dict[int, Any] = {}
         for n, node in enumerate(record.nodes):
-            zero.append(self._first(t, node, zero, scalars, q, v))
-            if ("x", n) in self._slots:
-                t.store(self._slots["x", n], t.index(0), zero[n])
+            known[n] = self._first(t, node, known, scalars, q, v)
+            self._keep(t, n, t.index(0), known[n])
             if ("d", n) in self._slots:
-                t.store(self._slots["d", n], t.index(0), t.number(0.0))
-            if node.op == "polynomial":
+                t.store(self._slots["d", n], t.index(0), zero)
+            if node.op == "sqrt":
+                halves[n] = t.div(t.number(0.5), known[n])
+            if node.op == "polynomial" and n in self._live:
                 self._lay_out(t, n, node, scalars, h, order)
-        matrix = {
-            place: zero[node] if node >= 0 else self._weight(t, scalars, w)
-            for place, (node, w) in record.mass.items()
-        }
-        inverse = Factors(t, matrix, self.size)
-        right = [zero[f] if f >= 0 else None for f in record.force]
-        start = self._accelerate(t, inverse, right, h, t.index(0))
+        for i in range(self.size):
+            t.store(self._slots["v", i], t.index(0), v[i])
+        matrix = {place: self._entry(t, known, scalars, *entry) for place, entry in record.mass.items()}
+        inverse = Inverse(t, matrix, self.size)
+        start = Start(known, inverse, scalars)
+        right = [known[f] if f >= 0 else None for f in record.force]
+        rates = self._accelerate(t, inverse, right, h, t.index(0))
 
-        def at_order(k: Any, carried: Sequence) -> list:
-            inner = self._inner(t, k)
-            inner["per order"] = t.div(t.number(1.0), t.real(k))
-            values: list = []
-            for n, node in enumerate(record.nodes):
-                value = self._next(t, n, node, values, zero, scalars, inner, k)
-                values.append(value)
-                if ("x", n) in self._slots and node.op != "polynomial":
-                    t.store(self._slots["x", n], k, value)
-                if ("d", n) in self._slots and node.op != "log":
-                    t.store(self._slots["d", n], k, t.mul(t.real(k), value))
-            right = []
-            for i in range(self.size):
-                f = record.force[i]
-                total = values[f] if f >= 0 else None
-                for (a, b), (node, _) in record.mass.items():
-                    if node < 0 or i not in (a, b):
-                        continue
-                    j = b if i == a else a
-                    more = t.fma(values[node], start[j], inner["mass", i, j])
-                    total = t.neg(more) if total is None else t.sub(total, more)
-                right.append(total)
-            self._accelerate(t, inverse, right, h, k)
+        def two_orders(k: Any, carried: Sequence) -> list:
+            sums = self._convolve(t, k)
+            self._one_order(t, start, halves, rates, h, k, lambda pair: sums[pair][0])
+            self._one_order(t, start, halves, rates, h, t.plus(k, 1), lambda pair: self._newest(t, k, pair, sums[pair][1]))
             return []
 
-        t.loop(t.index(1), order, [], at_order)
-        per = t.div(h, t.real(t.plus(order, 1)))
-        for i in range(self.size):
-            last = t.load(self._slots["v", i], order)
-            t.store(self._slots["q", i], t.plus(order, 1), t.mul(per, last))
-        return Expansion(zero, inverse, scalars)
+        self._one_order(t, start, halves, rates, h, t.index(1), lambda pair: None)
+        t.loop(t.index(2), order, [], two_orders, step=2)
+        return start
 
-    def _accelerate(self, t: Target, inverse: Factors, right: Sequence, h: Any, k: Any) -> list:
-        """Store a_k, v_{k+1} and q_{k+1}; return a_k."""
-        a = inverse.solve([t.number(0.0) if r is None else r for r in right])
-        after = t.plus(k, 1)
-        per = t.div(h, t.real(after))
-        for i in range(self.size):
-            if ("a", i) in self._slots:
-                t.store(self._slots["a", i], k, a[i])
-            rate = t.load(self._slots["v", i], k)
-            t.store(self._slots["v", i], after, t.mul(per, a[i]))
-            t.store(self._slots["q", i], after, t.mul(per, rate))
-        return a
+    def _keep(self, t: Target, n: int, k: Any, value: Any) -> None:
+        if ("x", n) in self._slots:
+            t.store(self._slots["x", n], k, value)
+
+    def _entry(self, t: Target, values: dict, scalars: dict, node: int, weight: Any, constant: Any) -> Any:
+        """Return an entry of the mass matrix."""
+        if node < 0:
+            return self._weight(t, scalars, constant)
+        value = values[node]
+        if weight != 1.0 and constant != 0.0:
+            return t.fma(self._weight(t, scalars, weight), value, self._weight(t, scalars, constant))
+        if weight != 1.0:
+            return t.mul(self._weight(t, scalars, weight), value)
+        return value if constant == 0.0 else t.add(value, self._weight(t, scalars, constant))
 
     def _weight(self, t: Target, scalars: dict[str, Any], weight: Any) -> Any:
         return scalars[weight] if isinstance(weight, str) else t.number(weight)
@@ -273,7 +269,7 @@ class Series:
             t.store(slot, t.index(k), t.mul(power, self._weight(t, scalars, w)))
             power = t.mul(power, h)
 
-    def _first(self, t: Target, node: Node, zero: list, scalars: dict, q: Sequence, v: Sequence) -> Any:
+    def _first(self, t: Target, node: Node, zero: dict, scalars: dict, q: Sequence, v: Sequence) -> Any:
         """Return a node's coefficient of order 0, its value."""
         op, args = node.op, node.args
         if op == "place":
@@ -294,7 +290,7 @@ class Series:
             return t.sqrt(zero[args[0]])
         return t.elementary(op, zero[args[0]])
 
-    def _weighted(self, t: Target, node: Node, values: list, scalars: dict, total: Any) -> Any:
+    def _weighted(self, t: Target, node: Node, values: dict, scalars: dict, total: Any) -> Any:
         for a, w in zip(node.args, node.weights[:-1], strict=True):
             x = values[a]
             if isinstance(w, float) and abs(w) == 1.0:
@@ -307,73 +303,139 @@ class Series:
                 total = t.mul(weight, x) if total is None else t.fma(weight, x, total)
         return t.number(0.0) if total is None else total
 
-    def _inner(self, t: Target, k: Any, group: int = 8) -> dict[Any, Any]:
-        """Return Σ_{0<j<k} A_j B_{k-j} for all pairs, several in one loop."""
-        distinct = list(dict.fromkeys(self._pairs.values()))
-        sums: dict[tuple[int, int], Any] = {}
-        for first in range(0, len(distinct), group):
-            pairs = distinct[first : first + group]
+    def _convolve(self, t: Target, k: Any) -> dict:
+        """Return Σ_{0<j<k} A_j B_{k-j} and Σ_{1<j<k} A_j B_{k+1-j} for all pairs, k even.
 
-            def accumulate(j: Any, carried: Sequence, pairs: Sequence = pairs) -> list:
-                seen: dict[tuple, Any] = {}
-                other = t.minus(k, j)
+        Both share what they load: B_{k+1-j} is what B_{k-j} was for the j before.
+        """
+        unlike = [pair for pair in self._distinct if pair[0] != pair[1]]
+        squares = [pair for pair in self._distinct if pair[0] == pair[1]]
+        sums: dict = {}
+        for pairs, end in ((unlike, k), (squares, t.half(k))):
+            for first in range(0, len(pairs), GROUP):
+                sums |= self._convolve_group(t, k, pairs[first : first + GROUP], end)
+        return sums
 
-                def value(slot: int, where: Any, which: str) -> Any:
-                    if (slot, which) not in seen:
-                        seen[slot, which] = t.load(slot, where)
-                    return seen[slot, which]
+    def _convolve_group(self, t: Target, k: Any, pairs: Sequence[tuple[Factor, Factor]], end: Any) -> dict:
+        n = len(pairs)
+        lower = list(dict.fromkeys(a for a, _ in pairs))
+        upper = list(dict.fromkeys(b for _, b in pairs))
 
-                return [
-                    t.fma(value(a, j, "j"), value(b, other, "k-j"), total)
-                    for (a, b), total in zip(pairs, carried, strict=True)
-                ]
+        def accumulate(j: Any, carried: Sequence) -> list:
+            other = t.minus(k, j)
+            x = {a: a.load(t, j) for a in lower}
+            y = {b: b.load(t, other) for b in upper}
+            last = dict(zip(upper, carried[2 * n :], strict=True))
+            even = [t.fma(x[a], y[b], total) for (a, b), total in zip(pairs, carried[:n], strict=True)]
+            odd = [t.fma(x[a], last[b], total) for (a, b), total in zip(pairs, carried[n : 2 * n], strict=True)]
+            return [*even, *odd, *y.values()]
 
-            totals = t.loop(t.index(1), k, [t.number(0.0)] * len(pairs), accumulate)
-            sums |= dict(zip(pairs, totals, strict=True))
-        return {key: sums[pair] for key, pair in self._pairs.items()}
+        zeros = [t.number(0.0)] * (2 * n + len(upper))
+        totals = t.loop(t.index(1), end, zeros, accumulate)
+        last = dict(zip(upper, totals[2 * n :], strict=True))
+        result = {}
+        for (a, b), even, odd in zip(pairs, totals[:n], totals[n : 2 * n], strict=True):
+            if a == b:  # the sums so far are one half, without the middle
+                middle = a.load(t, end)
+                even = t.fma(middle, middle, t.add(even, even))
+                odd = t.fma(middle, last[b], odd)
+                odd = t.add(odd, odd)
+            result[a, b] = even, odd
+        return result
 
-    def _next(
-        self, t: Target, n: int, node: Node, values: list, zero: list, scalars: dict, inner: dict, k: Any
-    ) -> Any:
-        """Return a node's coefficient of order k > 0."""
-        op, args = node.op, node.args
-        if op in ("place", "velocity", "polynomial"):
-            return t.load(self._x(n), k)
-        if op == "sum":
-            return self._weighted(t, node, values, scalars, None)
-        total = inner[(n,)]
-        x = args[0]
-        if op == "product":
-            y = args[1]
-            if x == y:
-                return t.fma(t.add(zero[x], zero[x]), values[x], total)
-            return t.fma(zero[x], values[y], t.fma(zero[y], values[x], total))
-        if op == "reciprocal":
-            return t.neg(t.mul(t.fma(values[x], zero[n], total), zero[n]))
-        if op == "sqrt":
-            return t.div(t.sub(values[x], total), t.add(zero[n], zero[n]))
-        per = inner["per order"]
-        if op == "log":
-            weighted = t.div(t.sub(t.mul(t.real(k), values[x]), total), zero[x])
-            t.store(self._slots["d", n], k, weighted)
-            return t.mul(weighted, per)
-        partner = zero[n] if op == "exp" else zero[args[1]]
-        value = t.fma(values[x], partner, t.mul(total, per))
-        return t.neg(value) if op == "cos" else value
+    def _newest(self, t: Target, k: Any, pair: tuple[Factor, Factor], total: Any) -> Any:
+        """Add A_1 B_k + A_k B_1."""
+        a, b = pair
+        total = t.fma(a.load(t, t.index(1)), b.load(t, k), total)
+        return t.fma(a.load(t, k), b.load(t, t.index(1)), total)
 
-    def advance(self, t: Target, order: Any) -> tuple[list, list]:
-        """Return places and velocities at the step's end: the sums of their series, small terms first."""
-        q, v = [], []
+    def _one_order(
+        self, t: Target, start: Start, halves: dict, rates: list, h: Any, k: Any, inner_of: Callable
+    ) -> list:
+        """Compute the coefficients of order k > 0, with sums from `_convolve`."""
+        record = self.record
+        before = t.plus(k, -1)
+        per = t.reciprocal(k)
+        step = t.mul(h, per)
+        values: dict[int, Any] = {}
+
+        def inner(key: Any) -> Any:
+            """Return Σ_{0<j<k} A_j B_{k-j}."""
+            total = inner_of(self._pairs[key])
+            return t.number(0.0) if total is None else total
+
+        def compute(n: int, node: Node) -> Any:
+            op, args = node.op, node.args
+            if op == "place":
+                return t.mul(step, t.load(self._slots["v", node.index], before))
+            if op in ("velocity", "polynomial"):
+                return self._factor(n).load(t, k)
+            if op == "sum":
+                return self._weighted(t, node, values, start.scalars, None)
+            total, x = inner(n), args[0]
+            if op == "product":
+                y = args[1]
+                if x == y:
+                    return t.fma(t.add(start.zero[x], start.zero[x]), values[x], total)
+                return t.fma(start.zero[x], values[y], t.fma(start.zero[y], values[x], total))
+            if op == "reciprocal":
+                return t.neg(t.mul(t.fma(values[x], start.zero[n], total), start.zero[n]))
+            if op == "sqrt":
+                return t.mul(t.sub(values[x], total), halves[n])
+            slope = self._slope(n)
+            if slope.back:
+                value = t.mul(step, t.fma(slope.load(t, k), start.zero[args[1]], total))
+            else:
+                value = t.fma(values[x], start.zero[args[1]], t.mul(per, total))
+            return t.neg(value) if op == "cos" else value
+
+        for n in self._live:
+            values[n] = compute(n, record.nodes[n])
+            if record.nodes[n].op != "polynomial":
+                self._keep(t, n, k, values[n])
+            if ("d", n) in self._slots:
+                t.store(self._slots["d", n], k, t.mul(t.real(k), values[n]))
+        right = []
         for i in range(self.size):
-            for kind, end, result in (("v", order, v), ("q", t.plus(order, 1), q)):
-                slot = self._slots[kind, i]
+            f = record.force[i]
+            total = values[f] if f >= 0 else None
+            for (a, b), (node, weight, _) in record.mass.items():
+                if node < 0 or i not in (a, b):
+                    continue
+                j = b if i == a else a
+                more = t.fma(values[node], rates[j], inner((i, j)))
+                if weight != 1.0:
+                    more = t.mul(self._weight(t, start.scalars, weight), more)
+                total = t.neg(more) if total is None else t.sub(total, more)
+            right.append(total)
+        self._accelerate(t, start.inverse, right, h, k)
+        return []
 
-                def down(m: Any, carried: Sequence, slot: int = slot, end: Any = end) -> list:
-                    return [t.add(carried[0], t.load(slot, t.minus(end, m)))]
+    def _accelerate(self, t: Target, inverse: Inverse, right: Sequence, h: Any, k: Any) -> list:
+        """Store a_k and v_{k+1}; return a_k."""
+        a = [t.number(0.0) if x is None else x for x in _times(t, inverse.rows, right)]
+        after = t.plus(k, 1)
+        step = t.mul(h, t.reciprocal(after))
+        for i in range(self.size):
+            if ("a", i) in self._slots:
+                t.store(self._slots["a", i], k, a[i])
+            t.store(self._slots["v", i], after, t.mul(step, a[i]))
+        return a
 
-                total = t.loop(t.index(1), t.plus(end, 1), [t.load(slot, end)], down)
-                result += total
-        return q, v
+    def advance(self, t: Target, q: Sequence, h: Any, order: Any) -> tuple[list, list]:
+        """Return places and velocities at the step's end: the sums of their series, small terms first."""
+        slots = [self._slots["v", i] for i in range(self.size)]
+
+        def down(m: Any, carried: Sequence) -> list:
+            k = t.minus(order, m)
+            v = [t.load(slot, k) for slot in slots]
+            sums = [t.add(total, x) for total, x in zip(carried, v, strict=False)]
+            per = t.reciprocal(t.plus(k, 1))
+            return sums + [t.fma(per, x, total) for total, x in zip(carried[self.size :], v, strict=True)]
+
+        totals = t.loop(t.index(0), t.plus(order, 1), [t.number(0.0)] * (2 * self.size), down)
+        after = [t.fma(h, total, x) for total, x in zip(totals[self.size :], q, strict=True)]
+        return after, totals[: self.size]
 
     def shorten(self, t: Target, factor: Any, order: Any) -> None:
         """Turn the coefficients of a step h into those of the step factor · h."""
@@ -386,12 +448,9 @@ class Series:
 
         (power,) = t.loop(t.index(1), order, [t.number(1.0)], scale)
         power = t.mul(power, factor)
-        after = t.plus(order, 1)
         for i in range(self.size):
-            v, q = self._slots["v", i], self._slots["q", i]
+            v = self._slots["v", i]
             t.store(v, order, t.mul(power, t.load(v, order)))
-            t.store(q, order, t.mul(power, t.load(q, order)))
-            t.store(q, after, t.mul(t.mul(power, factor), t.load(q, after)))
 
     def attempt(
         self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any, tolerance: Any
@@ -409,32 +468,41 @@ class Series:
         bounds : list of number
             Bounds on what v leaves out; q leaves out at most h/(N+2) times as much.
         """
-        expansion = self.expand(t, inputs, q, v, h, order)
-        certificate = Certificate(self, t, expansion, order, tolerance)
-        none = [t.number(math.inf)] * self.size
-        wanted = certificate.guess()
-        never = t.less(t.number(1.0), t.number(0.0))
+        start = self.expand(t, inputs, q, v, h, order)
+        certificate = Certificate(self, t, start, order, tolerance)
+        one = t.number(1.0)
+        never = t.less(one, t.number(0.0))
+        t.store(self.slots, t.index(0), one)  # one number waits in a slot of its own
 
         def shortened(count: Any, carried: Sequence) -> tuple[Any, list]:
-            done, h, factor, *_ = carried
-            one = t.number(1.0)
-            t.when(t.any(t.less(factor, one)), lambda: self.shorten(t, factor, order))
+            _, h, factor, *_ = carried
+            t.when(t.below(t.index(0), count), lambda: self.shorten(t, factor, order))
             h = t.mul(h, factor)
             passed, bounds = certificate.check(h)
-            factor = t.select(passed, one, t.number(0.65))
-            return t.any(t.less(factor, one)), [passed, h, factor, *bounds]
+            over = t.all(passed)
+            t.when(t.negated(over), lambda: t.store(self.slots, t.index(0), certificate.part()))
+            factor = t.select(passed, one, t.load(self.slots, t.index(0)))
+            return t.negated(over), [passed, h, factor, *bounds]
 
-        going = t.less(t.number(0.0), t.number(1.0))
-        done, h, _, *bounds = t.repeat(TRIES, t.any(going), [never, h, wanted, *none], shortened)
-        return done, h, *self.advance(t, order), bounds
+        none = [t.number(math.inf)] * self.size
+        done, h, _, *bounds = t.repeat(TRIES, [never, h, one, *none], shortened)
+        return done, h, *self.advance(t, q, h, order), bounds
 
 
-class Factors:
-    """M = L D Lᵀ, and what can be solved with it. Entries that are not there cost nothing."""
+class Inverse:
+    """The inverse of a symmetric matrix by symmetric sweeps. Entries that are not there cost nothing.
+
+    Attributes
+    ----------
+    rows : list of list
+        M⁻¹; None stands for zero.
+    definite : condition
+        Whether all pivots are positive, those of M = L D Lᵀ.
+    """
 
     def __init__(self, t: Target, matrix: dict[tuple[int, int], Any], size: int) -> None:
-        self._t, self._size = t, size
         self.matrix = matrix
+<<<<<<< HEAD
         lower: dict[tuple[int, int], Any] = {}
         self._inverse: list = []
         scaled: dict[tuple[int, int], Any] = {}
@@ -459,136 +527,164 @@ class Factors:
                     scaled[i, j] = entry
                     lower[i, j] = t.mul(entry, self._inverse[j])
         self._lower = lower
+=======
+        a = {place: entry for i, j in matrix for place, entry in (((i, j), matrix[i, j]), ((j, i), matrix[i, j]))}
+        self.definite: Any = None
+        for k in range(size):
+            positive = t.less(t.number(0.0), a[k, k])
+            self.definite = positive if k == 0 else t.both(self.definite, positive)
+            per = t.div(t.number(1.0), a[k, k])
+            row = {i: a[i, k] for i in range(size) if i != k and (i, k) in a}
+            scaled = {i: t.mul(x, per) for i, x in row.items()}
+            for i in row:
+                less = t.neg(scaled[i])
+                for j in row:
+                    if j >= i:
+                        a[i, j] = a[j, i] = _add_product(t, a.get((i, j)), less, row[j])
+                a[i, k] = a[k, i] = scaled[i]
+            a[k, k] = t.neg(per)
+        # Every sweep leaves the negative inverse of the part that was swept.
+        found = {(i, j): t.neg(x) for (i, j), x in a.items() if j >= i}
+        self.rows = [[found.get((min(i, j), max(i, j))) for j in range(size)] for i in range(size)]
+>>>>>>> cert
 
-    def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a vector; None stands for zero."""
-        t, n = self._t, self._size
-        y: list = list(right)
-        for i in range(n):
-            for k in range(i):
-                if (i, k) in self._lower and y[k] is not None:
-                    product = t.mul(self._lower[i, k], y[k])
-                    y[i] = t.neg(product) if y[i] is None else t.sub(y[i], product)
-        x = [None if y[i] is None else t.mul(y[i], self._inverse[i]) for i in range(n)]
-        for i in reversed(range(n)):
-            for k in range(i + 1, n):
-                if (k, i) in self._lower and x[k] is not None:
-                    product = t.mul(self._lower[k, i], x[k])
-                    x[i] = t.neg(product) if x[i] is None else t.sub(x[i], product)
-        return x
 
-    def absolute_inverse(self) -> list[list]:
-        """Return |M⁻¹| by rows; None stands for zero."""
-        t, n = self._t, self._size
-        columns = [self.solve([t.number(1.0) if i == j else None for i in range(n)]) for j in range(n)]
-        return [[None if columns[j][i] is None else t.abs(columns[j][i]) for j in range(n)] for i in range(n)]
+def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
+    return t.mul(a, b) if total is None else t.fma(a, b, total)
+
+
+def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
+    """Return a matrix times a vector; None stands for zero."""
+    result = []
+    for row in matrix:
+        total = None
+        for entry, value in zip(row, vector, strict=True):
+            if entry is not None and value is not None:
+                total = _add_product(t, total, entry, value)
+        result.append(total)
+    return result
 
 
 class Certificate:
     """Bounds on what a step's series leave out; see the module's docstring.
 
-    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part, Σ' without
-    order 0, D_j = j X_j, and b = Σ|D_j|/N:
+    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part and Σ' without
+    order 0:
 
+    * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
-    * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p, where 1/x has a norm of at most 1/p with
-      p = |x_0| - Σ'|x| - E_x > 0.
-    * sin and cos, b < 1: for the truncated argument the tails s, c of the pair obey s <= (H(D, cos) + Σ|D| c)/N
-      and c <= (H(D, sin) + Σ|D| s)/N, for k >= N in the recurrence's factor 1/k. The rest of the argument, of
-      norm E, adds (|sin| + s)(cosh E - 1) + (|cos| + c) sinh E to the sine's, likewise to the cosine's.
-    * exp z: s <= (H(D, z) + Σ|D| s)/N, then E_z = s + (|z| + s)(exp E - 1).
+    * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
     * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
-      p = |z_0| - Σ'|z| bounds 1/|ẑ⁻¹| from below; it needs p² > R.
-    * log z of x: x̂ D_z = D_x̂ leaves H(D_z, x)/(N p) for the truncated x̂, with p = |x_0| - Σ'|x|; then
-      log(1 + e/x̂) adds E_x/(p - E_x).
-    * atan z with slope g = 1/(1 + x²): (H(D, g) + Σ|D| E_g)/N + E_x (|g| + E_g), the integral of the slope
-      along the rest of the argument; E_g holds for every part of that rest, since it grows with E_x.
-    * tanh z, slope 1 - z²: for the truncated argument E = A + b(2|z|E + E²) with A = (H(D, g) + Σ|D| H(z, z))/N,
-      its smaller root; the rest of the argument adds δ = 2 E_x (1 + Y²), Y = |z| + E, if (Y + δ)² + 1 does not
-      exceed 2 (1 + Y²).
+      p = |z_0| - Σ'|z|; it needs p² > R.
+    * functions, z' = w x' with D_j = j x_j: k z_k = Σ_j D_j w_{k-j} leaves E_z = A + B E_w, with
+      A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is said
+      of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where w is z,
+      A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
+
+    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from its
+    own series what is below k only.
     """
 
-    def __init__(self, series: Series, t: Target, expansion: Expansion, order: Any, tolerance: Any) -> None:
+    def __init__(self, series: Series, t: Target, start: Start, order: Any, tolerance: Any) -> None:
         self._series, self._t, self._order, self._tolerance = series, t, order, tolerance
-        self._expansion = expansion
-        self._steps = t.real(order)
+        self._start, self._n = start, series.size
+        self._inverse = [[None if x is None else t.abs(x) for x in row] for row in start.inverse.rows]
+        matrix = start.inverse.matrix
+        self._roots = [t.sqrt(matrix[i, i]) for i in range(self._n)]
+        self._per_root = [t.div(t.number(1.0), root) for root in self._roots]
+        self._per = t.reciprocal(order)
+        self._per_next = t.reciprocal(t.plus(order, 1))
 
-    def _last(self, i: int) -> Any:
-        return self._t.abs(self._t.load(self._series._slots["v", i], self._order))
+    def check(self, h: Any) -> tuple[Any, list]:
+        """Tell whether the step of length h is certified, and return the bounds on what v leaves out."""
+        t, n = self._t, self._n
+        self._fine, self._h = self._start.inverse.definite, h
+        self._measure()
+        self._sizes = self._find_sizes()
+        self._rest = [t.mul(self._tolerance, size) for size in self._sizes]
+        self._tails: dict[int, Any] = {}
+        for i in self._series._live:
+            self._tails[i] = self._tail(i)
+        right, change = self._balance()
+        base = [t.number(0.0) if b is None else t.mul(h, b) for b in _times(t, self._inverse, right)]
+        coupled = any(e is not None for row in change for e in row)
+        # The fixed point of E = base + C E by a few terms of its Neumann series, a little enlarged; any E > 0
+        # that passes the strict inequality is as good as another.
+        matrix: list = [[None] * n for _ in range(n)]
+        if coupled:
+            columns = [_times(t, self._inverse, column) for column in zip(*change, strict=True)]
+            matrix = [list(row) for row in zip(*columns, strict=True)]
 
-    def _roots(self) -> list:
-        """Return the roots of the mass matrix's diagonal."""
-        t, matrix = self._t, self._expansion.inverse.matrix
-        return [t.sqrt(matrix[i, i]) for i in range(self._series.size)]
+        def again(guess: list) -> list:
+            more = _times(t, matrix, guess)
+            return [b if m is None else t.add(b, m) for b, m in zip(base, more, strict=True)]
 
-    def _sizes(self, norms: Sequence) -> list:
+        guess = base
+        for _ in range(3 if coupled else 0):
+            guess = again(guess)
+        least = t.number(1e-30)
+        guess = [t.fma(t.number(1.25), g, t.mul(least, s)) for g, s in zip(guess, self._sizes, strict=True)]
+        passed, self._bounds = self._fine, []
+        for new, g, rest in zip(again(guess), guess, self._rest, strict=True):
+            bound = t.mul(self._per_next, g)
+            self._bounds.append(bound)
+            passed = t.both(passed, t.both(t.less(new, g), t.less(bound, rest)))
+        return passed, self._bounds
+
+    def part(self) -> Any:
+        """Return a part of the step that will probably be certified, where the last check was not passed."""
+        t, series = self._t, self._series
+        # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
+        bounds = terms = t.number(0.0)
+        for i, (bound, rest) in enumerate(zip(self._bounds, self._rest, strict=True)):
+            per = t.div(t.number(1.0), rest)
+            slot = series._slots["v", i]
+            before = t.mul(t.number(0.1), t.abs(t.load(slot, t.plus(self._order, -1))))
+            bounds = self._larger(bounds, t.mul(bound, per))
+            terms = self._larger(terms, t.mul(t.add(t.abs(t.load(slot, self._order)), before), per))
+        power = t.mul(self._per_next, t.elementary("log", t.select(self._fine, bounds, terms)))
+        safety = t.select(self._fine, t.number(0.95), t.number(0.8))
+        found = t.mul(safety, t.elementary("exp", t.neg(power)))
+        found = t.select(t.less(found, t.number(0.5)), found, t.number(0.5))
+        return t.select(t.less(t.number(0.02), found), found, t.number(0.02))
+
+    def _larger(self, a: Any, b: Any) -> Any:
+        return self._t.select(self._t.less(a, b), b, a)
+
+    def _find_sizes(self) -> list:
         """Return the size of each velocity: that of the largest one, measured by energy."""
         t = self._t
-        roots = self._roots()
         total = t.number(SMALLEST_SIZE)
-        for root, norm in zip(roots, norms, strict=True):
-            product = t.mul(root, norm)
-            total = t.select(t.less(total, product), product, total)
-        return [t.div(total, root) for root in roots]
+        for i, root in enumerate(self._roots):
+            total = self._larger(total, t.mul(root, self._all[self._series._slots["v", i]]))
+        return [t.mul(total, per) for per in self._per_root]
 
-    def guess(self) -> Any:
-        """Return the part of the step that will probably be certified: 1, or less where the tail is far too long."""
-        t, series = self._t, self._series
-        norms = self._norms([series._slots["v", i] for i in range(series.size)], self._order)
-        sizes = self._sizes([norms[series._slots["v", i], 0] for i in range(series.size)])
-        worst = t.number(0.0)
-        before = t.plus(self._order, -1)
-        for i, size in enumerate(sizes):
-            slot = series._slots["v", i]
-            last = t.abs(t.load(slot, self._order))
-            last = t.add(last, t.mul(t.number(0.1), t.abs(t.load(slot, before))))
-            ratio = t.div(last, size)
-            worst = t.select(t.less(worst, ratio), ratio, worst)
-        # A tail of w at the order N is one of w f^N after a step of f h: ten, hundred, ... times too long.
-        excess = t.div(worst, t.mul(t.number(10.0), self._tolerance))
-        one = t.number(1.0)
-        factor, power = one, one
-
-        def halve(count: Any, carried: Sequence) -> tuple[Any, list]:
-            factor, power = carried
-            long = t.less(one, t.mul(excess, power))
-            factor = t.select(long, t.mul(factor, t.number(0.7)), factor)
-            power = t.select(long, t.mul(power, small), power)
-            return t.any(long), [factor, power]
-
-        def raised(k: Any, carried: Sequence) -> list:
-            return [t.mul(carried[0], t.number(0.7))]
-
-        (small,) = t.loop(t.index(0), self._order, [one], raised)
-        factor, _ = t.repeat(24, t.any(t.less(one, excess)), [factor, power], halve)
-        return factor
-
-    def _norms(self, slots: Sequence[int], end: Any, group: int = 8) -> dict[tuple[int, int], Any]:
-        """Return for each slot the sum of absolute coefficients from order 0 (key 0) and from order 1 (key 1)."""
-        t = self._t
-        result = {}
-        for first in range(0, len(slots), group):
-            some = slots[first : first + group]
+    def _measure(self) -> None:
+        """Find norms of all slots, with and without order 0, and the overlaps H of all pairs."""
+        t, order, pairs = self._t, self._order, self._series._distinct
+        self._later: dict[int, Any] = {}
+        self._overlaps: dict[tuple[Factor, Factor], Any] = {}
+        for first in range(0, len(pairs), GROUP):
+            self._measure_pairs(pairs[first : first + GROUP])
+        alone = [slot for slot in range(self._series.slots) if slot not in self._later]
+        for first in range(0, len(alone), GROUP):
+            some = alone[first : first + GROUP]
 
             def accumulate(k: Any, carried: Sequence, some: Sequence = some) -> list:
                 return [
                     t.add(total, t.abs(t.load(slot, k))) for slot, total in zip(some, carried, strict=True)
                 ]
 
-            totals = t.loop(t.index(1), end, [t.number(0.0)] * len(some), accumulate)
-            for slot, total in zip(some, totals, strict=True):
-                result[slot, 1] = total
-                result[slot, 0] = t.add(total, t.abs(t.load(slot, t.index(0))))
-        return result
+            totals = t.loop(t.index(1), order, [t.number(0.0)] * len(some), accumulate)
+            self._later |= dict(zip(some, totals, strict=True))
+        self._all = {slot: t.add(x, t.abs(t.load(slot, t.index(0)))) for slot, x in self._later.items()}
 
-    def _overlaps(self, pairs: Sequence[tuple[int, int]], group: int = 6) -> dict[tuple[int, int], Any]:
-        """Return H(A, B) = Σ_{j=1..N-1} |A_j| Σ_{m=N-j..N-1} |B_m| for pairs of slots."""
-        t = self._t
-        result = {}
-        for first in range(0, len(pairs), group):
-            some = pairs[first : first + group]
-            suffixes = list(dict.fromkeys(b for _, b in some))
+    def _measure_pairs(self, pairs: Sequence[tuple[Factor, Factor]]) -> None:
+        """Sum |A_j| times the sum of |B_m| over m >= N - j."""
+        t, order = self._t, self._order
+        lower, upper = (list(dict.fromkeys(pair[i] for pair in pairs)) for i in (0, 1))
 
+<<<<<<< HEAD
             def accumulate(
                 j: Any, carried: Sequence, some: Sequence = some, suffixes: Sequence = suffixes
             ) -> list:
@@ -600,182 +696,124 @@ class Certificate:
                     for (a, b), total in zip(some, carried[len(suffixes) :], strict=True)
                 ]
                 return [*sums.values(), *totals]
+=======
+        def accumulate(j: Any, carried: Sequence) -> list:
+            other = t.minus(order, j)
+            x = {a: t.abs(a.load(t, j)) for a in lower}
+            sums = {b: t.add(s, t.abs(b.load(t, other))) for b, s in zip(upper, carried, strict=False)}
+            totals = zip(pairs, carried[len(upper) :], strict=True)
+            return [*sums.values(), *(t.fma(x[a], sums[b], total) for (a, b), total in totals)]
+>>>>>>> cert
 
-            zeros = [t.number(0.0)] * (len(suffixes) + len(some))
-            totals = t.loop(t.index(1), self._order, zeros, accumulate)
-            result |= dict(zip(some, totals[len(suffixes) :], strict=True))
-        return result
+        found = t.loop(t.index(1), order, [t.number(0.0)] * (len(upper) + len(pairs)), accumulate)
+        self._later |= {b.slot: s for b, s in zip(upper, found, strict=False)}
+        self._overlaps |= dict(zip(pairs, found[len(upper) :], strict=True))
 
-    def check(self, h: Any) -> tuple[Any, list]:
-        """Tell whether the step of length h is certified, and return the bounds on what v leaves out."""
-        t, series, record = self._t, self._series, self._series.record
-        slots, n = series._slots, series.size
-        self._n = self._norms(range(series.slots), self._order)
-        overlaps = self._overlaps(list(dict.fromkeys(series._pairs.values())))
-        self._h = {key: overlaps[pair] for key, pair in series._pairs.items()}
-        sizes = self._sizes([self._n[slots["v", i], 0] for i in range(n)])
-        rest = [t.mul(self._tolerance, size) for size in sizes]
-        self._fine = self._expansion.inverse.definite
-        tails: list = []
-        for i, node in enumerate(record.nodes):
-            tails.append(self._tail(i, node, tails, rest, h))
-        right, change = self._balance(tails)
-        inverse = self._expansion.inverse.absolute_inverse()
+    def _overlap(self, key: Any) -> Any:
+        return self._overlaps[self._series._pairs[key]]
 
-        def times(matrix: list[list], vector: list) -> list:
-            result = []
-            for row in matrix:
-                total = None
-                for entry, value in zip(row, vector, strict=True):
-                    if entry is not None and value is not None:
-                        total = t.mul(entry, value) if total is None else t.fma(entry, value, total)
-                result.append(total)
-            return result
+    def _norm(self, n: int) -> Any:
+        return self._all[self._series._factor(n).slot]
 
-        base = times(inverse, right)
-        base = [t.number(0.0) if b is None else b for b in base]
-        coupled = any(e is not None for row in change for e in row)
-        # The fixed point of E = base + C E by a few terms of its Neumann series, a little enlarged; any E > 0
-        # that passes the strict inequality is as good as another.
-        least = [t.div(t.mul(t.number(1e-30), size), h) for size in sizes]
-        guess = list(base)
-        if coupled:
-            for _ in range(3):
-                guess = [
-                    b if c is None else t.add(b, c)
-                    for b, c in zip(base, times(inverse, times(change, guess)), strict=True)
-                ]
-        guess = [t.fma(t.number(1.25), g, low) for g, low in zip(guess, least, strict=True)]
-        again = times(inverse, times(change, guess)) if coupled else [None] * n
-        passed = self._fine
-        bounds = []
-        per = t.div(h, t.real(t.plus(self._order, 1)))
-        for i in range(n):
-            total = base[i] if again[i] is None else t.add(base[i], again[i])
-            passed = t.both(passed, t.less(total, guess[i]))
-            bounds.append(t.mul(per, guess[i]))
-            passed = t.both(passed, t.less(bounds[i], rest[i]))
-        return passed, bounds
-
-    def _balance(self, tails: list) -> tuple[list, list[list]]:
+    def _balance(self) -> tuple[list, list[list]]:
         """Return R, the tail of r - M a, and the bounds |M - M_0| by rows; None stands for zero."""
-        t, series, record = self._t, self._series, self._series.record
-        n, slots = series.size, series._slots
-        right: list = [None if f < 0 else tails[f] for f in record.force]
+        t, series, n = self._t, self._series, self._n
+        right: list = [None if f < 0 else self._tails[f] for f in series.record.force]
         change: list[list] = [[None] * n for _ in range(n)]
-        for (a, b), (node, _) in record.mass.items():
+        for (a, b), (node, weight, _) in series.record.mass.items():
             if node < 0:
                 continue
-            moved = t.add(self._n[series._x(node), 1], tails[node])
+            tail, moved = self._tails[node], self._later[series._factor(node).slot]
+            scale = None if weight == 1.0 else t.abs(series._weight(t, self._start.scalars, weight))
             for i, j in {(a, b), (b, a)}:
-                change[i][j] = moved
-                more = t.fma(tails[node], self._n[slots["a", j], 0], self._h["mass", i, j])
+                more = t.fma(tail, self._all[series._slots["a", j]], self._overlap((i, j)))
+                more = more if scale is None else t.mul(scale, more)
                 right[i] = more if right[i] is None else t.add(right[i], more)
+                change[i][j] = t.add(moved, tail) if scale is None else t.mul(scale, t.add(moved, tail))
         return right, change
 
     def _require(self, condition: Any) -> None:
         self._fine = self._t.both(self._fine, condition)
 
-    def _tail(self, i: int, node: Node, tails: list, rest: list, h: Any) -> Any:
+    def _integrated(self, factor: Factor, tail: Any) -> Any:
+        """Return h(|x_{N-1}| + E_x)/N, a bound on the tail of the series that has hx for its derivative."""
+        t = self._t
+        last = t.abs(factor.load(t, t.plus(self._order, -1)))
+        return t.mul(t.mul(self._h, self._per), t.add(last, tail))
+
+    def _tail(self, n: int) -> Any:
         """Return a bound on the coefficients of order N and above of a node."""
-        t, series, order = self._t, self._series, self._order
-        slots, op, args = series._slots, node.op, node.args
-        if op == "place":
-            slot = slots["q", node.index]
-            known = t.add(t.abs(t.load(slot, order)), t.abs(t.load(slot, t.plus(order, 1))))
-            return t.fma(t.div(h, t.real(t.plus(order, 2))), rest[node.index], known)
-        if op == "velocity":
-            return t.add(self._last(node.index), rest[node.index])
+        t, series = self._t, self._series
+        node = series.record.nodes[n]
+        op, args = node.op, node.args
+        if op in ("place", "velocity"):
+            factor = Factor(series._slots["v", node.index])
+            tail = t.add(t.abs(factor.load(t, self._order)), self._rest[node.index])
+            return tail if op == "velocity" else self._integrated(factor, tail)
         if op == "polynomial":
             return t.number(0.0)
         if op == "sum":
             total = None
             for a, w in zip(args, node.weights[:-1], strict=True):
-                weight = t.abs(series._weight(t, self._expansion.scalars, w))
-                total = t.mul(weight, tails[a]) if total is None else t.fma(weight, tails[a], total)
+                if isinstance(w, float) and abs(w) == 1.0:
+                    total = self._tails[a] if total is None else t.add(total, self._tails[a])
+                    continue
+                weight = t.abs(series._weight(t, self._start.scalars, w))
+                total = t.mul(weight, self._tails[a]) if total is None else t.fma(weight, self._tails[a], total)
             return t.number(0.0) if total is None else total
-        if op == "cos":
-            return self._pair_tails[1]
-        x = args[0]
-        # The slope of tanh comes after it; its own tail is part of the rule.
         if op == "product":
-            y = args[1]
-            nx, ny = self._n[series._x(x), 0], self._n[series._x(y), 0]
-            return self._of_product(self._h[i,], nx, tails[x], ny, tails[y])
+            x, y = args
+            both = t.fma(t.add(self._norm(y), self._tails[y]), self._tails[x], self._overlap(n))
+            return t.fma(self._norm(x), self._tails[y], both)
         if op == "reciprocal":
-            slot = series._x(x)
-            p = t.sub(t.sub(t.abs(t.load(slot, t.index(0))), self._n[slot, 1]), tails[x])
+            (x,) = args
+            slot = series._factor(x).slot
+            p = t.sub(t.sub(t.abs(t.load(slot, t.index(0))), self._later[slot]), self._tails[x])
             self._require(t.less(t.number(0.0), p))
-            return t.div(t.fma(tails[x], self._n[series._x(i), 0], self._h[i,]), p)
+            return t.div(t.fma(self._tails[x], self._norm(n), self._overlap(n)), p)
         if op == "sqrt":
-            slot = series._x(i)
-            p = t.sub(t.abs(t.load(slot, t.index(0))), self._n[slot, 1])
-            r = t.add(tails[x], self._h[i,])
-            room = t.sub(t.mul(p, p), r)
-            self._require(t.both(t.less(t.number(0.0), p), t.less(t.number(0.0), room)))
-            return t.div(r, t.add(p, t.sqrt(self._positive(room))))
-        one, tail = t.number(1.0), tails[x]
-        if op == "log":
-            slot = series._x(x)
-            p = t.sub(t.abs(t.load(slot, t.index(0))), self._n[slot, 1])
-            room = t.sub(p, tail)
-            self._require(t.less(t.number(0.0), room))
-            return t.add(t.div(self._h[i,], t.mul(p, self._steps)), t.div(tail, room))
-        self._require(t.less(tail, one))
-        slope_sum = self._n[series._d(x), 1]
-        b = t.div(slope_sum, self._steps)
-        if op in ("sin", "exp"):
-            self._require(t.less(b, one))
-        own = self._n[series._x(i), 0] if ("x", i) in slots else None
-        square = t.mul(tail, tail)
-        if op == "sin":
-            # cosh E - 1 and sinh E for E < 1.
-            rise = t.mul(square, t.fma(t.number(0.05), square, t.number(0.5)))
-            sinh = t.mul(tail, t.fma(t.number(0.2), square, one))
-            partner = args[1]
-            h_cos = t.div(self._h[i,], self._steps)  # H(D, cos)/N
-            h_sin = t.div(self._h[partner,], self._steps)
-            room = t.sub(one, t.mul(b, b))
-            s = t.div(t.fma(b, h_sin, h_cos), room)
-            c = t.div(t.fma(b, h_cos, h_sin), room)
-            all_s = t.add(self._n[series._x(i), 0], s)
-            all_c = t.add(self._n[series._x(partner), 0], c)
-            self._pair_tails = (
-                t.add(s, t.fma(all_s, rise, t.mul(all_c, sinh))),
-                t.add(c, t.fma(all_c, rise, t.mul(all_s, sinh))),
-            )
-            return self._pair_tails[0]
-        overlap = t.div(self._h[i,], self._steps)
+            slot = series._factor(n).slot
+            p = t.sub(t.abs(t.load(slot, t.index(0))), self._later[slot])
+            r = t.add(self._tails[args[0]], self._overlap(n))
+            return t.div(r, self._reach(p, r))
+        return self._tails[n] if n in self._tails else self._tail_of_function(n, op, args)
+
+    def _reach(self, p: Any, r: Any) -> Any:
+        """Return p + √(p² - r): r over it is the smaller root of e² - 2pe + r = 0 for p > 0."""
+        t, zero = self._t, self._t.number(0.0)
+        room = t.sub(t.mul(p, p), r)
+        self._require(t.both(t.less(zero, p), t.less(zero, room)))
+        return t.add(p, t.sqrt(t.select(t.less(zero, room), room, zero)))
+
+    def _tail_of_function(self, n: int, op: str, args: tuple[int, ...]) -> Any:
+        t, series = self._t, self._series
+        slope = series._slope(n)
+        if slope.back:  # D is h times the argument's rate
+            along, scale = t.mul(self._h, self._all[slope.slot]), t.mul(self._h, self._per)
+            lead = self._integrated(Factor(slope.slot), self._tails[args[2]])
+        else:
+            along, scale, lead = self._later[slope.slot], self._per, self._tails[args[0]]
+        b = t.fma(along, self._per_next, lead)
+
+        def start(of: int) -> Any:
+            return t.fma(lead, self._norm(series.record.nodes[of].args[1]), t.mul(scale, self._overlap(of)))
+
+        a = start(n)
+        if op in ("atan", "log"):
+            return t.fma(b, self._tails[args[1]], a)
+        if op == "tanh":
+            square = self._overlap(series.record.nodes[args[1]].args[0])
+            a = t.fma(b, square, a)
+            p = t.sub(t.number(0.5), t.mul(b, self._norm(n)))
+            return t.div(a, self._reach(p, t.mul(a, b)))
+        # 1/(1 - b) <= 1 + 2b and 1/(1 - b²) <= 1 + 4/3 b² up to b = 1/2
+        self._require(t.less(b, t.number(0.5)))
         if op == "exp":
-            s = t.div(overlap, t.sub(one, b))
-            growth = t.mul(tail, t.fma(t.number(0.72), tail, one))
-            return t.fma(t.add(own, s), growth, s)
-        slope = args[1]
-        if op == "atan":
-            whole = t.add(self._n[series._x(slope), 0], tails[slope])
-            return t.fma(tail, whole, t.fma(b, tails[slope], overlap))
-        assert op == "tanh"
-        z = self._n[series._x(i), 0]
-        own_overlap = self._h[i + 1,]  # H(z, z), of the square that makes the slope
-        start = t.fma(b, own_overlap, overlap)
-        linear = t.sub(one, t.mul(t.add(b, b), z))
-        inside = t.sub(t.mul(linear, linear), t.mul(t.number(4.0), t.mul(b, start)))
-        self._require(t.both(t.less(t.number(0.0), linear), t.less(t.number(0.0), inside)))
-        e = t.div(t.add(start, start), t.add(linear, t.sqrt(self._positive(inside))))
-        y = t.add(z, e)
-        twice = t.mul(t.number(2.0), t.fma(y, y, one))
-        more = t.mul(tail, twice)
-        reach = t.add(y, more)
-        self._require(t.less(t.fma(reach, reach, one), twice))
-        return t.add(e, more)
-
-    def _positive(self, x: Any) -> Any:
-        t = self._t
-        return t.select(t.less(t.number(0.0), x), x, t.number(0.0))
-
-    def _of_product(self, overlap: Any, nx: Any, ex: Any, ny: Any, ey: Any) -> Any:
-        t = self._t
-        return t.fma(nx, ey, t.fma(t.add(ny, ey), ex, overlap))
+            return t.fma(t.add(b, b), a, a)
+        other = start(args[1])
+        grown = t.fma(t.mul(b, b), t.number(1.3333333333333335), t.number(1.0))
+        self._tails[args[1]] = t.mul(grown, t.fma(b, a, other))
+        return t.mul(grown, t.fma(b, other, a))
 
 
 class Plain:
@@ -785,11 +823,11 @@ class Plain:
     """
 
     def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
-        self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
+        self._memory: list[dict[int, Any]] = [{} for _ in range(slots + 1)]
         self.number = number
         self._functions: Any = None
         if xp is not None:
-            self._functions = {name: getattr(xp, name) for name in (*ELEMENTARY, "sqrt")}
+            self._functions = {name: getattr(xp, name) for name in (*FUNCTIONS, "sqrt")}
 
     def add(self, a: Any, b: Any) -> Any:
         return a + b
@@ -826,14 +864,20 @@ class Plain:
     def both(self, a: bool, b: bool) -> bool:
         return a and b
 
+    def all(self, condition: bool) -> bool:
+        return condition
+
+    def negated(self, condition: bool) -> bool:
+        return not condition
+
     def select(self, condition: bool, a: Any, b: Any) -> Any:
         return a if condition else b
 
-    def any(self, condition: bool) -> bool:
-        return condition
-
     def real(self, k: int) -> Any:
         return self.number(k)
+
+    def reciprocal(self, k: int) -> Any:
+        return self.number(1) / self.number(k)
 
     def index(self, k: int) -> int:
         return k
@@ -844,24 +888,30 @@ class Plain:
     def minus(self, a: int, b: int) -> int:
         return a - b
 
+    def half(self, k: int) -> int:
+        return k // 2
+
+    def below(self, a: int, b: int) -> bool:
+        return a < b
+
     def load(self, slot: int, k: int) -> Any:
         return self._memory[slot][k]
 
     def store(self, slot: int, k: int, value: Any) -> None:
         self._memory[slot][k] = value
 
-    def loop(self, first: int, end: int, carried: Sequence, body: Callable) -> list:
+    def loop(self, first: int, end: int, carried: Sequence, body: Callable, step: int = 1) -> list:
         values = list(carried)
-        for k in range(first, end):
+        for k in range(first, end, step):
             values = body(k, values)
         return values
 
-    def repeat(self, times: int, going: bool, carried: Sequence, body: Callable) -> list:
+    def repeat(self, times: int, carried: Sequence, body: Callable) -> list:
         values = list(carried)
         for count in range(times):
+            going, values = body(count, values)
             if not going:
                 break
-            going, values = body(count, values)
         return values
 
     def when(self, condition: bool, body: Callable) -> None:
