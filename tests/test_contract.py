@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import gc
 import inspect
+import itertools
 import math
 import pickle
 import subprocess
@@ -684,26 +685,28 @@ def test_copies_are_the_same(scene):
         assert again.acceleration(state, control) == expected
 
 
-@both
-@pytest.mark.parametrize("used", [False, True], ids=["new", "used"])
-def test_class_that_no_module_has_goes_by_value(decorate, used):
-    """As classes of `__main__` and of notebooks do: cloudpickle, in another process."""
-    cls = cart(decorate)
-    if used:
-        assert cls().mass == 1.0
-    text = cloudpickle.dumps((cls, cls(mass=2.0, pair=(1, 2)) if used else None))
+def test_class_that_no_module_has_goes_by_value():
+    """As classes of `__main__` and of notebooks do: cloudpickle, in another process; used before or not."""
+    sent = []
+    for decorate, used in itertools.product((False, True), repeat=2):
+        cls = cart(decorate)
+        sent.append((cls, cls(mass=2.0, pair=(1, 2)) if used else None))
     code = (
-        "import sys, dataclasses, pickle; cls, scene = pickle.loads(sys.stdin.buffer.read())\n"
-        "scene = scene or cls(mass=2.0, pair=(1, 2))\n"
-        "again = dataclasses.replace(scene, spring=4.0)\n"
-        "print(again, again.acceleration([1.0, 0.0], 3.0)['x'], cls(springs=2) == cls(springs=2))\n"
-        "try: cls(mass=-1.0)\n"
-        "except ValueError as error: print(error)\n"
+        "import sys, dataclasses, pickle\n"
+        "for cls, scene in map(pickle.loads, pickle.loads(sys.stdin.buffer.read())):\n"
+        "    scene = scene or cls(mass=2.0, pair=(1, 2))\n"
+        "    again = dataclasses.replace(scene, spring=4.0)\n"
+        "    print(again, again.acceleration([1.0, 0.0], 3.0)['x'], cls(springs=2) == cls(springs=2))\n"
+        "    try: cls(mass=-1.0)\n"
+        "    except ValueError as error: print(error)\n"
     )
+    text = pickle.dumps([cloudpickle.dumps(one) for one in sent])
     run = subprocess.run([sys.executable, "-c", code], input=text, capture_output=True, check=False)
-    first, second = run.stdout.decode().splitlines() or ["", run.stderr.decode()]
-    assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True"), second
-    assert second == "mass must be above 0 kg, got -1 kg"
+    lines = run.stdout.decode().splitlines()
+    assert len(lines) == 8, run.stderr.decode()
+    for first, second in zip(lines[::2], lines[1::2], strict=True):
+        assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True")
+        assert second == "mass must be above 0 kg, got -1 kg"
 
 
 MAIN = """

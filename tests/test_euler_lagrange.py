@@ -28,12 +28,12 @@ PACKAGE = [
     *((CylinderInCylinder, {"control": mode}) for mode in CylinderInCylinder.modes),
     (CartPole, {}),
     *((Acrobot, {"control": mode}) for mode in Acrobot.modes),
-    *((Chain, {"bars": n}) for n in (1, 2, 3, 4)),
+    *((Chain, {"bars": n}) for n in (1, 2, 3)),
     (RotaryPendulum, {}),
     (TwoLinkArm, {}),
 ]
 CASES = [*PACKAGE, *((scene, {}) for scene in contract_scenes.ALL)]
-SLOW = [(Chain, {"bars": n}) for n in (5, 6)]
+SLOW = [(Chain, {"bars": n}) for n in (4, 5, 6)]
 IDS = ["-".join([s.__name__, *(f"{v}" for v in k.values())]) for s, k in [*CASES, *SLOW]]
 scenes = pytest.mark.parametrize(
     "case",
