@@ -41,7 +41,7 @@ def exact_step(scene, state, control, dt):
         q, v = ([start[f"{letter}{i}"] for i in range(n)] for letter in "qv")
         inputs = {**constants, **start, "start_elapsed": mpmath.mpf(0)}
         series.expand(t, {name: inputs[name] for name in stepper._whole.inputs}, q, v, h, 40)
-        q, v = series.advance(t, 40)
+        q, v = series.advance(t, q, h, 40)
         state = stepper.finish(mpmath, q, v, state, control, h, numbers)
     return mpmath.matrix(state)
 

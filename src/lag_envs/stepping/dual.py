@@ -113,8 +113,14 @@ class Dual:
     def real(self, k: Any) -> Number:
         return self.plain(self._t.real(k))
 
+    def reciprocal(self, k: Any) -> Number:
+        return self.plain(self._t.reciprocal(k))
+
     def index(self, k: int) -> Any:
         return self._t.index(k)
+
+    def half(self, k: Any) -> Any:
+        return self._t.half(k)
 
     def plus(self, k: Any, n: int) -> Any:
         return self._t.plus(k, n)
@@ -132,7 +138,9 @@ class Dual:
         for i, number in enumerate((value.value, *value.slopes)):
             self._t.store(first + i, k, self._t.number(0.0) if number is None else number)
 
-    def loop(self, first: Any, end: Any, carried: Sequence[Number], body: Callable) -> list[Number]:
+    def loop(
+        self, first: Any, end: Any, carried: Sequence[Number], body: Callable, step: int = 1
+    ) -> list[Number]:
         width = self._columns + 1
 
         def flatten(values: Sequence[Number]) -> list:
@@ -143,7 +151,7 @@ class Dual:
             return [Number(flat[i], tuple(flat[i + 1 : i + width])) for i in range(0, len(flat), width)]
 
         return gather(
-            self._t.loop(first, end, flatten(carried), lambda k, flat: flatten(body(k, gather(flat))))
+            self._t.loop(first, end, flatten(carried), lambda k, flat: flatten(body(k, gather(flat))), step)
         )
 
     def elementary(self, name: str, x: Number) -> Number:

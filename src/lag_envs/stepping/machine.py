@@ -329,7 +329,7 @@ def _write_tangent(
     set.add(function.attributes, "noinline")
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    plain = Machine(builder, step.slots * (width + 1), 1, True)
+    plain = Machine(builder, step.slots * (width + 1) * STRIDE + 1, 1, True)
     t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
 
     def at(row: int) -> ir.Value:
@@ -343,8 +343,9 @@ def _write_tangent(
     inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
     q = [moving(layout.q + i, i) for i in range(n)]
     v = [moving(layout.v + i, n + i) for i in range(n)]
-    step.expand(t, inputs, q, v, t.plain(builder.load(at(layout.h))), order)
-    q, v = step.advance(t, order)
+    h = t.plain(builder.load(at(layout.h)))
+    step.expand(t, inputs, q, v, h, order)
+    q, v = step.advance(t, q, h, order)
     for i, number in enumerate([*q, *v]):
         builder.store(number.value, at(layout.q + i))
         for k, slope in enumerate(number.slopes):

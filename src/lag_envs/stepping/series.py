@@ -183,15 +183,10 @@ class Series:
 
     # --- the series ----------------------------------------------------------------------------------------
 
-<<<<<<< HEAD
     def expand(
         self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any
-    ) -> Expansion:
-        """Fill the slots with coefficients: velocities up to the order N, places up to N + 1, the rest below N.
-=======
-    def expand(self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any) -> Start:
+    ) -> Start:
         """Fill the slots with coefficients: velocities up to the order N, the rest below N.
->>>>>>> cert
 
         Parameters
         ----------
@@ -230,7 +225,9 @@ class Series:
         def two_orders(k: Any, carried: Sequence) -> list:
             sums = self._convolve(t, k)
             self._one_order(t, start, halves, rates, h, k, lambda pair: sums[pair][0])
-            self._one_order(t, start, halves, rates, h, t.plus(k, 1), lambda pair: self._newest(t, k, pair, sums[pair][1]))
+            self._one_order(
+                t, start, halves, rates, h, t.plus(k, 1), lambda pair: self._newest(t, k, pair, sums[pair][1])
+            )
             return []
 
         self._one_order(t, start, halves, rates, h, t.index(1), lambda pair: None)
@@ -327,7 +324,9 @@ class Series:
             y = {b: b.load(t, other) for b in upper}
             last = dict(zip(upper, carried[2 * n :], strict=True))
             even = [t.fma(x[a], y[b], total) for (a, b), total in zip(pairs, carried[:n], strict=True)]
-            odd = [t.fma(x[a], last[b], total) for (a, b), total in zip(pairs, carried[n : 2 * n], strict=True)]
+            odd = [
+                t.fma(x[a], last[b], total) for (a, b), total in zip(pairs, carried[n : 2 * n], strict=True)
+            ]
             return [*even, *odd, *y.values()]
 
         zeros = [t.number(0.0)] * (2 * n + len(upper))
@@ -502,33 +501,11 @@ class Inverse:
 
     def __init__(self, t: Target, matrix: dict[tuple[int, int], Any], size: int) -> None:
         self.matrix = matrix
-<<<<<<< HEAD
-        lower: dict[tuple[int, int], Any] = {}
-        self._inverse: list = []
-        scaled: dict[tuple[int, int], Any] = {}
-        for j in range(size):
-            pivot = matrix[j, j]
-            for k in range(j):
-                if (j, k) in lower:
-                    pivot = t.sub(pivot, t.mul(lower[j, k], scaled[j, k]))
-            self._inverse.append(t.div(t.number(1.0), pivot))
-            self.definite = (
-                t.less(t.number(0.0), pivot)
-                if j == 0
-                else t.both(self.definite, t.less(t.number(0.0), pivot))
-            )
-            for i in range(j + 1, size):
-                entry = matrix.get((j, i))
-                for k in range(j):
-                    if (i, k) in lower and (j, k) in lower:
-                        product = t.mul(lower[i, k], scaled[j, k])
-                        entry = t.neg(product) if entry is None else t.sub(entry, product)
-                if entry is not None:
-                    scaled[i, j] = entry
-                    lower[i, j] = t.mul(entry, self._inverse[j])
-        self._lower = lower
-=======
-        a = {place: entry for i, j in matrix for place, entry in (((i, j), matrix[i, j]), ((j, i), matrix[i, j]))}
+        a = {
+            place: entry
+            for i, j in matrix
+            for place, entry in (((i, j), matrix[i, j]), ((j, i), matrix[i, j]))
+        }
         self.definite: Any = None
         for k in range(size):
             positive = t.less(t.number(0.0), a[k, k])
@@ -546,7 +523,6 @@ class Inverse:
         # Every sweep leaves the negative inverse of the part that was swept.
         found = {(i, j): t.neg(x) for (i, j), x in a.items() if j >= i}
         self.rows = [[found.get((min(i, j), max(i, j))) for j in range(size)] for i in range(size)]
->>>>>>> cert
 
 
 def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
@@ -684,26 +660,12 @@ class Certificate:
         t, order = self._t, self._order
         lower, upper = (list(dict.fromkeys(pair[i] for pair in pairs)) for i in (0, 1))
 
-<<<<<<< HEAD
-            def accumulate(
-                j: Any, carried: Sequence, some: Sequence = some, suffixes: Sequence = suffixes
-            ) -> list:
-                other = t.minus(self._order, j)
-                sums = dict(zip(suffixes, carried, strict=False))
-                sums = {b: t.add(total, t.abs(t.load(b, other))) for b, total in sums.items()}
-                totals = [
-                    t.fma(t.abs(t.load(a, j)), sums[b], total)
-                    for (a, b), total in zip(some, carried[len(suffixes) :], strict=True)
-                ]
-                return [*sums.values(), *totals]
-=======
         def accumulate(j: Any, carried: Sequence) -> list:
             other = t.minus(order, j)
             x = {a: t.abs(a.load(t, j)) for a in lower}
             sums = {b: t.add(s, t.abs(b.load(t, other))) for b, s in zip(upper, carried, strict=False)}
             totals = zip(pairs, carried[len(upper) :], strict=True)
             return [*sums.values(), *(t.fma(x[a], sums[b], total) for (a, b), total in totals)]
->>>>>>> cert
 
         found = t.loop(t.index(1), order, [t.number(0.0)] * (len(upper) + len(pairs)), accumulate)
         self._later |= {b.slot: s for b, s in zip(upper, found, strict=False)}
@@ -759,7 +721,9 @@ class Certificate:
                     total = self._tails[a] if total is None else t.add(total, self._tails[a])
                     continue
                 weight = t.abs(series._weight(t, self._start.scalars, w))
-                total = t.mul(weight, self._tails[a]) if total is None else t.fma(weight, self._tails[a], total)
+                total = (
+                    t.mul(weight, self._tails[a]) if total is None else t.fma(weight, self._tails[a], total)
+                )
             return t.number(0.0) if total is None else total
         if op == "product":
             x, y = args
@@ -828,6 +792,11 @@ class Plain:
         self._functions: Any = None
         if xp is not None:
             self._functions = {name: getattr(xp, name) for name in (*FUNCTIONS, "sqrt")}
+            self._functions |= {
+                "a*b+c": lambda a, b, c: a * b + c,
+                "a*b-c": lambda a, b, c: a * b - c,
+                "c-a*b": lambda a, b, c: c - a * b,
+            }
 
     def add(self, a: Any, b: Any) -> Any:
         return a + b
