@@ -1,5 +1,7 @@
 """Scenes for tests, each with something that the package's own do not have."""
 
+import numpy as np
+
 from lag_envs.scenes.contract import Scene, parameter
 
 
@@ -158,4 +160,51 @@ class Functions(Scene):
         return {"theta": u.torque * xp.cos(q.theta), "r": -xp.tanh(10 * v.r) - 3 * v.r**3}
 
 
-ALL = (ChargedParticle, RotatingHoop, RotatingFrame, ElasticPendulum, Trolley, Functions)
+class Top(Scene):
+    """A heavy top in Euler's angles, its rates in the body's frame, spun by a motor."""
+
+    across: float = parameter(0.02, "kg m²", above=0.0)
+    along: float = parameter(0.01, "kg m²", above=0.0)
+    moment: float = parameter(1.2, "N m", least=0.0)
+    coordinates = {"phi": "rad", "theta": "rad", "psi": "rad"}
+    controls = {"motor": "N m"}
+
+    def kinetic(self, q, v, xp):
+        first = v.phi * xp.sin(q.theta) * xp.sin(q.psi) + v.theta * xp.cos(q.psi)
+        second = v.phi * xp.sin(q.theta) * xp.cos(q.psi) - v.theta * xp.sin(q.psi)
+        third = v.phi * xp.cos(q.theta) + v.psi
+        return (self.across * (first**2 + second**2) + self.along * third**2) / 2
+
+    def potential(self, q, xp):
+        return self.moment * xp.cos(q.theta)
+
+    def applied(self, q, v, u, xp):
+        return {"psi": u.motor}
+
+
+class Crane(Scene):
+    """A load on a rope that a winch shortens, under a trolley that a force pushes, in matrices of NumPy."""
+
+    load: float = parameter(1.0, "kg", above=0.0)
+    trolley: float = parameter(3.0, "kg", above=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    friction: float = parameter(0.2, "N", least=0.0)
+    coordinates = {"x": "m", "theta": "rad"}
+    prescribed = {"rope": "m"}
+    controls = {"force": "N", "rope_ddot": "m/s²"}
+    reactions = {"winch": "rope"}
+
+    def kinetic(self, q, v, xp):
+        c, s = xp.cos(q.theta), xp.sin(q.theta)
+        jacobian = np.array([[1, q.rope * c, s], [0, q.rope * s, -c]])
+        speed = jacobian @ np.array(list(v))
+        return self.trolley * v.x**2 / 2 + self.load * (speed @ speed) / 2
+
+    def potential(self, q, xp):
+        return -self.load * self.gravity * q.rope * xp.cos(q.theta)
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force - self.friction * xp.tanh(50 * v.x)}
+
+
+ALL = (ChargedParticle, RotatingHoop, RotatingFrame, ElasticPendulum, Trolley, Functions, Top, Crane)

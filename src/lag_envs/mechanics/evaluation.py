@@ -6,6 +6,7 @@ The same lines run on arrays and on `Dual` numbers, which carry derivatives alon
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,6 +27,49 @@ class Numeric:
     pi = math.pi
     sin, cos, tan, exp, log, sqrt, tanh = np.sin, np.cos, np.tan, np.exp, np.log, np.sqrt, np.tanh
     atan = arctan = np.arctan
+
+
+def _bare(x: Any) -> Any:
+    return x.value if isinstance(x, Lanes) else x
+
+
+def _binary(f: Any) -> tuple[Any, Any]:
+    return lambda a, b: Lanes(f(_bare(a), _bare(b))), lambda a, b: Lanes(f(_bare(b), _bare(a)))
+
+
+def _on_lanes(f: Any) -> Any:
+    return staticmethod(lambda x: Lanes(f(_bare(x))))
+
+
+class Lanes:
+    """An array that a formula takes for one number, even where it puts its numbers into arrays of its own."""
+
+    __slots__ = ("value",)
+    __array_ufunc__ = None  # NumPy's numbers leave arithmetic to this class
+
+    def __init__(self, value: Any) -> None:
+        self.value = np.asarray(value, dtype=np.float64)
+
+    __add__, __radd__ = _binary(operator.add)
+    __sub__, __rsub__ = _binary(operator.sub)
+    __mul__, __rmul__ = _binary(operator.mul)
+    __truediv__, __rtruediv__ = _binary(operator.truediv)
+    __pow__, __rpow__ = _binary(operator.pow)
+
+    def __neg__(self) -> Lanes:
+        return Lanes(-self.value)
+
+    def __pos__(self) -> Lanes:
+        return self
+
+
+class OfLanes:
+    """The functions of `Numeric` on `Lanes`."""
+
+    pi = math.pi
+    sin, cos, tan = (_on_lanes(f) for f in (np.sin, np.cos, np.tan))
+    exp, log, sqrt, tanh = (_on_lanes(f) for f in (np.exp, np.log, np.sqrt, np.tanh))
+    atan = arctan = _on_lanes(np.arctan)
 
 
 class Dual:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, FormulaError, evaluate
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import Carrying, Dual, Numeric, Point
+from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point
 from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
@@ -517,9 +517,10 @@ class Scene(metaclass=SceneType):
         """
         point, shape = self._point(state, control)
         names = self._layout.names
-        q = Values("coordinate", {name: point.values[place(name)] for name in names})
-        v = Values("velocity of a coordinate", {name: point.values[velocity(name)] for name in names})
-        kinetic, potential = self.kinetic(q, v, Numeric), self.potential(q, Numeric)
+        q = Values("coordinate", {name: Lanes(point.values[place(name)]) for name in names})
+        v = Values("velocity of a coordinate", {name: Lanes(point.values[velocity(name)]) for name in names})
+        given = self.kinetic(q, v, OfLanes), self.potential(q, OfLanes)
+        kinetic, potential = (x.value if isinstance(x, Lanes) else x for x in given)
         energies = {"kinetic": kinetic, "potential": potential, "total": kinetic + potential}
         if self.mechanics.gyroscopic is not None:
             linear, rest = point.of(self.mechanics.gyroscopic)
