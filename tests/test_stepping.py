@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from functools import cache
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -27,6 +28,7 @@ from lag_envs.report.reference import Pendulum, elliptic, linear
 from lag_envs.report.reference import pendulum as pendulum_reference
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.stepping.pendulum import Drive
 from lag_envs.stepping.slope import Pull, Turn
 from lag_envs.tasks import TASKS, load_task
@@ -38,6 +40,14 @@ KINDS = "task", "damped", "stiff", "extreme"
 def precise():
     with mp.workdps(60):
         yield
+
+
+class CoarseBar(PivotedBar):
+    """A bar whose series is asked for less, as those that the report compares with."""
+
+    @property
+    def flow(self):
+        return pendulum_flow(8, 1e-6)
 
 
 # --- the series -----------------------------------------------------------------------------------
@@ -157,8 +167,51 @@ def test_every_task_is_one_certified_step():
             if bound is not None:
                 pendulums.add(name)
                 assert bound.substeps == 1, (name, case)
-                assert 0.0 < bound.theta < bound.theta_dot < 1.0001e-12, (name, case)
+                assert 0.0 < bound.theta < bound.theta_dot <= 1e-12, (name, case)
     assert len(pendulums) == 6
+
+
+PENDULUMS = {
+    "bar": PivotedBar(track=None),
+    "damped bar": PivotedBar(mass=0.2, com_distance=0.3, damping=0.001, track=None),
+    "short bar with a track": PivotedBar(com_distance=0.1, damping=1e-4),
+    "bar without gravity": PivotedBar(gravity=0.0, track=None),
+    "shell": CylinderInCylinder(),
+    "damped shell": CylinderInCylinder(damping=0.24),
+    "shell, drag": CylinderInCylinder(control="damping"),
+    "a rougher series": CoarseBar(track=None),
+}
+
+
+@pytest.mark.parametrize("name", PENDULUMS)
+@pytest.mark.parametrize("dt", [0.002, 0.02, 0.05, 0.3])
+def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
+    """Walk the speed: one substep up to the certified speed and within 1e-12 rad/s, all of several within size."""
+    scene = PENDULUMS[name]
+    tolerance, place = scene.flow.tolerance, scene.angle + 1
+    state = np.linspace(0.3, 1.0, len(scene.state_names))
+    advance, x = scene.stepper().compile(), scene.largest_x(dt)
+    constants = [v for v in scene.constants().values() if v]
+    reached = set()
+    for u in (0.0, 5.0, 200.0):
+        certified = scene.certified_speed(state, u, dt)
+        field = math.hypot(*scene.drive(scene.lift(state), u, SimpleNamespace(**scene.constants()), math)[:2])
+        near = max(certified, 0.0)
+        walk = {near, near * (1.0 + 1e-12), near + 0.01, 1.1 * near, *np.linspace(0.0, 40.0, 300)}
+        walk |= {*np.linspace(0.5 * near, 2.0 * near, 100)}
+        for speed in walk:
+            state[place] = speed * (1.0 if u else -1.0)
+            bound = scene.truncation_bound(state, u, dt)
+            assert (bound.substeps == 1) == (speed <= certified), speed
+            size = 1.0 if bound.substeps == 1 else max(1.0, speed, math.sqrt(field))
+            assert bound.theta_dot <= tolerance * size, (speed, bound)
+            reached.add(bound.substeps)
+        for speed in (0.999 * near, 1.001 * near + 1e-3):
+            state[place] = speed
+            *_, taken = advance(*map(float, scene.lift(state)), u, dt, x, *constants)
+            expected = scene.truncation_bound(state, u, dt).substeps
+            assert taken == expected or (expected > 500 and 1 < taken < expected)  # along the slow manifold
+    assert {1, 2} <= reached or dt > 0.02
 
 
 def corners(name):

@@ -92,6 +92,11 @@ def mixed_polynomial(coefficients: Sequence[float], x: Twofold, *, twofold: int)
     return value
 
 
+def twofold_parts(*numbers: Twofold) -> tuple:
+    """Return the parts of several numbers, one after the other."""
+    return tuple(part for number in numbers for part in number.parts())
+
+
 def _twofold(value: Any) -> Twofold:
     if isinstance(value, Twofold):
         return value
