@@ -102,5 +102,5 @@ def _twofold(value: Any) -> Twofold:
         return value
     if isinstance(value, Number):
         return Twofold(value)
-    fraction = Fraction(value).limit_denominator(1_000_000)
+    fraction = Fraction(value).limit_denominator(1000)
     return Twofold(value, float(fraction - Fraction(value)) if float(fraction) == value else 0.0)
