@@ -19,13 +19,12 @@ from agents.optimum import Optimal
 from agents.run import UserError, check_env
 from lag_envs import TASKS
 from lag_envs.controllers import make_controller
-from lag_envs.leaderboard.protocol import REFERENCES, Reference
+from lag_envs.leaderboard.protocol import REFERENCES
 from lag_envs.leaderboard.ranking import corrected
 from lag_envs.scores import KNOWN_RETURNS
 
-#: Seeds of nobody else, of the references' mean by themselves; episodes that are played together, and those
-#: of policies that take long.
-FIRST_SEED, REFERENCE_SEED, BATCH, FEW = 4_000_000_000, 5_000_000_000, 65_536, 1_000
+#: Seeds of nobody else; episodes that are played together, and of policies that take long.
+FIRST_SEED, BATCH, FEW = 4_000_000_000, 65_536, 1_000
 SLOW = ("iLQR", "optimal")
 
 
@@ -45,33 +44,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     for env_id in envs:
         known = KNOWN_RETURNS[env_id]
-        reference = REFERENCES.get(env_id)
+        reference, mean = REFERENCES.get(env_id, (None, None))[:2]
         show(env_id, "random", many(env_id, "random", args.batches), known.random)
         if reference is not None:
-            returns = many(env_id, reference.controller, args.batches, REFERENCE_SEED)
-            show(env_id, f"{reference.controller} (reference)", returns, reference.mean)
+            show(env_id, reference, many(env_id, reference, args.batches), mean)
         if known.policy in SLOW and not args.quick:
             show(env_id, known.policy, few(env_id, known.policy, reference), known.best)
-        elif known.policy not in SLOW:
+        elif known.policy not in (*SLOW, reference):
             show(env_id, known.policy, many(env_id, known.policy, args.batches), known.best)
     return 0
 
 
-def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> np.ndarray:
+def many(env_id: str, name: str, batches: int) -> np.ndarray:
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
-    firsts = (first + k * BATCH for k in range(batches))
+    firsts = (FIRST_SEED + k * BATCH for k in range(batches))
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 
-def few(env_id: str, name: str, reference: Reference | None) -> np.ndarray:
+def few(env_id: str, name: str, reference: str | None) -> np.ndarray:
     """Return a slow policy's returns, without its luck."""
     agent = Optimal(env_id) if name == "optimal" else make_controller(env_id, name)
     played = {"returns": evaluate_batch(env_id, agent, FIRST_SEED, FEW)}
     if reference is not None:
-        quick = make_controller(env_id, reference.controller)
-        played["reference"] = evaluate_batch(env_id, quick, FIRST_SEED, FEW)
-    return corrected(reference, [played])[0]
+        played["reference"] = evaluate_batch(env_id, make_controller(env_id, reference), FIRST_SEED, FEW)
+    return corrected(REFERENCES.get(env_id), [played])[0]
 
 
 def show(env_id: str, name: str, returns: np.ndarray, used: float | None) -> None:

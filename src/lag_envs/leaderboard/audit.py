@@ -182,7 +182,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
         return found
     lines = log.split(b"\n")
     if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:
-        found.open = f"{path.name} of this release is of another board"
+        found.open = "this is not the board that this release knows: the log's first line is another"
         return found
     begun = b"\n".join(lines[: pin.lines]) + b"\n"
     if len(lines) <= pin.lines:
@@ -237,9 +237,11 @@ def _results(board: Board, found: Cheap) -> Finding:
         except BoardError as error:
             finding.wrong.append(f"{board.log}, line {_verified_at(found, entry)}: {error}")
             continue
-        found.results[entry.protocol, entry.id] = result
         where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
-        finding.wrong += [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        finding.wrong += odd
+        if not odd:
+            found.results[entry.protocol, entry.id] = result
     finding.told = f"{len(found.results)} are what was verified"
     return finding
 
