@@ -44,8 +44,8 @@ COLUMNS = (
     Column(
         "rank",
         "Rank",
-        "Agents share a rank where it is not clear which of them is better. One that acts like an earlier one "
-        "has none.",
+        "Agents share a rank where it is not clear which of them is better. One that acts like an earlier "
+        "one has none.",
         True,
     ),
     Column("name", "Agent", "The submission's name, and who submitted it.", True),
