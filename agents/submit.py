@@ -161,7 +161,7 @@ def learned(env_id: str, runs: Path, folder: Path) -> Submission:
     name = ALGORITHMS[algo][1] if algo in ALGORITHMS else algo
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
-        description="Stable-Baselines3, hyperparameters in agents/hyperparams",
+        description="Stable-Baselines3, hyperparameters as `lag-envs hyperparams` prints them",
     )  # fmt: skip
     print(f"  acts as the models do: actions differ by {off:.1e} at most, over {count} observations of each")
     return made

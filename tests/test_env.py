@@ -16,6 +16,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from rollouts import IDS, RENDERS, actions, make, trace
 
+from lag_envs.envs import program
+from lag_envs.envs.program import Program
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.scenes.base import StepRefused
 
@@ -123,6 +125,48 @@ def test_spec_survives_json(env_id):
     assert trace(env, actions(60, 1)) == trace(twin, actions(60, 1))
 
 
+@each_id
+@pytest.mark.parametrize(
+    "options", [{}, {"dt": 0.005}, {"duration": 3.0}, {"dt": 0.1, "duration": 2.0}], ids=str
+)
+@pytest.mark.parametrize(
+    "copied",
+    [lambda s: s, lambda s: EnvSpec.from_json(s.to_json()), lambda s: pickle.loads(pickle.dumps(s))],
+    ids=["spec", "json", "pickle"],
+)
+def test_spec_names_the_steps_of_an_episode(env_id, options, copied):
+    first = gym.make(env_id, **options)
+    steps = round(options.get("duration", 10.0) / options.get("dt", first.unwrapped.task.interval))
+    again = gym.make(copied(gym.make(copied(first.spec)).spec))  # twice: limits don't add up
+    native = gym.make_vec(env_id, num_envs=2, **options)
+    many = gym.make_vec(copied(gym.make_vec(copied(native.spec)).spec))
+    one_of_many = gym.make_vec(copied(first.spec), num_envs=2)
+    for env in (first, again, native, many, one_of_many, pickle.loads(pickle.dumps(again))):
+        assert env.spec.max_episode_steps == steps
+    for env in (first, again):
+        limits = [env.unwrapped.task.limit]
+        while isinstance(env, gym.Wrapper):
+            limits += [env._max_episode_steps] if isinstance(env, gym.wrappers.TimeLimit) else []
+            env = env.env
+        assert set(limits) == {steps}
+
+
+def test_episodes_of_remade_environments_are_as_long():
+    spec = gym.make("PivotedBar-v0", dt=0.005, duration=1.0).spec
+    assert steps_until_truncated(gym.make(EnvSpec.from_json(spec.to_json()))) == 200
+    # A spec's steps are a limit. Where the step is changed, Gymnasium is told to leave it out.
+    spec = gym.make("PivotedBar-v0", duration=1.0).spec
+    assert steps_until_truncated(gym.make(spec, dt=0.005)) == 50
+    assert steps_until_truncated(gym.make(spec, dt=0.005, max_episode_steps=-1)) == 200
+
+
+def test_spec_of_parameters_in_numpys_types_survives_json():
+    env = gym.make("PivotedBar-v0", mass=np.float32(0.25), dt=np.array(0.04), damping=np.int64(1))
+    twin = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert twin.spec == env.spec and twin.unwrapped.scene == env.unwrapped.scene
+    assert twin.unwrapped.task.dt == 0.04
+
+
 def test_spec_of_an_endless_episode_survives_json():
     env = gym.make("PivotedBarFree-v0", duration=math.inf)
     spec = EnvSpec.from_json(env.spec.to_json())
@@ -215,7 +259,9 @@ def test_copies_are_independent():
 
 @each_id
 def test_unknown_keyword(env_id):
-    with pytest.raises(TypeError, match=r"unknown keyword 'colour'; this environment takes .*mass"):
+    with pytest.raises(
+        TypeError, match=r"unexpected keyword argument 'colour'; this environment takes .*mass"
+    ):
         make(env_id, colour="red")
 
 
@@ -656,3 +702,32 @@ def test_a_refused_step_changes_nothing():
             env.step(np.ones(1))
         assert (env.state == state).all() and env.control == 0.0
     env.reset(seed=2)
+
+
+def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
+    # It is most of what making an environment takes.
+    recorded = []
+    record = Program._record
+
+    def count(self, task, constants):
+        recorded.append(task)
+        record(self, task, constants)
+
+    monkeypatch.setattr(Program, "_record", count)
+    monkeypatch.setattr(program, "_programs", {})
+    for i in range(5):
+        make("PivotedBar-v0", mass=0.1 + 0.1 * i, dt=0.01 + 0.01 * i)
+        gym.make_vec("PivotedBar-v0", num_envs=3, track=0.4 + 0.1 * i)
+    assert len(recorded) == 1
+    others = [{"track": None}, {"track": math.inf}, {"damping": 0.0}, {"gravity": 0.0}]
+    for options in others:
+        make("PivotedBar-v0", **options)
+        make("PivotedBar-v0", mass=0.3, **options)
+    assert len(recorded) == 1 + len(others)
+    gym.make_vec("PivotedBar-v0", num_envs=2, mass=[0.1, 0.2])
+    gym.make_vec("PivotedBar-v0", num_envs=2, mass=[0.3, 0.2])
+    assert len(recorded) == 2 + len(others)
+    for options in ({}, {"target": 0.1}, {"control": "tilt"}):
+        make("InclineTilt-v0", **options)
+        make("InclineTilt-v0", **options)
+    assert len(recorded) == 5 + len(others)

@@ -1,9 +1,11 @@
 """The core stands alone: what it installs, and what importing it loads."""
 
 import json
+import os
 import subprocess
 import sys
 import venv
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -66,3 +68,26 @@ def test_core_alone_can_be_installed_and_stepped(tmp_path):
     # -I keeps the surrounding environment's PYTHONPATH out.
     assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
     assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
+
+
+def test_one_distribution_brings_pygame():
+    """Gymnasium asks for pygame-ce; pygame beside it would overwrite half of its files."""
+    assert packages_distributions()["pygame"] == ["pygame-ce"]
+
+
+def test_no_skips_fails_what_is_skipped(tmp_path):
+    """What `make test-slow` stands on: nothing is left out in silence."""
+    (tmp_path / "test_it.py").write_text(
+        "import pytest\n\ndef test_a(): pytest.skip('a')\n\n"
+        "@pytest.mark.skipif(True, reason='b')\ndef test_b(): pass\n\ndef test_c(): pass\n"
+    )
+    (tmp_path / "test_other.py").write_text("import pytest\n\npytest.importorskip('no_such_module')\n")
+
+    def outcome(*options):
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-c", os.devnull, *options]
+        path = {"PYTHONPATH": str(ROOT / "tests")}
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ | path)
+        return done.stdout
+
+    assert "1 passed, 3 skipped" in outcome()
+    assert "1 failed, 1 passed, 2 errors" in outcome("--no-skips", "--continue-on-collection-errors")

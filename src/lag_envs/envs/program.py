@@ -17,6 +17,8 @@ blocks and so stay in the processor's nearest cache.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -38,6 +40,19 @@ def constants_of(task: Task) -> dict[str, float]:
         f"half{i}": h for i, h in enumerate(task.start)
     }
     return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+
+
+def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
+    """Return the program of a task: the same for all tasks that differ in their numbers only."""
+    values = (getattr(task.scene, field.name) for field in dataclasses.fields(task.scene))
+    choices = tuple(math.isinf(v) if isinstance(v, float) else repr(v) for v in values)
+    key = (type(task), type(task.scene), choices, task.variant, absent, varying)
+    if key not in _programs:
+        _programs[key] = Program(task, absent, varying)
+    return _programs[key]
+
+
+_programs: dict[tuple, Program] = {}
 
 
 class Program:

@@ -35,6 +35,11 @@ class _Shell(Task):
         """Near the bottom, the shell at rest."""
         return [0.1, 0.2, 0.0]
 
+    @property
+    def edges(self) -> Sequence[Sequence[float]]:
+        """The shell at its fastest, to either side."""
+        return [[0.0, 0.0, rate] for rate in (-self.fastest_shell, self.fastest_shell)]
+
     def numbers(self) -> dict[str, float]:
         """Return the limits of the shell's acceleration and rate."""
         return {"limit_control": self.limit_control, "fastest_shell": self.fastest_shell}
@@ -472,6 +477,7 @@ class Damping(Task):
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
+    rest_action = -1.0
 
     def check(self) -> None:
         """Refuse the other control, and a scene without a field."""

@@ -278,7 +278,7 @@ class Brake(Task):
     | radius | 0.05 | m | rolling radius R |
     | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
     | damping | 0 | N s/m | constant drag; adds to the brake |
-    | tilt | 0.261799 | rad | the slope φ, 0 or more and below π/2 |
+    | tilt | 0.261799 | rad | the slope φ, from 0 to π/2 |
     | gravity | 9.81 | m/s² | field g, downward |
     | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
     | duration | 10 | s | length of an episode, `math.inf` for one without an end |
@@ -327,7 +327,9 @@ class Brake(Task):
     defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
     observation = ("distance", "v")
     limit_control = 6.0
-    gentle = 0.5
+    rest_action = -1.0
+    #: Speed that costs nothing at the line [m/s], and what each m/s above it costs.
+    gentle, price = 0.5, 5.0
 
     def check(self) -> None:
         """Refuse the other controls, and a slope on which the cylinder would not roll down."""
@@ -361,13 +363,13 @@ class Brake(Task):
         return -dt
 
     def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return minus the time to the line, and -5 (v - v_s)₊ with the speed v there."""
+        """Return minus the time to the line, and minus the price of the speed there above the gentle one."""
         force = self.scene.drive(y, u, k, xp)
         assert isinstance(force, slope.Pull)
         time = slope.crossing_time(y[0], y[1], force, dt, xp)
         # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
         speed = y[1] + force.pull * time + force.drag * y[0]
-        return -time - 5.0 * xp.maximum(speed - self.gentle, 0.0)
+        return -time - self.price * xp.maximum(speed - self.gentle, 0.0)
 
     def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
         """Tell whether the line has been crossed."""

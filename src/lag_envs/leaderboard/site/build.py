@@ -170,8 +170,8 @@ def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
     if board["protocol"] != protocol:
         board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
     known, board["optimum"] = board["known"], None
-    if known and known.get("estimate") is not None and known["best"] != known["random"]:
-        board["optimum"] = (known["estimate"] - known["random"]) / (known["best"] - known["random"])
+    if known and known.get("optimum") is not None and known["best"] != known["random"]:
+        board["optimum"] = (known["optimum"] - known["random"]) / (known["best"] - known["random"])
     # Of the best agent that can be watched; without any, the scene as it is at the start.
     watched = [row for row in board["rows"] if row["replays"]]
     shown = next((row for row in watched if row["rank"] is not None), watched[0] if watched else None)
