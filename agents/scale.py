@@ -28,16 +28,6 @@ from agents.optimum import Optimal
 from agents.results import to_json
 from agents.run import UserError, check_env, write
 from lag_envs import TASKS
-<<<<<<< HEAD
-from lag_envs.controllers import make_controller
-from lag_envs.leaderboard.protocol import REFERENCES
-from lag_envs.leaderboard.ranking import corrected
-from lag_envs.scores import KNOWN_RETURNS
-
-#: Seeds of nobody else; episodes that are played together, and of policies that take long.
-FIRST_SEED, BATCH, FEW = 4_000_000_000, 65_536, 1_000
-SLOW = ("iLQR", "optimal")
-=======
 from lag_envs.benchmark import machine
 from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.leaderboard.protocol import REFERENCES
@@ -49,7 +39,6 @@ Array = NDArray[np.float64]
 #: policies play that take long.
 FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 SLOW = {"iLQR": 1_000, "optimal": 16_384}
->>>>>>> main
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,21 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-<<<<<<< HEAD
-        known = KNOWN_RETURNS[env_id]
-        reference, mean = REFERENCES.get(env_id, (None, None))[:2]
-        show(env_id, "random", many(env_id, "random", args.batches), known.random)
-        if reference is not None:
-            show(env_id, reference, many(env_id, reference, args.batches), mean)
-        if known.policy in SLOW and not args.quick:
-            show(env_id, known.policy, few(env_id, known.policy, reference), known.best)
-        elif known.policy not in (*SLOW, reference):
-            show(env_id, known.policy, many(env_id, known.policy, args.batches), known.best)
-    return 0
-
-
-def many(env_id: str, name: str, batches: int) -> np.ndarray:
-=======
         kept[env_id] = rounded(measured(env_id, args.batches, args.quick))
         if args.output:
             about = {"date": datetime.date.today().isoformat(), "machine": machine()}
@@ -132,22 +106,12 @@ def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
 
 
 def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array:
->>>>>>> main
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
-    firsts = (FIRST_SEED + k * BATCH for k in range(batches))
+    firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 
-<<<<<<< HEAD
-def few(env_id: str, name: str, reference: str | None) -> np.ndarray:
-    """Return a slow policy's returns, without its luck."""
-    agent = Optimal(env_id) if name == "optimal" else make_controller(env_id, name)
-    played = {"returns": evaluate_batch(env_id, agent, FIRST_SEED, FEW)}
-    if reference is not None:
-        played["reference"] = evaluate_batch(env_id, make_controller(env_id, reference), FIRST_SEED, FEW)
-    return corrected(REFERENCES.get(env_id), [played])[0]
-=======
 def optima(first: int) -> Array:
     """Return the largest returns of a batch of the braking task."""
     envs = gym.make_vec("InclineBrake-v0", BATCH)
@@ -156,7 +120,6 @@ def optima(first: int) -> Array:
     best = optimal_return(bare.task, *bare.state.T)
     envs.close()
     return best
->>>>>>> main
 
 
 def without_luck(returns: Array, reference: Array | None) -> tuple[float, float]:
