@@ -208,7 +208,7 @@ def test_other_architectures_may_act_alike(tmp_path):
     nets = {s: arrays | {"bias_0": np.full(1, 3e-3 * s)} for s in range(5)}
     network = learned(tmp_path / "net", policy=NET | {"hidden": []}, arrays=nets)
     likeness = Likeness(plain.env, "n")
-    assert likeness(network, plain, 1e-9).actions == pytest.approx(0.006, rel=0.01)  # of the one in the middle
+    assert likeness(network, plain, 1e-9).actions == pytest.approx(0.006, rel=0.01)  # the middle one
     assert likeness(plain, network, 1e-9).actions < 1e-7  # the nearest
     assert likeness(built_in(tmp_path / "pd"), plain, 1e-9).closeness > 1.0
 

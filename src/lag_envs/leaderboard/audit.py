@@ -120,6 +120,10 @@ class Cheap:
     #: What the submissions say of themselves, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
+    def chained(self, number: int) -> bool:
+        """Tell whether a line of the log holds the hash of what is before it."""
+        return any(line.number == number and line.event.prev is not None for line in self.lines)
+
 
 def cheap(board: Board, pin: Path | None = None) -> Cheap:
     """Make all checks that take no time."""
@@ -239,6 +243,9 @@ def _results(board: Board, found: Cheap) -> Finding:
             continue
         where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
         odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        # Of the time before there was a chain.
+        if result.get("build") is None and found.chained(_verified_at(found, entry)):
+            odd.append(f"{where} does not say with which build it was made; {REMEDY}")
         finding.wrong += odd
         if not odd:
             found.results[entry.protocol, entry.id] = result
@@ -345,6 +352,8 @@ def _history(board: Board, log: bytes) -> Finding:
         found.told = f"{len(tagged) - before} earlier versions are the beginning of this one"
         if before:
             found.told += f"; {before} are of boards that were begun again before there was a chain"
+        if git(folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
+            found.told += "; the clone is shallow, so there may be more"
     except NoHistory as error:
         found.open = str(error)
     return found

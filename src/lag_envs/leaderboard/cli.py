@@ -300,7 +300,9 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _withdraw(args: argparse.Namespace) -> int:
-    Board(args.board).withdraw(args.id, args.reason)
+    board = Board(args.board)
+    _some(board)
+    board.withdraw(args.id, args.reason)
     print(f"{args.id}: withdrawn")
     return 0
 
