@@ -680,7 +680,7 @@ def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     from lag_envs.scores import KNOWN_RETURNS
 
     known = KNOWN_RETURNS[env_id]._asdict() if env_id in KNOWN_RETURNS else None
-    return known if scale is None else (known or {"estimate": None}) | scale.model_dump()
+    return known if scale is None else (known or {"optimum": None}) | scale.model_dump()
 
 
 def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
