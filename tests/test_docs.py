@@ -286,8 +286,8 @@ def test_scale_is_what_was_measured(env_id):
     best = found[known.policy]
     assert known.error == pytest.approx(best["error"], rel=0.2)
     assert abs(known.best - best["mean"]) < 3.0 * known.error
-    # Where it lies farther off, it is by a thousandth of the way between the two at most.
-    assert abs(known.random - found["random"]["mean"]) < 1e-3 * (known.best - known.random)
+    # What counts as random was set from fewer episodes.
+    assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
     assert (known.optimum is not None) == ("optimum" in found)
     if known.optimum is not None:
         assert known.optimum == pytest.approx(found["optimum"]["mean"], abs=1e-4)

@@ -107,14 +107,14 @@ class Tilt(Task):
 
     ## Optimal Value
 
-    At least 181.6 (a plan by iLQR on the exact model gets it) and about 181.9 at most (finite-horizon value
-    iteration on a grid, extrapolated: an estimate), in the mean over the targets. Over 4,096 episodes (mean ±
-    standard error), the last column being the cascade φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1,
-    action = 43.4 (φ_wanted - φ), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
+    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the cascade is φ_wanted = -1.45 (x - x*) - 1.28
+    w, clipped to ±0.1, and action = 43.4 (φ_wanted - φ), clipped to ±1:
 
-    | Id | Random actions | Zero control | Cascade |
-    | -- | -------------- | ------------ | ------- |
-    | InclineTilt-v0 | 9.5 ± 0.2 | 11.3 ± 0.2 | 179.9 ± 0.3 |
+    | Id | Random actions | Zero control | Cascade | Best known |
+    | -- | -------------- | ------------ | ------- | ---------- |
+    | InclineTilt-v0 | 9.46 ± 0.18 | 11.29 ± 0.23 | 179.88 ± 0.28 | 181.560 ± 0.026 |
 
     ## Version History
 
@@ -306,14 +306,15 @@ class Brake(Task):
 
     ## Optimal Value
 
-    At least -1.724 (a switching line with its turning point computed on the exact model gets it), which is
-    also what finite-horizon value iteration on a grid, extrapolated, gives at most: an estimate. Over 4,096
-    episodes (mean ± standard error), the last column being the switching line action = 14.6 (v - 0.149 - 2.33
-    distance), clipped to ±1:
+    Known: roll freely, then brake fully, from the best moment on. `lag_envs.controllers.optimal_return` is what
+    that returns from any start; no policy exceeds it. The best policy known, which acts at intervals, misses it
+    by 0.0002 in the mean (`python -m agents.scale` measures both, in episodes of their own). Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the switching line is action = 14.6 (v - 0.149 -
+    2.33 distance), clipped to ±1:
 
-    | Id | Random actions | Zero control | Switching line |
-    | -- | -------------- | ------------ | -------------- |
-    | InclineBrake-v0 | -4.32 ± 0.01 | -11.98 ± 0.03 | -1.740 ± 0.005 |
+    | Id | Random actions | Zero control | Switching line | Best known |
+    | -- | -------------- | ------------ | -------------- | ---------- |
+    | InclineBrake-v0 | -4.318 ± 0.012 | -11.975 ± 0.033 | -1.7435 ± 0.0049 | -1.7241 ± 0.0004 |
 
     Zero control is the action -1, no brake.
 
