@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import gc
 import inspect
+import itertools
 import math
 import pickle
 import subprocess
@@ -84,6 +85,52 @@ def test_class_is_a_frozen_dataclass_with_and_without_the_decorator(decorate):
         cls(width=1.0)
     with pytest.raises(TypeError):
         cls(2.0)
+
+
+def test_other_ways_of_dataclasses():
+    """Slots, positional fields, an __init__ of one's own, an annotation that says it is none."""
+    from typing import ClassVar
+
+    @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+    class Slots(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+
+        def potential(self, q, xp):
+            return self.spring * (q.x - self.width) ** 2 / 2
+
+    @dataclasses.dataclass(frozen=True)
+    class Positional(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+        coordinates: ClassVar = {"x": "m"}
+
+    class Own(cart(False)):
+        def __init__(self, width):
+            for name, value in {"mass": width, "spring": 2.0, "springs": 1, "pair": ()}.items():
+                object.__setattr__(self, name, value)
+
+    slots = Slots(width=1.0)
+    assert slots.acceleration([1.5, 0.0])["x"] == -1.0
+    assert copy.deepcopy(slots) == copy.copy(slots) == slots and copy.copy(Own(2.0)) == Own(2.0)
+    assert dataclasses.replace(slots, mass=2.0).acceleration([1.5, 0.0])["x"] == -0.5
+    assert Positional(0.25).width == 0.25
+    assert Own(4.0).acceleration([1.0, 0.0])["x"] == -0.5
+
+
+def test_singular_state_is_its_own_affair():
+    class Polar(Scene):
+        coordinates = {"r": "m", "phi": "rad"}
+
+        def kinetic(self, q, v, xp):
+            return (v.r**2 + q.r**2 * v.phi**2) / 2
+
+        def potential(self, q, xp):
+            return -1 / q.r
+
+    scene = Polar()
+    found = scene.acceleration([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0], [2.0, 0.0, 0.0, 1.0]])["r"]
+    assert found[0] == 0.0 and found[2] == 1.75 and not np.isfinite(found[1])
+    A, _ = scene.linearise([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+    assert np.isfinite(A[0]).all() and not np.isfinite(A[1]).all()
 
 
 @both
@@ -332,6 +379,9 @@ def test_free_place_may_be_left_out():
 
     scene = Coasting()
     assert scene.state_names == ("x_dot", "theta", "theta_dot")
+    whole = type("Whole", (Coasting,), {"left_out": ()})()
+    path = whole.simulate([5.0, 1.0, 0.2, 0.3], 3, 0.02)
+    np.testing.assert_array_equal(scene.simulate([1.0, 0.2, 0.3], 3, 0.02), path[:, 1:])
     A, B = scene.linearise([1.0, 0.2, 0.3])
     assert A.shape == (3, 3) and B.shape == (3, 0)
 
@@ -635,26 +685,28 @@ def test_copies_are_the_same(scene):
         assert again.acceleration(state, control) == expected
 
 
-@both
-@pytest.mark.parametrize("used", [False, True], ids=["new", "used"])
-def test_class_that_no_module_has_goes_by_value(decorate, used):
-    """As classes of `__main__` and of notebooks do: cloudpickle, in another process."""
-    cls = cart(decorate)
-    if used:
-        assert cls().mass == 1.0
-    text = cloudpickle.dumps((cls, cls(mass=2.0, pair=(1, 2)) if used else None))
+def test_class_that_no_module_has_goes_by_value():
+    """As classes of `__main__` and of notebooks do: cloudpickle, in another process; used before or not."""
+    sent = []
+    for decorate, used in itertools.product((False, True), repeat=2):
+        cls = cart(decorate)
+        sent.append((cls, cls(mass=2.0, pair=(1, 2)) if used else None))
     code = (
-        "import sys, dataclasses, pickle; cls, scene = pickle.loads(sys.stdin.buffer.read())\n"
-        "scene = scene or cls(mass=2.0, pair=(1, 2))\n"
-        "again = dataclasses.replace(scene, spring=4.0)\n"
-        "print(again, again.acceleration([1.0, 0.0], 3.0)['x'], cls(springs=2) == cls(springs=2))\n"
-        "try: cls(mass=-1.0)\n"
-        "except ValueError as error: print(error)\n"
+        "import sys, dataclasses, pickle\n"
+        "for cls, scene in map(pickle.loads, pickle.loads(sys.stdin.buffer.read())):\n"
+        "    scene = scene or cls(mass=2.0, pair=(1, 2))\n"
+        "    again = dataclasses.replace(scene, spring=4.0)\n"
+        "    print(again, again.acceleration([1.0, 0.0], 3.0)['x'], cls(springs=2) == cls(springs=2))\n"
+        "    try: cls(mass=-1.0)\n"
+        "    except ValueError as error: print(error)\n"
     )
+    text = pickle.dumps([cloudpickle.dumps(one) for one in sent])
     run = subprocess.run([sys.executable, "-c", code], input=text, capture_output=True, check=False)
-    first, second = run.stdout.decode().splitlines() or ["", run.stderr.decode()]
-    assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True"), second
-    assert second == "mass must be above 0 kg, got -1 kg"
+    lines = run.stdout.decode().splitlines()
+    assert len(lines) == 8, run.stderr.decode()
+    for first, second in zip(lines[::2], lines[1::2], strict=True):
+        assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True")
+        assert second == "mass must be above 0 kg, got -1 kg"
 
 
 MAIN = """

@@ -79,6 +79,17 @@ def test_seeds_are_what_they_were(old, new, keywords):
             agree(friction[carries], theirs["needed_friction"][carries])
 
 
+def test_vertical_plane_carries_nothing():
+    for tilt in (math.pi / 2, -math.pi / 2, 1.2):
+        before, after = OldIncline(tilt=tilt), Incline(tilt=tilt)
+        assert after.forces([0.1, 0.2]) == pytest.approx(before.forces([0.1, 0.2]), rel=1e-13, abs=1e-13)
+        assert math.isinf(after.forces([0.1, 0.2])["needed_friction"]) == (tilt != 1.2)
+        now = Moment([0.1, 0.2], 0.0)
+        assert sorted(map(_summary, after.shapes(now))) == sorted(map(_summary, before.shapes(now)))
+    with pytest.raises(ValueError, match="tilt must be at most"):
+        Incline(tilt=1.6)
+
+
 @variants
 def test_one_state_is_a_row_of_many(old, new, keywords):
     scene, generator = new(**keywords), np.random.default_rng(4)

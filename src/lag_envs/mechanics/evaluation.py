@@ -58,8 +58,19 @@ class Dual:
     def __rsub__(self, other: Any) -> Dual:
         return -1.0 * self + other
 
+    def __truediv__(self, other: Any) -> Dual:
+        value, divisor = _parts(self), _parts(other)
+        quotient = value[0] / divisor[0]
+        return Dual(quotient, (value[1] - quotient[..., None] * divisor[1]) / divisor[0][..., None])
+
     def __rtruediv__(self, other: Any) -> Dual:
-        return Dual(1.0 / self.value, -self.slope / (self.value * self.value)[..., None]) * other
+        quotient = other / self.value
+        return Dual(quotient, -(quotient / self.value)[..., None] * self.slope)
+
+
+def _parts(x: Any) -> tuple[Any, Any]:
+    """Return value and slope of any number."""
+    return (x.value, x.slope) if isinstance(x, Dual) else (np.asarray(x, dtype=np.float64), 0.0)
 
 
 def _carried(function: Any, slope: Any) -> Any:
@@ -155,31 +166,20 @@ class Point:
         return total
 
     def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a column."""
-        n = len(right)
-        numbers = [*self.mass, *right]
-        slopes = [x.slope for x in numbers if isinstance(x, Dual)]
-        if n == 1 and not slopes:
-            return [right[0] / self.mass[0]]
-        matrix, column = self._solvable([x.value if isinstance(x, Dual) else x for x in numbers], n)
-        solved = np.linalg.solve(matrix, column[..., None])[..., 0]
-        if not slopes:
-            return list(np.moveaxis(solved, -1, 0))
-        width = slopes[0].shape[-1]
-        flat = [x.slope if isinstance(x, Dual) else np.zeros(width) for x in numbers]
-        parts = np.stack(np.broadcast_arrays(*flat, np.zeros((*solved.shape[:-1], width))), axis=-2)[
-            ..., :-1, :
-        ]
-        bend = parts[..., : n * n, :].reshape(*parts.shape[:-2], n, n, width)
-        slope = np.linalg.solve(
-            matrix, parts[..., n * n :, :] - np.einsum("...ijk,...j->...ik", bend, solved)
-        )
-        return [Dual(solved[..., i], slope[..., i, :]) for i in range(n)]
-
-    @staticmethod
-    def _solvable(numbers: Sequence, n: int) -> tuple[Array, Array]:
-        stacked = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in numbers)), axis=-1)
-        return stacked[..., : n * n].reshape(*stacked.shape[:-1], n, n), stacked[..., n * n :]
+        """Return M⁻¹ times a column, by elimination: where M is singular, that state alone gets no number."""
+        n = range(len(right))
+        a = [list(self.mass[len(n) * i : len(n) * (i + 1)]) for i in n]
+        b = list(right)
+        for i in n:
+            for j in range(i + 1, len(n)):
+                factor = a[j][i] / a[i][i]
+                a[j] = [x - factor * y for x, y in zip(a[j], a[i], strict=True)]
+                b[j] = b[j] - factor * b[i]
+        for i in reversed(n):
+            for j in range(i + 1, len(n)):
+                b[i] = b[i] - a[i][j] * b[j]
+            b[i] = b[i] / a[i][i]
+        return b
 
     # --- what follows --------------------------------------------------------------------------------------
 

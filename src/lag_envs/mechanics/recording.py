@@ -111,9 +111,11 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     numbers : mapping
         A number for each parameter that is not None.
     """
-    other = object.__new__(type(scene))
-    values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
-    vars(other).update(values | {name: numbers[name] for name in scene._numbers()}, **{TWIN: True})
+    other, given = object.__new__(type(scene)), scene._numbers()
+    for field in dataclasses.fields(scene):
+        value = numbers[field.name] if field.name in given else getattr(scene, field.name)
+        object.__setattr__(other, field.name, value)
+    vars(other)[TWIN] = True
     return other
 
 
@@ -205,18 +207,6 @@ def record(scene: Any, layout: Layout) -> Record:
     FormulaError
         Naming class and formula, where one does what a recorded number cannot follow.
     """
-    first, second = _record(scene, layout), _record(scene, layout)
-    for a, b in zip(first.exprs(), second.exprs(), strict=True):
-        if not a.same(b):
-            raise FormulaError(
-                f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend "
-                "on place, velocity, controls and fields only, not on time or chance"
-            )
-    _check_controls(scene, layout, first)
-    return first
-
-
-def _record(scene: Any, layout: Layout) -> Record:
     names = layout.names
     copy = twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
     q = Values("coordinate", {name: Expr.of(place(name)) for name in names})
@@ -246,7 +236,19 @@ def _record(scene: Any, layout: Layout) -> Record:
                 raise FormulaError(f"the place of {name!r} depends on more than parameters")
     with formula(scene, "poses"):
         poses = _poses(run("poses"))
-    return Record(Energies(applied=applied, **parts), rests, poses)
+    found = Record(Energies(applied=applied, **parts), rests, poses)
+    _check_controls(scene, layout, found)
+    return found
+
+
+def check_again(scene: Any, layout: Layout, found: Record) -> None:
+    """Raise a FormulaError where a formula gives something else when it is run again."""
+    again = record(scene, layout).exprs()
+    if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
+        raise FormulaError(
+            f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
+            "place, velocity, controls and fields only, not on time or chance"
+        )
 
 
 def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:

@@ -55,6 +55,7 @@ def parameter(
     above: float | None = None,
     least: float | None = None,
     below: float | None = None,
+    most: float | None = None,
     optional: bool = False,
     infinite: bool = False,
 ) -> Any:
@@ -67,8 +68,8 @@ def parameter(
         ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
     unit : str
         Its unit, for tables and errors.
-    above, least, below : float, optional
-        The range that it must lie in: above, at least, below.
+    above, least, below, most : float, optional
+        The range that it must lie in: above, at least, below, at most.
     optional : bool
         Whether None may be given; a default of None says so too.
     infinite : bool
@@ -82,6 +83,7 @@ def parameter(
             "above": above,
             "least": least,
             "below": below,
+            "most": most,
             "made": default if made else None,
             "optional": optional or (default is None),
             "infinite": infinite,
@@ -119,6 +121,9 @@ def real_array(name: str, values: ArrayLike) -> Array:
 # mark, which is known by its identity: as a copy it would be taken for a default.
 copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 
+#: Where a motion is singular, or a number too large, that state's results are not finite, and no others'.
+_QUIET = np.errstate(all="ignore")
+
 #: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
 _admitted: weakref.WeakKeyDictionary[type, set] = weakref.WeakKeyDictionary()
 
@@ -139,6 +144,15 @@ class SceneType(ABCMeta):
         _complete(cls)
         signature = inspect.signature(cls.__init__)  # type: ignore[misc]
         return signature.replace(parameters=list(signature.parameters.values())[1:])
+
+
+def _annotations(cls: type) -> dict[str, Any]:
+    """Return the class's own annotations; from Python 3.14 on they may name what is not there yet."""
+    if sys.version_info >= (3, 14):
+        import annotationlib
+
+        return dict(annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF))
+    return dict(inspect.get_annotations(cls))
 
 
 def _complete(cls: type) -> None:
@@ -260,7 +274,7 @@ class Scene(metaclass=SceneType):
                 and "__dataclass_fields__" not in vars(parent)
             ):
                 _complete(parent)
-        own, annotations = vars(cls), dict(inspect.get_annotations(cls))
+        own, annotations = vars(cls), _annotations(cls)
         faults = []
         for name in (*MAPPINGS, *SEQUENCES):
             if name in annotations and not str(annotations[name]).replace("typing.", "").startswith(
@@ -277,7 +291,7 @@ class Scene(metaclass=SceneType):
             annotations["control"] = "str"
             if "control" not in own:
                 cls.control = next(iter(own["modes"]))  # type: ignore[attr-defined]
-        if annotations != inspect.get_annotations(cls):
+        if annotations != _annotations(cls):
             cls.__annotations__ = annotations
         for name in MAPPINGS:
             if isinstance(own.get(name), Mapping):
@@ -315,6 +329,7 @@ class Scene(metaclass=SceneType):
             ) from error
         if not known:
             _check_names(self)
+            recording.check_again(self, self._layout, recording.record(self, self._layout))
             _check_motion(self, self.mechanics)
             _check_bodies(self)
             _admitted[type(self)].add(key)
@@ -328,7 +343,8 @@ class Scene(metaclass=SceneType):
     def _structure(self) -> tuple:
         """All that decides which code steps the scene; scenes that agree in it differ in numbers only."""
         cls, numbers = type(self), self._numbers()
-        formulas = tuple(getattr(cls, name) for name in ("rests", *recording.ARGUMENTS))
+        # By identity: a formula that calls super() would keep its own class alive.
+        formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         plain = tuple((f.name, getattr(self, f.name)) for f in fields if "unit" not in f.metadata)
         zero = tuple(name for name in numbers if getattr(self, name) == 0.0)
@@ -341,10 +357,9 @@ class Scene(metaclass=SceneType):
         raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
 
     def __reduce__(self) -> tuple:
-        return _restore, (
-            type(self),
-            {name: value for name, value in vars(self).items() if not name.startswith("_")},
-        )
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
+        others = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        return _restore, (type(self), others | fields)
 
     # --- what follows: names -------------------------------------------------------------------------------
 
@@ -465,6 +480,7 @@ class Scene(metaclass=SceneType):
         """Return the parameters' values by symbol."""
         return {recording.parameter(name): np.float64(getattr(self, name)) for name in self._numbers()}
 
+    @_QUIET
     def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the accelerations of the free coordinates, by name.
 
@@ -478,12 +494,14 @@ class Scene(metaclass=SceneType):
         point, shape = self._point(state, control)
         return {name: _shaped(point.acceleration[name], shape) for name in self._layout.free}
 
+    @_QUIET
     def mass_matrix(self, state: ArrayLike, control: ArrayLike = 0.0) -> Array:
         """Return the mass matrix of the free coordinates, shape (..., n, n)."""
         point, shape = self._point(state, control)
         n = len(self._layout.free)
         return np.stack([_shaped(x, shape) for x in point.mass], axis=-1).reshape(*shape, n, n)
 
+    @_QUIET
     def energy(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return kinetic, potential and total energy [J].
 
@@ -508,6 +526,7 @@ class Scene(metaclass=SceneType):
             energies["jacobi"] = kinetic - linear - 2.0 * rest + potential
         return {name: _shaped(value, shape) for name, value in energies.items()}
 
+    @_QUIET
     def forces(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
 
@@ -536,6 +555,7 @@ class Scene(metaclass=SceneType):
             forces[name] = np.divide(np.abs(forces[friction]), forces[normal], out=out, where=carries)[()]
         return forces
 
+    @_QUIET
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the powers of ``drive`` and ``applied`` forces and that lost to ``drag`` [W].
 
@@ -545,6 +565,7 @@ class Scene(metaclass=SceneType):
         point, shape = self._point(state, control)
         return {name: _shaped(value, shape) for name, value in point.power().items()}
 
+    @_QUIET
     def linearise(self, state: ArrayLike, control: ArrayLike = 0.0) -> tuple[Array, Array]:
         """Return the derivatives of the state's rate of change by state and control, (A, B).
 
@@ -870,7 +891,8 @@ def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
     """Return a scene from a pickle, perhaps the first of its class in this process."""
     _complete(cls)
     scene = object.__new__(cls)
-    vars(scene).update(state)
+    for name, value in state.items():
+        object.__setattr__(scene, name, value)
     scene._admit()
     return scene
 
@@ -912,7 +934,7 @@ def _check_names(scene: Scene) -> None:
                 f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
                 "dissipation and applied, from which these follow"
             )
-        for name in (*inspect.get_annotations(c), *vars(c)):
+        for name in (*_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
     layout = scene._layout
@@ -962,8 +984,8 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
     symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
     seen = []
     with np.errstate(all="ignore"):
-        for _ in range(16):
-            at = values | {symbol: generator.uniform(0.1, 1.5) for symbol in symbols}
+        for low, high in ((0.1, 1.5), (-3.0, 3.0), (0.01, 0.1), (1.0, 10.0)) * 4:
+            at = values | {symbol: generator.uniform(low, high) for symbol in symbols}
             matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
             if not np.isfinite(matrix).all():
                 continue
@@ -983,11 +1005,12 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
     number = check_number(field.name, value, unit, infinite=field.metadata["infinite"])
-    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
     for rule, limit, broken in (
         ("above", above, above is not None and not number > above),
         ("at least", least, least is not None and not number >= least),
         ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
         ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
         ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
     ):

@@ -43,7 +43,8 @@ class Incline(Scene):
     damping : float [N s/m]
         Coefficient c of the drag -cx' at the axis. It adds to a drag that is the control.
     tilt : float [rad], optional
-        Fixed tilt, below π/2 to either side; 0.26 by default. Only for the control "damping".
+        Fixed tilt, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
+        control "damping".
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt", "tilt_rate"}
@@ -71,8 +72,8 @@ class Incline(Scene):
     tilt: float | None = parameter(
         lambda incline: 0.26 if incline.control == "damping" else None,
         "rad",
-        above=-math.pi / 2,
-        below=math.pi / 2,
+        least=-math.pi / 2,
+        most=math.pi / 2,
     )
     gravity: float = parameter(9.81, "m/s²", least=0.0)
     control: str = "damping"
@@ -158,9 +159,12 @@ class Incline(Scene):
         radius = self.radius
         left, right = self.place(low, 0.0, phi), self.place(high, 0.0, phi)
         depth = min(left[1], right[1]) - (high - low)
+        behind = [(right[0], depth), (left[0], depth)]
+        if abs(phi) > 0.25 * math.pi:  # rather a wall than a hill
+            behind = [self.place(x, low - high, phi) for x in (high, low)]
         marks = shapes.ticks(low, high, shapes.round_length((high - low) / 15.0))
         return [
-            Polygon([left, right, (right[0], depth), (left[0], depth)], "ground"),
+            Polygon([left, right, *behind], "ground"),
             *(Line([self.place(x, 0.0, phi), self.place(x, -0.6 * radius, phi)], "ground") for x in marks),
             Line([(0.0, 0.0), (-24.0 * radius, 0.0)], "guide"),
             Line(shapes.arc((0.0, 0.0), 20.0 * radius, math.pi - phi, math.pi), "guide"),

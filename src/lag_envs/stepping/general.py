@@ -85,7 +85,7 @@ class SeriesStepper:
                 inputs[name] = given[name.removeprefix("control_")]
             elif name.startswith("start_") and name != "start_elapsed":
                 inputs[name] = given[name.removeprefix("start_")]
-        q = [given[name] for name in self._layout.free]
+        q = [given.get(name, 0.0) for name in self._layout.free]  # where one is left out, nothing depends on it
         shift = self._shift(xp, q, {p.name: given.get(p.name) for p in self._layout.prescribed}, u, k)
         for i, name in enumerate(self._layout.free):
             inputs[f"q{i}"] = q[i]
