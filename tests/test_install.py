@@ -69,6 +69,13 @@ def test_core_alone_can_be_installed_and_stepped(tmp_path):
     # -I keeps the surrounding environment's PYTHONPATH out.
     assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
     assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
+    # What is for other libraries is in the wheel, and says what it needs.
+    assert "lag_envs.sb3.ScaledReward" in run(
+        python.with_name("lag-envs"), "hyperparams", "ppo", cwd=tmp_path
+    )
+    for module, extra in (("lag_envs.sb3", "agents"), ("lag_envs.zoo", "zoo")):
+        with pytest.raises(AssertionError, match=rf'pip install "lag-envs\[{extra}\]"'):
+            run(python, "-I", "-m", module, "enjoy", cwd=tmp_path)
 
 
 def test_one_distribution_brings_pygame():

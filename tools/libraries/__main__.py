@@ -39,6 +39,8 @@ QUIET = {
     "RAY_AUTH_MODE": "disabled",
     "RAY_USAGE_STATS_ENABLED": "0",
     "PYTHONUNBUFFERED": "1",
+    # The networks are small: threads would wait for each other.
+    "OMP_NUM_THREADS": "1",
 }
 
 
