@@ -17,9 +17,11 @@ from gymnasium.utils.env_checker import check_env
 from rollouts import ANY_BAR, IDS, RENDERS, actions, make, trace
 
 from lag_envs.envs import program
+from lag_envs.envs.model import Model
 from lag_envs.envs.program import Program
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.scenes.base import StepRefused
+from lag_envs.tasks.incline import Brake
 
 each_id = pytest.mark.parametrize("env_id", IDS)
 
@@ -686,3 +688,21 @@ def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
         make("InclineTilt-v0", **options)
         make("InclineTilt-v0", **options)
     assert len(recorded) == 5 + len(others)
+
+
+def test_attributes_set_by_hand_are_not_taken_from_elsewhere(monkeypatch):
+    # A formula may name an attribute of the task; a program that another task has recorded does not know it.
+    def crossing(task):
+        return Model(task)([[-0.001, 2.0]], [-1.0])[1][0]
+
+    def task():
+        return make("InclineBrake-v0").task
+
+    usual, lenient = crossing(task()), task()
+    lenient.gentle = 1.5
+    assert crossing(lenient) == pytest.approx(usual + 5.0, abs=1e-9)
+    assert crossing(task()) == usual
+    monkeypatch.setattr(Brake, "gentle", 1.5)
+    assert crossing(task()) == crossing(lenient)
+    monkeypatch.undo()
+    assert crossing(task()) == usual

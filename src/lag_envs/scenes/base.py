@@ -290,7 +290,9 @@ class Scene(ABC):
         """
         controls = self.check_control(controls)
         if controls.ndim != 1:
-            raise ValueError(f"controls must have shape (T,), got shape {controls.shape}: {shown(controls)}")
+            raise ValueError(
+                f"controls must have shape (T,), got shape {controls.shape}: {shown(controls.tolist())}"
+            )
         dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)

@@ -87,7 +87,7 @@ class SwingUp(Task):
     | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
     | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
     | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
-    | track | 0.5 | m | 1e-3 to 1e6 | travel S to either side; `math.inf`: no end (S = 0.5 m); None: none |
+    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; `math.inf`: no end (S = 0.5 m); None: none |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
@@ -139,7 +139,7 @@ class SwingUp(Task):
     scene: PivotedBar
     scene_type = PivotedBar
     defaults: ClassVar = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
-    usable: ClassVar = {"track": (1e-3, 1e6)}
+    usable: ClassVar = {"track": (1e-3, 1e9)}
     limit_control = 5.0
 
     @property
@@ -289,7 +289,7 @@ class Balance(SwingUp):
     | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
     | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
     | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
-    | track | 0.5 | m | 1e-3 to 1e6 | travel S to either side; finite here |
+    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; finite here |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
