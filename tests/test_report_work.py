@@ -487,7 +487,7 @@ def test_long_horizons_are_exact_products():
 
 
 def test_targets_are_compared_once():
-    found = verdicts.duels(verdicts.gathered(OWN), {})
+    found = verdicts.compared(verdicts.gathered(OWN), {})
     assert [(d.mode, d.target) for d in found] == [(mode, target) for mode in MODES for target in TARGETS]
 
 

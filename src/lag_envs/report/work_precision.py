@@ -257,7 +257,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         at_rounding = row["error"] < 4.0 * ROUNDING
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
-            clock = timed(Ours(Ours.METHOD, 1), base, dt, 1, together)
+            clock = timed(Ours(Ours.METHOD, 1), base, dt, steps, together)
             times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
             for i, row in enumerate(found):
                 yield row | {"ns": times[i + 1], "clock": times[0]}
@@ -301,12 +301,15 @@ def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: b
     """Return a sample of some milliseconds, all in compiled loops where the rival has them."""
     if rival.fixed and steps > 1:
         steps = min(steps, max(16, 512 // rival.substeps(1)))
+    if steps == 1 and rival.changing:
+        per_control = rival.substeps(1) if rival.fixed else 1
+        cases, changes = (
+            (base, max(1, 4 // per_control)) if together else (base[:8], max(8, 512 // per_control))
+        )
+        return rival.build(Problems(cases), dt, 1, together, changes)
     if together:
         sample = rival.build(Problems(base), dt, steps, True)
         return repeated(sample, 8) if steps == 1 else sample
-    if steps == 1 and rival.changing:
-        per_control = rival.substeps(1) if rival.fixed else 1
-        return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // per_control))
     one = rival.build(Problems(base[:1]), dt, steps, False)
     one.end()
     begin = time.perf_counter()
