@@ -302,11 +302,10 @@ def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: b
     if rival.fixed and steps > 1:
         steps = min(steps, max(16, 512 // rival.substeps(1)))
     if steps == 1 and rival.changing:
-        per_control = rival.substeps(1) if rival.fixed else 1
-        cases, changes = (
-            (base, max(1, 4 // per_control)) if together else (base[:8], max(8, 512 // per_control))
-        )
-        return rival.build(Problems(cases), dt, 1, together, changes)
+        each = rival.substeps(1) if rival.fixed else 1
+        if together:  # few, for a control that is held drives states afar
+            return rival.build(Problems(base), dt, 1, True, max(1, 4 // each))
+        return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // each))
     if together:
         sample = rival.build(Problems(base), dt, steps, True)
         return repeated(sample, 8) if steps == 1 else sample
