@@ -609,8 +609,8 @@ def test_refused_step_keeps_the_rows_before():
     [
         ([0.0, 0.0], [1.0, math.nan], 0.02, r"control must be finite, got nan at \[1\]"),
         ([0.0, 0.0], [math.inf], 0.02, "control must be finite, got inf"),
-        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got \(\)"),
-        ([0.0, 0.0], [[1.0]], 0.02, r"shape \(T,\), got \(1, 1\)"),
+        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got shape \(\): 1\.0"),
+        ([0.0, 0.0], [[1.0]], 0.02, r"shape \(T,\), got shape \(1, 1\): "),
         ([0.0, 0.0], ["one"], 0.02, "control must be real numbers"),
         ([0.0, 0.0, 0.0], [1.0], 0.02, r"state must be \(theta, theta_dot\), got .* \(3,\)"),
         ([0.0, math.nan], [1.0], 0.02, "state must be finite, got .*theta_dot"),
