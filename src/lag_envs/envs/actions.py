@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.scenes.base import is_masked, shown
+
 
 class Actions:
     """The actions of one task.
@@ -34,23 +36,17 @@ class Actions:
 
     def one(self, action: Any) -> Any:
         """Return an action as a float, or as an array where it has several numbers; or raise a ValueError."""
-        array = np.asarray(action)
-        if array.shape != self.shape:
-            raise ValueError(f"the action must have shape {self.shape}, got shape {array.shape}: {action!r}")
-        self._check_type(array, "the action")
+        array = self._array(action, "the action", self.shape)
         if self.values:
             self._check_choices(array, "the action")
         elif not np.isfinite(array).all():
-            raise ValueError(f"the action must be finite, got {action!r}")
+            raise ValueError(f"the action must be finite, got {shown(action)}")
         numbers = np.ascontiguousarray(array, np.float64).reshape(-1)
         return float(numbers[0]) if self.count == 1 else numbers
 
     def many(self, actions: Any, n: int) -> NDArray[np.floating]:
         """Return the actions of n environments, one behind the other; or raise a ValueError."""
-        array = np.asarray(actions)
-        if array.shape != (n, *self.shape):
-            raise ValueError(f"actions must have shape {(n, *self.shape)}, got {array.shape}")
-        self._check_type(array, "actions")
+        array = self._array(actions, "actions", (n, *self.shape))
         if self.values:
             self._check_choices(array, "actions")
         if (
@@ -59,10 +55,21 @@ class Actions:
             array = array.astype(np.float64)
         return array.reshape(-1)
 
-    def _check_type(self, array: NDArray, what: str) -> None:
-        if array.dtype.kind not in ("iu" if self.values else "fiub"):
-            kind = "whole numbers" if self.values else "real numbers"
-            raise ValueError(f"{what} must be {kind}, got {array!r:.80} of type {array.dtype}")
+    def _array(self, given: Any, what: str, shape: tuple[int, ...]) -> NDArray:
+        """Return real or whole numbers of this shape as an array, or raise a ValueError."""
+        try:
+            array = np.asarray(given)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"{what} must have shape {shape}, got {shown(given)}") from error
+        if array.shape != shape:
+            raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}: {shown(given)}")
+        if array.dtype.kind not in ("iu" if self.values else "fiub") or is_masked(given):
+            one = what.startswith("the")
+            kind = ("whole" if self.values else "real") + (" number" if one else " numbers")
+            raise ValueError(
+                f"{what} must be {'a ' if one else ''}{kind}, got {shown(given)} of type {array.dtype}"
+            )
+        return array
 
     def _check_choices(self, array: NDArray, what: str) -> None:
         bad = (array < 0) | (array >= np.array(self.values).reshape(self.shape))

@@ -37,12 +37,14 @@ def constants_of(task: Any) -> dict[str, float]:
     return task.formulas.constants()
 
 
-def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
-    """Return the program of a task: the same for all tasks that differ in their numbers only."""
+def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
+    """Return the program of a task: one for all tasks that differ in `constants_of` only."""
     key = (type(task), type(task.scene), task.formulas.key, absent, varying)
     if key not in _programs:
         _programs[key] = Program(task, absent, varying)
     return _programs[key]
+
+
 
 
 _programs: dict[tuple, Program] = {}

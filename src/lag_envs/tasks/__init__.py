@@ -35,11 +35,14 @@ def __getattr__(name: str) -> Any:
 
 
 def load_task(place: str | type[Any]) -> type[Any]:
-    """Return the task class at "module:Class"; a class as it is."""
+    """Return the task class at "module:Class", or raise a ValueError; a class as it is."""
     if isinstance(place, type):
         return place
-    module, _, name = place.partition(":")
-    found: Any = import_module(module)
-    for part in name.split("."):
-        found = getattr(found, part)
-    return found
+    try:
+        module, _, name = place.partition(":")
+        found: Any = import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        return found
+    except (AttributeError, ImportError, TypeError, ValueError) as error:
+        raise ValueError(f"task must be given as 'module:Class', got {place!r:.200}: {error}") from error
