@@ -6,7 +6,6 @@ import copyreg
 import dataclasses
 import inspect
 import math
-import numbers
 import sys
 import weakref
 from abc import ABCMeta
@@ -25,7 +24,7 @@ from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.base import SMALLEST, StepRefused, check_number, check_step, real_array, shown
 from lag_envs.scenes.shapes import Moment, Shape, Window
 
 if TYPE_CHECKING:
@@ -35,10 +34,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=type)
-
-#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not
-#: vanish or overflow.
-SMALLEST = 1e-60
 
 #: Class attributes that are mappings, and those that are names in order.
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
@@ -56,8 +51,9 @@ def parameter(
     least: float | None = None,
     below: float | None = None,
     most: float | None = None,
+    usable: tuple[float, float] = (-math.inf, math.inf),
     optional: bool = False,
-    infinite: bool = False,
+    endless: bool = False,
 ) -> Any:
     """Declare a physical parameter.
 
@@ -70,9 +66,12 @@ def parameter(
         Its unit, for tables and errors.
     above, least, below, most : float, optional
         The range that it must lie in: above, at least, below, at most.
+    usable : (float, float)
+        The range in which an environment can be used, whatever its other parameters, see `Task.usable`; a
+        scene alone may be stepped beyond it.
     optional : bool
         Whether None may be given; a default of None says so too.
-    infinite : bool
+    endless : bool
         Whether infinity may be given.
     """
     made = callable(default)
@@ -86,35 +85,10 @@ def parameter(
             "most": most,
             "made": default if made else None,
             "optional": optional or (default is None),
-            "infinite": infinite,
+            "endless": endless,
+            "usable": usable,
         },
     )
-
-
-def check_number(name: str, value: Any, unit: str = "", *, infinite: bool = False) -> float:
-    """Return the value as a finite float, or raise a ValueError that names it."""
-    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
-        raise ValueError(f"{name} must be a real number, got {value!r}")
-    try:
-        number = float(value)
-    except OverflowError:  # an integer may be too large
-        number = math.inf
-        infinite = False
-    if not math.isfinite(number) and not (infinite and number == math.inf):
-        raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
-    return number
-
-
-def real_array(name: str, values: ArrayLike) -> Array:
-    """Return values as a new float64 array, or raise a ValueError that names them."""
-    try:
-        array = np.array(values)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} must be real numbers, got {values!r}") from error
-    if array.dtype.kind not in "fiu" and array.size:
-        raise ValueError(f"{name} must be real numbers, got {values!r}")
-    return array.astype(np.float64)
 
 
 # A class that goes to another process by value before it is used takes its fields along, and in them this
@@ -306,10 +280,10 @@ class Scene(metaclass=SceneType):
     def _admit(self) -> None:
         """Check parameters and, for the first scene of its kind, names and formulas."""
         _check_class(type(self))
-        if self.modes and self.control not in tuple(self.modes):  # type: ignore[attr-defined]
-            raise ValueError(
-                f"control must be one of {', '.join(self.modes)}, got {self.control!r}"  # type: ignore[attr-defined]
-            )
+        if self.modes:
+            mode = self.control  # type: ignore[attr-defined]
+            if not isinstance(mode, str) or mode not in self.modes:
+                raise ValueError(f"control must be one of {', '.join(self.modes)}, got {shown(mode)}")
         fields = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}  # type: ignore[arg-type]
         made = [f for f in fields.values() if f.metadata["made"] and getattr(self, f.name) is None]
         for field in (*(f for f in fields.values() if f not in made), *made):
@@ -648,8 +622,8 @@ class Scene(metaclass=SceneType):
         ValueError
             For a state, control or step that is not finite or has the wrong shape, or a step not above 0.
         StepRefused
-            Where a step cannot be certified within the cap on substeps, or has no finite result. Its attribute
-            `trajectory` holds the rows before that.
+            Where a step cannot be certified within the cap on substeps, or has no finite result. Its
+            attribute `trajectory` holds the rows before that.
         """
         start, dt = self._check_state(state), check_step(dt)
         given = self._check_sequence(controls)
@@ -670,7 +644,8 @@ class Scene(metaclass=SceneType):
         if n == 0:
             if isinstance(controls, bool) or not isinstance(controls, int | np.integer) or controls < 0:
                 raise ValueError(
-                    f"this scene has no control: give the number of steps in place of controls, got {controls!r:.60}"
+                    "this scene has no control: give the number of steps in place of controls, "
+                    f"got {controls!r:.60}"
                 )
             return np.empty((int(controls), 0))
         array = real_array("controls", controls)
@@ -701,8 +676,9 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         StepBound
-            Substeps, order, and for each entry of the state a proved bound on the truncation error, summed over
-            the substeps; rounding, and the growth of earlier substeps' errors along the motion, come on top.
+            Substeps, order, and for each entry of the state a proved bound on the truncation error, summed
+            over the substeps; rounding, and the growth of earlier substeps' errors along the motion, come on
+            top.
 
         Raises
         ------
@@ -725,7 +701,7 @@ class Scene(metaclass=SceneType):
         return StepBound(status, order, by_state, "proved with the step")
 
     def jacobian(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> tuple[Array, Array]:
-        """Return the derivatives of the state after a control step by the state before it and by the controls.
+        """Return the derivatives of the state after a control step by the state before it and by controls.
 
         The derivatives go through the same series and substeps as the step itself.
 
@@ -771,9 +747,10 @@ class Scene(metaclass=SceneType):
         start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
         held = zip(self.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
         error = StepRefused(
-            f"{where} was refused: from ({start}) with {', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and "
-            f"dt={dt:g} s it could not be certified within the largest number of substeps, or has no finite result; "
-            "take a smaller dt or milder parameters"
+            f"{where} was refused: from ({start}) with "
+            f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s it could not be "
+            "certified within the largest number of substeps, or has no finite result; take a smaller dt or "
+            "milder parameters"
         )
         error.trajectory = None if trajectory is None else trajectory.copy()
         return error
@@ -1005,7 +982,7 @@ def _check_motion(scene: Scene, found: Mechanics) -> None:
 
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
-    number = check_number(field.name, value, unit, infinite=field.metadata["infinite"])
+    number = check_number(field.name, value, unit, endless=field.metadata["endless"])
     above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
     for rule, limit, broken in (
         ("above", above, above is not None and not number > above),
@@ -1020,11 +997,3 @@ def _check_range(field: dataclasses.Field, value: Any) -> float:
                 f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
             )
     return number
-
-
-def check_step(dt: Any) -> float:
-    """Return the step as float, or raise a ValueError."""
-    dt = check_number("dt", dt, "s")
-    if not dt >= sys.float_info.min:  # what lies between has no inverse
-        raise ValueError(f"dt must be above 0 s, got {dt:g} s")
-    return dt

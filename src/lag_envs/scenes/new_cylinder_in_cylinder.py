@@ -74,14 +74,14 @@ class CylinderInCylinder(Scene):
     9.81
     """
 
-    mass: float = parameter(1.0, "kg", above=0.0)
-    shell_radius: float = parameter(0.5, "m", above=0.0)
-    radius: float = parameter(0.1, "m", above=0.0)
+    mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
+    shell_radius: float = parameter(0.5, "m", above=0.0, usable=(1e-5, 1e5))
+    radius: float = parameter(0.1, "m", above=0.0, usable=(1e-5, 1e5))
     inertia: float = parameter(
-        lambda shell: 0.5 * shell.mass * shell.radius * shell.radius, "kg m²", least=0.0
+        lambda shell: 0.5 * shell.mass * shell.radius * shell.radius, "kg m²", least=0.0, usable=(0.0, 1e18)
     )
-    damping: float = parameter(0.0, "N m s", least=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
     control: str = "tilt"
 
     coordinates = {"theta": "rad"}

@@ -63,19 +63,22 @@ class Incline(Scene):
     0.653
     """
 
-    mass: float = parameter(1.0, "kg", above=0.0)
-    radius: float = parameter(0.05, "m", above=0.0)
+    mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
+    radius: float = parameter(0.05, "m", above=0.0, usable=(1e-5, 1e5))
     inertia: float = parameter(
-        lambda incline: 0.5 * incline.mass * incline.radius * incline.radius, "kg m²", least=0.0
+        lambda incline: 0.5 * incline.mass * incline.radius * incline.radius,
+        "kg m²",
+        least=0.0,
+        usable=(0.0, 1e18),
     )
-    damping: float = parameter(0.0, "N s/m", least=0.0)
+    damping: float = parameter(0.0, "N s/m", least=0.0, usable=(0.0, 1e9))
     tilt: float | None = parameter(
         lambda incline: 0.26 if incline.control == "damping" else None,
         "rad",
         least=-math.pi / 2,
         most=math.pi / 2,
     )
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
     control: str = "damping"
 
     coordinates = {"x": "m"}

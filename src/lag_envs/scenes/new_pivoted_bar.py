@@ -59,14 +59,17 @@ class PivotedBar(Scene):
     -5.0
     """
 
-    mass: float = parameter(0.2, "kg", above=0.0)
-    com_distance: float = parameter(0.3, "m", above=0.0)
+    mass: float = parameter(0.2, "kg", above=0.0, usable=(1e-6, 1e6))
+    com_distance: float = parameter(0.3, "m", above=0.0, usable=(1e-5, 1e5))
     inertia: float = parameter(
-        lambda bar: bar.mass * bar.com_distance * bar.com_distance / 3.0, "kg m²", least=0.0
+        lambda bar: bar.mass * bar.com_distance * bar.com_distance / 3.0,
+        "kg m²",
+        least=0.0,
+        usable=(0.0, 1e18),
     )
-    damping: float = parameter(0.0, "N m s", least=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
-    track: float | None = parameter(0.5, "m", above=0.0, infinite=True, optional=True)
+    damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
+    track: float | None = parameter(0.5, "m", above=0.0, endless=True, optional=True)
 
     coordinates = {"theta": "rad"}
     prescribed = {"s": "m", "rise": "m"}
