@@ -96,6 +96,9 @@ class Machine:
     def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
         return self._b.select(condition, a, b)
 
+    def either(self, a: Any, b: Any) -> ir.Value:
+        return self._b.or_(a, b)
+
     def all(self, condition: Any) -> ir.Value:
         if self._lanes == 1:
             return condition
@@ -258,7 +261,7 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    t = Machine(builder, step.slots * STRIDE + 1, lanes, fused)
+    t = Machine(builder, step.slots * STRIDE + 2, lanes, fused)
 
     def pointer(row: int) -> ir.Value:
         return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())
