@@ -87,7 +87,7 @@ class Target(Protocol):
     def store(self, slot: int, k: Any, value: Any) -> None: ...
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list: ...
     def repeat(self, times: int, carried: Sequence, body: Callable) -> list: ...
-    def when(self, condition: Any, body: Callable) -> None: ...
+    def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list: ...
     def elementary(self, name: str, x: Any) -> Any: ...
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]: ...
 
@@ -487,24 +487,23 @@ class Series:
         start = self.expand(t, inputs, q, v, h, order)
         certificate = Certificate(self, t, start, h, order, tolerance)
         one = t.number(1.0)
-        for k in (0, 1):
-            t.store(self.slots, t.index(k), one)
+
+        def going(passed: Any) -> Any:
+            return t.negated(t.all(passed if wanted is None else t.either(passed, t.negated(wanted))))
 
         def retry(count: Any, carried: Sequence) -> tuple[Any, list]:
-            part, power = (t.load(self.slots, t.index(k)) for k in (0, 1))
+            passed, part, power, *_ = carried
+            part, power = certificate.shorten(passed, part, power)
             passed, bounds = certificate.check(part, power)
-            over = t.all(passed if wanted is None else t.either(passed, t.negated(wanted)))
+            return going(passed), [passed, part, power, *bounds]
 
-            def shorten() -> None:
-                for k, number in enumerate(certificate.shorten(passed, part, power)):
-                    t.store(self.slots, t.index(k), number)
+        def shorten() -> list:
+            passed, part, _, *bounds = t.repeat(TRIES, [done, one, one, *bounds_of_all], retry)
+            self.shorten(t, part, order)
+            return [passed, part, *bounds]
 
-            t.when(t.negated(over), shorten)
-            return t.negated(over), [passed, part, *bounds]
-
-        none = [t.number(math.inf)] * self.size
-        done, part, *bounds = t.repeat(TRIES, [t.less(one, one), one, *none], retry)
-        t.when(t.negated(t.all(t.negated(t.less(part, one)))), lambda: self.shorten(t, part, order))
+        done, bounds_of_all = certificate.check()
+        done, part, *bounds = t.when(going(done), shorten, [done, one, *bounds_of_all])
         h = t.mul(h, part)
         q, v = self.advance(t, q, h, order)
         for x in (*q, *v):  # what overflows is not done
@@ -596,22 +595,23 @@ class Certificate:
         self._per_next = t.reciprocal(t.plus(order, 1))
         self._measure()
 
-    def check(self, part: Any, power: Any) -> tuple[Any, list]:
-        """Tell whether a part of the step is certified, and return the bounds on what v leaves out.
+    def check(self, part: Any = None, power: Any = None) -> tuple[Any, list]:
+        """Tell whether the step, or a part of it, is certified, and return the bounds on what v leaves out.
 
-        A part f <= 1 makes Σ' |x_k| at most f times as large and overlaps, sums of orders from N on, f^N times.
+        A part f < 1 makes Σ' |x_k| at most f times as large, and overlaps, sums of orders from N on, f^N times.
 
         Parameters
         ----------
-        part, power : number
+        part, power : number, optional
             The part, and its N-th power.
         """
         t, n = self._t, self._n
-        self._fine = self._start.inverse.definite
-        self._h = t.mul(self._whole, part)
-        self._later = {slot: t.mul(part, x) for slot, x in self._norms.items()}
+        self._fine, self._power = self._start.inverse.definite, power
+        self._h, self._later = self._whole, self._norms
+        if part is not None:
+            self._h = t.mul(self._whole, part)
+            self._later = {slot: t.mul(part, x) for slot, x in self._norms.items()}
         self._all = {slot: t.add(x, self._size(slot, t.index(0))) for slot, x in self._later.items()}
-        self._power = power
         self._sizes = self._find_sizes()
         self._rest = [t.mul(self._tolerance, size) for size in self._sizes]
         self._tails: dict[int, Any] = {}
@@ -713,7 +713,11 @@ class Certificate:
         self._overlaps |= dict(zip(pairs, found[len(upper) :], strict=True))
 
     def _overlap(self, key: Any) -> Any:
-        return self._t.mul(self._power, self._overlaps[self._series._pairs[key]])
+        return self._powered(self._overlaps[self._series._pairs[key]])
+
+    def _powered(self, x: Any) -> Any:
+        """Return what terms of order N and above, of this size together, are in the part of the step."""
+        return x if self._power is None else self._t.mul(self._power, x)
 
     def _norm(self, n: int) -> Any:
         return self._all[self._series._factor(n).slot]
@@ -741,7 +745,7 @@ class Certificate:
     def _integrated(self, slot: int, tail: Any) -> Any:
         """Return h(|x_{N-1}| + E_x)/N, a bound on the tail of the series that has hx for its derivative."""
         t = self._t
-        last = t.mul(t.mul(self._whole, self._power), self._last_but_one(slot))
+        last = t.mul(self._powered(self._whole), self._last_but_one(slot))
         return t.mul(self._per, t.fma(self._h, tail, last))
 
     def _tail(self, n: int) -> Any:
@@ -751,7 +755,7 @@ class Certificate:
         op, args = node.op, node.args
         if op in ("place", "velocity"):
             slot = series._slots["v", node.index]
-            tail = t.fma(self._power, self._size(slot, self._order), self._rest[node.index])
+            tail = t.add(self._powered(self._size(slot, self._order)), self._rest[node.index])
             return tail if op == "velocity" else self._integrated(slot, tail)
         if op == "polynomial":
             return t.number(0.0)
@@ -828,7 +832,7 @@ class Plain:
     """
 
     def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
-        self._memory: list[dict[int, Any]] = [{} for _ in range(slots + 1)]
+        self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
         self.number = number
         self._functions: Any = None
         if xp is not None:
@@ -927,9 +931,8 @@ class Plain:
                 break
         return values
 
-    def when(self, condition: bool, body: Callable) -> None:
-        if condition:
-            body()
+    def when(self, condition: bool, body: Callable, otherwise: Sequence) -> list:
+        return body() if condition else list(otherwise)
 
     def elementary(self, name: str, x: Any) -> Any:
         if self._functions is not None:
