@@ -96,6 +96,9 @@ class Machine:
     def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
         return self._b.select(condition, a, b)
 
+    def either(self, a: Any, b: Any) -> ir.Value:
+        return self._b.or_(a, b)
+
     def all(self, condition: Any) -> ir.Value:
         if self._lanes == 1:
             return condition
@@ -195,9 +198,17 @@ class Machine:
         for phi, value in zip(phis, values, strict=True):
             phi.add_incoming(value, self._b.basic_block)
 
-    def when(self, condition: Any, body: Callable) -> None:
-        with self._b.if_then(condition):
-            body()
+    def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list:
+        b = self._b
+        start = b.basic_block
+        with b.if_then(condition):
+            values = body()
+            last = b.basic_block
+        phis = [b.phi(value.type) for value in otherwise]
+        for phi, value, other in zip(phis, values, otherwise, strict=True):
+            phi.add_incoming(value, last)
+            phi.add_incoming(other, start)
+        return phis
 
     def elementary(self, name: str, x: Any) -> ir.Value:
         operations, result = series.elementary(name, self._fused)
@@ -258,7 +269,7 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    t = Machine(builder, step.slots * STRIDE + 1, lanes, fused)
+    t = Machine(builder, step.slots * STRIDE, lanes, fused)
 
     def pointer(row: int) -> ir.Value:
         return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())
@@ -330,7 +341,7 @@ def _write_tangent(
     set.add(function.attributes, "noinline")
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    plain = Machine(builder, step.slots * (width + 1) * STRIDE + 1, 1, True)
+    plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
     t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
 
     def at(row: int) -> ir.Value:
