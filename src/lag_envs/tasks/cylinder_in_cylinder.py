@@ -468,7 +468,8 @@ class Damping(Task):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md).
 
     ## Optimal Value
 

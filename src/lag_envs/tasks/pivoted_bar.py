@@ -115,8 +115,8 @@ class SwingUp(Task):
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
-    s and s' are exact to rounding.
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md). s and s' are exact to rounding.
 
     ## Optimal Value
 
@@ -317,8 +317,8 @@ class Balance(SwingUp):
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
-    s and s' are exact to rounding.
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md). s and s' are exact to rounding.
 
     ## Optimal Value
 
