@@ -21,9 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from lag_envs.stepping.cache import jit
 
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
@@ -135,7 +136,7 @@ def stretched(low: float, centre: float, high: float, cells: int, scale: float) 
     return nodes
 
 
-@numba.njit(cache=True)
+@jit
 def _interpolated(values: Any, cell: int, place: Any, strides: Any) -> float:
     """Return the value at a place in a cell; `values` is flat."""
     p, q = place[0], place[1]
@@ -156,7 +157,7 @@ def _interpolated(values: Any, cell: int, place: Any, strides: Any) -> float:
     return low + p * (high - low)
 
 
-@numba.njit(cache=True)
+@jit
 def interpolate_rows(values: Any, times: Any, cells: Any, places: Any, strides: Any) -> Any:
     """Return for each row the value at its place in ``values[times[i]]``; a cell below 0 is worth 0."""
     out = np.zeros(len(cells))
@@ -166,7 +167,7 @@ def interpolate_rows(values: Any, times: Any, cells: Any, places: Any, strides: 
     return out
 
 
-@numba.njit(cache=True)
+@jit
 def carried(x: Any, nodes: Any, own: Any, others: Any) -> Any:
     """Carry each x from its own axis, ``nodes[own[i]]``, to the same place among the nodes `others`."""
     out = np.empty(len(x))
@@ -222,7 +223,7 @@ def transitions(grid: Grid, actions: Array, step: Step) -> Transitions:
     return result
 
 
-@numba.njit(cache=True)
+@jit
 def _sweep(cells: Any, places: Any, rewards: Any, strides: Any, after: Any, values: Any, best: Any) -> None:
     """Write the value before a step, and the number of the best action, given the value after it."""
     for i in range(cells.shape[0]):
@@ -237,7 +238,7 @@ def _sweep(cells: Any, places: Any, rewards: Any, strides: Any, after: Any, valu
         best[i] = arg
 
 
-@numba.njit(cache=True)
+@jit
 def _expect(weights: Any, cells: Any, places: Any, strides: Any, values: Any, expected: Any) -> None:
     """Write the expectation over the outcomes of a kick at each node."""
     for i in range(cells.shape[1]):

@@ -218,15 +218,26 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
 # --- the scale of scores ---
 
 
-def test_scale_measures_what_is_in_use(monkeypatch, capsys):
+def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(scale, "BATCH", 500)
-    monkeypatch.setattr(scale, "FEW", 20)
-    assert scale.main(["InclineBrake-v0", "--batches", "2"]) == 0
+    file = tmp_path / "scale.json"
+    assert scale.main(["InclineBrake-v0", "--batches", "2", "--output", str(file)]) == 0
+    found = json.loads(file.read_text())["envs"]["InclineBrake-v0"]
+    assert list(found) == ["random", "switching line", "reference", "optimum"]
+    assert {row["episodes"] for row in found.values()} == {1000}
+    # The same starts: so little is lost by acting at intervals.
+    assert 0.0 < found["optimum"]["mean"] - found["switching line"]["mean"] < 4e-4
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 2
+    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 4
     for line in lines:
         mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
         assert abs(mean - used) < 5.0 * error
     assert scale.main(["CylinderInCylinderPump-v0", "--quick"]) == 0
     assert "optimal" not in capsys.readouterr().out
+    monkeypatch.setitem(scale.SLOW, "iLQR", 20)
+    assert scale.main(["CylinderInCylinderTilt-v0", "--batches", "1", "--output", str(file)]) == 0
+    assert list(json.loads(file.read_text())["envs"]) == ["InclineBrake-v0", "CylinderInCylinderTilt-v0"]
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if " iLQR " in line)
+    mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
+    assert abs(mean - used) < 5.0 * error < 1.0
     assert scale.main(["InclineBrak-v0"]) == 2 and scale.main(["--batches", "0"]) == 2

@@ -1,13 +1,9 @@
-"""The pieces of compiled code: the exponential, the random generator, compiling without a cache folder."""
+"""The pieces of compiled code: the exponential, the random generator."""
 
 import math
-import os
-import subprocess
-import sys
 
 import mpmath
 import numpy as np
-import pytest
 
 from lag_envs.stepping.compiling import compile_traced
 from lag_envs.stepping.primitives import episode_key, uniform
@@ -47,16 +43,3 @@ def test_random_numbers_are_uniform_and_uncorrelated():
     assert abs(draws.mean() - 0.5) < 0.01
     assert abs(draws.var() - 1 / 12) < 0.003
     assert np.abs(np.corrcoef(draws)[np.triu_indices(200, 1)]).max() < 0.4
-
-
-@pytest.mark.parametrize("environment", ["PivotedBar-v0"])
-def test_works_where_no_cache_folder_can_be_written(environment):
-    code = (
-        "from numba.core.caching import CacheImpl; CacheImpl._locator_classes = [];"
-        f"import gymnasium as gym, lag_envs; env = gym.make({environment!r});"
-        "env.reset(seed=1); print(env.step(env.action_space.sample())[0].shape)"
-    )
-    path = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    run = subprocess.run([sys.executable, "-c", code], env=path, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    assert run.stdout.split() == ["(5,)"]

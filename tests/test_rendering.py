@@ -176,6 +176,7 @@ def test_shell_turns_by_the_integral_of_its_rate():
         ("InclineTilt-v0", {"radius": 1e-9}),
         ("InclineBrake-v0", {"tilt": 0.0}),
         ("InclineBrake-v0", {"tilt": 1.5}),
+        ("InclineBrake-v0", {"tilt": math.pi / 2}),
         ("InclineBrake-v0", {"radius": 1e6}),
         ("InclineBrake-v0", {"radius": 1e-9}),
         ("CylinderInCylinderTilt-v0", {"radius": 0.4999}),
@@ -188,6 +189,12 @@ def test_unusual_parameters_are_drawn_too(env_id, options):
     frame = pygame.surfarray.array3d(rendering.paint(task, moment(task)))
     assert time.process_time() - start < 0.5
     assert frame.std() > 0.0
+
+
+@pytest.mark.parametrize("tilt", [0.5, 0.8, math.pi / 2])
+def test_a_steep_plane_has_its_ground_too(tilt):
+    frame = picture("InclineBrake-v0", tilt=tilt)
+    assert np.all(frame == (0xE3, 0xE3, 0xE3), axis=-1).mean() > 0.15
 
 
 def test_far_away_start_stays_in_the_picture():

@@ -44,13 +44,31 @@ ONE_THREAD = {
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
-#: What a cold start does, from the start of the process on.
+#: What a cold start does after the start of the process, in stages; prints the seconds of each.
 COLD_START = """
-import gymnasium, lag_envs
+from time import perf_counter
+times = [perf_counter()]
+import numpy
+times.append(perf_counter())
+import gymnasium
+times.append(perf_counter())
+import numba
+times.append(perf_counter())
+import lag_envs
 env = gymnasium.make({id!r})
+times.append(perf_counter())
 env.reset(seed=1)
+times.append(perf_counter())
 env.step(env.action_space.sample())
+times.append(perf_counter())
+gymnasium.make({id!r})
+times.append(perf_counter())
+print(*(b - a for a, b in zip(times, times[1:])))
 """
+STAGES = (
+    "Python's own start and end", "import numpy", "import gymnasium", "import numba",
+    "import lag_envs, gym.make", "reset", "step", "gym.make again",
+)  # fmt: skip
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -70,9 +88,14 @@ class Target(NamedTuple):
         return f"{self.kind}, {self.num_envs:,}" if self.kind == "vector" else f"single, {self.kind}"
 
 
-TARGETS = (Target("made", 1, 2.0), Target("vector", 64, 6.0), Target("vector", 16384, 3.0))
-#: Seconds from the start of a process to its first step, by state of Numba's cache.
-COLD_TARGETS = {"empty": 2.5, "filled": 1.2}
+TARGETS = (
+    Target("made", 1, 2.0),
+    Target("vector", 64, 6.0),
+    Target("vector", 1024, 3.0),
+    Target("vector", 16384, 3.0),
+)
+#: Seconds from the start of a process to its end after one step, by state of the cache of compiled code.
+COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 
 @dataclass
@@ -88,6 +111,7 @@ class Settings:
     cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
     date: str = ""
     output: str | None = None
+    checkout: str | None = None  #: whose docs and README take the result over
 
 
 @dataclass
@@ -274,11 +298,12 @@ PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
 def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
     rows = contestants(settings.ids, settings.sizes) if settings.speed else []
-    cold: dict[str, list[float]] = {}
+    stages: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
-        complete = cold_starts(settings.ids[0], settings.cold_starts, cold)
+        complete = cold_starts(settings.ids[0], settings.cold_starts, stages)
+    cold = {name: [sum(one) for one in many] for name, many in stages.items()}
     results = [summary(row, rows) for row in rows]
     report: dict[str, Any] = {
         "date": settings.date,
@@ -288,16 +313,25 @@ def bench(settings: Settings) -> dict[str, Any]:
         "settings": asdict(settings),
         "rows": results,
         "cold_start": {
-            name: {"seconds": times, "median": quartiles(times)[1]} for name, times in cold.items()
+            name: {
+                "seconds": times,
+                "median": quartiles(times)[1],
+                "stages": {
+                    stage: quartiles(part)[1]
+                    for stage, part in zip(STAGES, zip(*stages[name], strict=True), strict=True)
+                },
+            }
+            for name, times in cold.items()
         },
     }
     report["targets"] = verdicts(results, cold)
     print("\n".join(table(report)))
     if settings.output:
-        Path(settings.output).write_text(
-            json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-        )
+        Path(settings.output).write_text(to_json(report), encoding="utf-8")
         print(f"written to {settings.output}")
+    if settings.checkout and complete:
+        take_over(report, Path(settings.checkout))
+        print(f"written to docs/speed.json and README.md in {settings.checkout}")
     return report
 
 
@@ -356,8 +390,8 @@ def rate(run: Run, steps: int, clock: Clock) -> float:
     return taken / (clock() - start)
 
 
-def cold_starts(id: str, count: int, times: dict[str, list[float]]) -> bool:
-    """Time whole processes up to the first step into `times`; return False where the user broke it off."""
+def cold_starts(id: str, count: int, times: dict[str, list[list[float]]]) -> bool:
+    """Time the stages of whole processes into `times`; return False where the user broke it off."""
     empty = (count + 1) // 2
     with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
         try:
@@ -372,12 +406,16 @@ def cold_starts(id: str, count: int, times: dict[str, list[float]]) -> bool:
     return True
 
 
-def cold_start(id: str, cache: str) -> float:
-    """Return the seconds that a process takes from its start to its end after one step."""
+def cold_start(id: str, cache: str) -> list[float]:
+    """Return the seconds of each of `STAGES` of a process that takes one step."""
     command = [sys.executable, "-P", "-c", COLD_START.format(id=id)]
     start = time.perf_counter()
-    subprocess.run(command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True)
-    return time.perf_counter() - start
+    done = subprocess.run(
+        command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True, text=True
+    )
+    total = time.perf_counter() - start
+    stages = list(map(float, done.stdout.split()))
+    return [total - sum(stages), *stages]
 
 
 @contextmanager
@@ -533,14 +571,100 @@ def table(report: dict[str, Any]) -> list[str]:
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
-        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}"]
-    if report["cold_start"]:
-        lines += [""]
+        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}; median of each stage, ms:"]
+        rows = [(f"  {stage}", f"{1e3 * seconds:.1f}") for stage, seconds in cold["stages"].items()]
+        lines += [*columns(rows), ""]
     words = {True: "met", False: "missed", None: "not measured"}
     lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
     if not report["complete"]:
         lines += ["", "broken off: these are the samples until then"]
     return lines
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """Return README's table: every environment at the sizes of `TARGETS`; what misses its aim is marked.
+
+    Parameters
+    ----------
+    report : dict
+        What `bench` returns; of these sizes, with CartPole-v1 among them.
+    """
+    rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
+    rival = ("gymnasium", "CartPole-v1")
+
+    def cell(library: str, id: str, target: Target) -> str:
+        row = rows[library, id, target.kind, target.num_envs]
+        if "steps_per_second" not in row:
+            return row["problem"] or "not measured"
+        time = 1e9 / row["steps_per_second"][1]
+        text = f"{time:,.0f} ns" if time >= 99.5 else f"{time:.3g} ns"
+        if (library, id) == rival:
+            return text
+        ratio = row["ratio"][1]
+        return f"{text}, {ratio:.1f}×" if ratio >= target.ratio else f"{text}, **{ratio:.2f}×, missed**"
+
+    sizes = ["1 (`gym.make`)" if t.kind == "made" else f"{t.num_envs:,} at once" for t in TARGETS]
+    lines = [
+        ["id", *sizes],
+        ["---"] * (1 + len(sizes)),
+        *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in _ours(report)),
+        ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
+        ["*aim*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
+    ]
+    machine, settings = report["machine"], report["settings"]
+    parts = [
+        "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
+        f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
+        f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
+        "\n".join("| " + " | ".join(line) + " |" for line in lines),
+    ]
+    if cold := report["cold_start"]:
+        starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
+        parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
+    return "\n\n".join(parts)
+
+
+def claim(report: dict[str, Any]) -> str:
+    """Return README's sentence on speed: the ranges of its table, and how many aims are missed."""
+    rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
+    found = [
+        sorted(row["ratio"][1] for row in rows if (row["kind"], row["num_envs"]) == target[:2])
+        for target in TARGETS
+    ]
+    places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
+    ranges = ", ".join(
+        f"{place} {ratios[0]:.3g} to {ratios[-1]:.3g} times"
+        for place, ratios in zip(places, found, strict=True)
+        if ratios
+    )
+    missed = sum(
+        ratio < target.ratio for target, ratios in zip(TARGETS, found, strict=True) for ratio in ratios
+    )
+    aims = f"{missed} of {sum(map(len, found))} aims are missed" if missed else "all aims are met"
+    return (
+        "- Fast: a step, observation, reward, endings and resets included, is quicker than one of Gymnasium's"
+        f" `CartPole-v1`: {ranges}; {aims}. See [Speed](#speed)."
+    )
+
+
+def _ours(report: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(row["id"] for row in report["rows"] if row["library"] == "lag_envs"))
+
+
+def take_over(report: dict[str, Any], checkout: Path) -> None:
+    """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
+    from lag_envs.report.docs import replaced
+
+    (checkout / "docs" / "speed.json").write_text(to_json(report), encoding="utf-8")
+    readme = checkout / "README.md"
+    text = replaced(readme.read_text(encoding="utf-8"), "bench", markdown(report))
+    readme.write_text(replaced(text, "fast", claim(report)), encoding="utf-8")
+
+
+def to_json(report: dict[str, Any]) -> str:
+    """Return a report as JSON, with lists of numbers on a line."""
+    text = json.dumps(report, indent=1, allow_nan=False)
+    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.envs.program import Program, constants_of
+from lag_envs.envs.program import constants_of, program_for
 from lag_envs.envs.single import absent
 from lag_envs.scenes.base import real_array
 from lag_envs.tasks.base import Task
@@ -39,7 +39,7 @@ class Model:
     def __init__(self, task: Task) -> None:
         self.task = task
         constants = constants_of(task)
-        program = Program(task, absent=absent([constants]))
+        program = program_for(task, absent([constants]))
         self._constants = SimpleNamespace(**constants)
         self._numbers = np.array([constants[name] for name in program.uniform])
         self._step = program.model

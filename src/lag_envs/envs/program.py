@@ -17,6 +17,8 @@ blocks and so stay in the processor's nearest cache.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -38,6 +40,25 @@ def constants_of(task: Task) -> dict[str, float]:
         f"half{i}": h for i, h in enumerate(task.start)
     }
     return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+
+
+def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
+    """Return the program of a task: one for all tasks that differ in `constants_of` only."""
+    scene = task.scene
+    values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
+    choices = [math.isinf(v) if isinstance(v, float) else repr(v) for v in values]
+    # Formulas may also name attributes of the task, which somebody may have set by hand.
+    own = [(name, repr(v)) for name, v in vars(task).items() if name not in _NUMBERS]
+    shared = [v for c in type(task).__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+    parts = (type(task), type(scene), task.variant, absent, varying, *choices, *own, *shared)
+    if parts not in _programs:
+        _programs[parts] = Program(task, absent, varying)
+    return _programs[parts]
+
+
+#: Attributes of a task whose numbers reach its code as constants, if at all.
+_NUMBERS = {"scene", "dt", "duration", "target"}
+_programs: dict[tuple, Program] = {}
 
 
 class Program:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from lag_envs.leaderboard.protocol import TINY
+from lag_envs.stepping.cache import jit
 
 
-@numba.njit(cache=True)
+@jit
 def affine(x: Any, weight: Any, bias: Any) -> Any:
     """Return x @ weight + bias for x (n, i), weight (i, o), bias (o,)."""
     n, wide = len(x), weight.shape[1]
@@ -31,7 +31,7 @@ def affine(x: Any, weight: Any, bias: Any) -> Any:
     return out
 
 
-@numba.njit(cache=True)
+@jit
 def interpolate(values: Any, strides: Any, cells: Any, places: Any) -> Any:
     """Return the multilinear interpolation of flat values.
 

@@ -59,23 +59,35 @@ def parameter(
     above: float | None = None,
     least: float | None = None,
     below: float | None = None,
+    most: float | None = None,
+    usable: tuple[float, float] = (-math.inf, math.inf),
 ) -> Any:
-    """Declare a physical parameter: default, unit, and the range that it must lie in."""
-    return dataclasses.field(
-        default=default, metadata={"unit": unit, "above": above, "least": least, "below": below}
-    )
+    """Declare a physical parameter: default, unit, and the range that it must lie in.
+
+    In the narrower range `usable` an environment can be used, whatever its other parameters, see
+    `Task.usable`; a scene alone may be stepped beyond it.
+    """
+    limits = {"above": above, "least": least, "below": below, "most": most}
+    return dataclasses.field(default=default, metadata={"unit": unit, "usable": usable} | limits)
 
 
-def check_number(name: str, value: Any, unit: str = "") -> float:
-    """Return the value as a finite float, or raise a ValueError that names it."""
-    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
-        raise ValueError(f"{name} must be a real number, got {value!r}")
+def shown(value: Any) -> str:
+    """Return a value as an error shows it, long ones cut short."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:150]}... ({len(text)} characters)"
+
+
+def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False) -> float:
+    """Return the value as a finite float, infinity too where it may be `endless`; else raise a ValueError."""
+    if type(value) is np.ndarray and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, numbers.Real):
+        raise ValueError(f"{name} must be a real number, got {shown(value)}")
     try:
         number = float(value)
     except OverflowError:  # an integer may be too large
-        number = math.inf
-    if not math.isfinite(number):
+        number = math.nan
+    if not math.isfinite(number) and not (endless and value == math.inf):
         raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
     return number
 
@@ -85,10 +97,17 @@ def real_array(name: str, values: ArrayLike) -> Array:
     try:
         array = np.array(values)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} must be real numbers, got {values!r}") from error
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must be real numbers, got {values!r}")
+        raise ValueError(f"{name} must be real numbers, got {shown(values)}") from error
+    if array.dtype.kind not in "fiu" or is_masked(values):
+        raise ValueError(f"{name} must be real numbers, got {shown(values)}")
     return array.astype(np.float64)
+
+
+def is_masked(values: Any) -> bool:
+    """Tell whether values are or hold a masked array, whose masked numbers NumPy would take for valid."""
+    if isinstance(values, list | tuple):
+        return any(map(is_masked, values))
+    return isinstance(values, np.ndarray) and hasattr(values, "mask")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -225,7 +244,7 @@ class Scene(ABC):
         array = real_array("state", state)
         if array.shape != (len(self.state_names),):
             raise ValueError(
-                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+                f"state must be ({', '.join(self.state_names)}), got shape {array.shape}: {shown(state)}"
             )
         if not np.isfinite(array).all():
             raise ValueError(
@@ -270,7 +289,9 @@ class Scene(ABC):
         """
         controls = self.check_control(controls)
         if controls.ndim != 1:
-            raise ValueError(f"controls must have shape (T,), got {controls.shape}")
+            raise ValueError(
+                f"controls must have shape (T,), got shape {controls.shape}: {shown(controls.tolist())}"
+            )
         dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)
@@ -395,15 +416,27 @@ class Scene(ABC):
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
-        y, u, k = (
-            self.lift(self.check_state(state)),
-            check_number("control", control),
-            SimpleNamespace(**self.constants()),
-        )
-        coefficients = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
-        return pendulum.truncation_bound(
-            float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order
-        )
+        omega, drive = self._pendulum(state, control)
+        return pendulum.truncation_bound(omega, drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def certified_speed(self, state: ArrayLike, control: float, dt: float) -> float | None:
+        """Return the |θ'| up to which one series per step is certified, if the rest is as given [rad/s].
+
+        Up to it, and not beyond, `truncation_bound` reports one substep, which leaves out at most 1e-12
+        rad/s. It is below 0 where drive, drag or field are too strong for one series at any speed, and None
+        for a scene that is not stepped by one.
+        """
+        if self.flow.coefficients is not pendulum.Drive:
+            return None
+        _, drive = self._pendulum(state, control)
+        return pendulum.certified_speed(drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def _pendulum(self, state: ArrayLike, control: float) -> tuple[float, pendulum.Drive]:
+        """Return θ' and the coefficients of the normal form."""
+        y, u = self.lift(self.check_state(state)), check_number("control", control)
+        k = SimpleNamespace(**self.constants())
+        drive = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
+        return float(self.unpack(y, u, k)[1]), drive
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
@@ -415,11 +448,12 @@ class Scene(ABC):
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
     number = check_number(field.name, value, unit)
-    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
     for rule, limit, broken in (
         ("above", above, above is not None and not number > above),
         ("at least", least, least is not None and not number >= least),
         ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
         ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
         ("at most", 1.0 / SMALLEST, number > 1.0 / SMALLEST),
     ):
@@ -438,8 +472,12 @@ def check_step(dt: Any) -> float:
     return dt
 
 
-def friction_ratio(friction: Any, normal: Any) -> Any:
-    """Return |F|/N; infinite where the contact carries nothing or pulls."""
+#: A normal force of this share of the weight is a rounding of zero, as on a vertical plane.
+NO_LOAD = 1e-12
+
+
+def friction_ratio(friction: Any, normal: Any, weight: float) -> Any:
+    """Return |F|/N; infinite where the contact pulls, or carries nothing but a rounding of the weight."""
     friction, normal = np.broadcast_arrays(np.abs(friction), normal)
     out = np.full(normal.shape, np.inf)
-    return np.divide(friction, normal, out=out, where=normal > 0.0)[()]
+    return np.divide(friction, normal, out=out, where=normal > NO_LOAD * weight)[()]

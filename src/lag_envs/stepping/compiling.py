@@ -70,11 +70,11 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
 
     Notes
     -----
-    Numba's disk cache knows a function by file, name, line and bytecode, not by its constants or by
-    what it calls. The name therefore carries a digest of the source, the constants and every helper's
-    name, which carries its own, and so on down.
+    The name carries a digest of the source, the constants and every helper's name, which carries its own,
+    and so on down: all that the compiled code depends on, and so what the cache knows it by.
     """
     from lag_envs.stepping import primitives
+    from lag_envs.stepping.cache import jit
 
     parts = [
         inspect.getsource(primitives),
@@ -84,13 +84,12 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     ]
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     unique = f"{name}_{digest}"
-    # Under this file's name the cache finds a folder to write to and a date to check.
-    code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), __file__, "exec")
+    code = compile(source.replace(f"def {name}(", f"def {unique}(", 1), f"<{unique}>", "exec")
     namespace: dict[str, Any] = dict(primitives.NAMES, **constants, __name__=__name__)
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
     namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)
-    return primitives.jit(namespace[unique])
+    return jit(namespace[unique], unique)
 
 
 def compile_python(name: str, function: Callable, *helpers: Callable, **constants: float) -> Callable:

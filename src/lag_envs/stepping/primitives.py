@@ -17,7 +17,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
@@ -173,15 +172,6 @@ def _exp(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
         p = b.fma(p, r, number(1.0 / math.factorial(k)))
     exponent = b.shl(b.add(b.fptosi(n, _INT), ir.Constant(_INT, 1023)), ir.Constant(_INT, 52))
     return b.fmul(p, b.bitcast(exponent, _DOUBLE))
-
-
-def jit(function: Callable) -> Callable:
-    """Compile a function, cached on disk where a place can be written to."""
-    options = {"error_model": "numpy", "nogil": True}
-    try:
-        return numba.njit(function, cache=True, **options)
-    except RuntimeError:  # no writable cache folder: compile anew in every process
-        return numba.njit(function, **options)
 
 
 #: What the source of a compiled function may name.

@@ -1,0 +1,294 @@
+"""Compiled functions on disk, one file each, checked before they are used.
+
+Numba's own cache believes its files. A file that lost a byte, be it to a full disk, a killed process or an
+editor, then gives an error deep inside pickle or LLVM, or runs as it is. Here a file begins with what it was
+compiled from and with a digest of its content, and one that does not match is dropped and compiled anew.
+A cache that cannot be written to is done without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import inspect
+import os
+import re
+import stat
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+#: Bytes that the cache may take; what has not been used for longest goes first.
+LIMIT = 256 * 2**20
+
+_MAGIC = b"lag_envs 1"
+_SUFFIX = ".compiled"
+_DAY = 86400.0
+#: The latest Numba that was seen to run loaded code.
+_KNOWN = (0, 68)
+_warned = False
+
+
+class Damaged(Exception):
+    """A file that is not what was written."""
+
+
+class Entry(NamedTuple):
+    """A file of the cache: its path, its size in bytes, and when it was used last (to a day)."""
+
+    path: Path
+    size: int
+    used: float
+
+
+def folder() -> Path | None:
+    """Return where compiled functions are kept; None where there is no such place.
+
+    That is ``lag_envs`` in the folder named by the environment variable ``NUMBA_CACHE_DIR``, or else in the
+    place for caches that the system gives the user.
+    """
+    named = os.environ.get("NUMBA_CACHE_DIR") or (
+        os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
+    )
+    try:
+        parent = (
+            Path(named).expanduser()
+            if named
+            else Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+        )
+        return parent.absolute() / "lag_envs"
+    except (OSError, RuntimeError):  # no home
+        return None
+
+
+def entries(place: Path) -> list[Entry]:
+    """Return the files in a cache's folder, those used last first; leftovers of killed processes too."""
+    found = []
+    with contextlib.suppress(OSError):
+        for item in os.scandir(place):
+            if item.name.endswith(_SUFFIX):
+                with contextlib.suppress(OSError):
+                    status = item.stat(follow_symlinks=False)
+                    found.append(Entry(Path(item.path), status.st_size, status.st_mtime))
+    return sorted(found, key=lambda entry: entry.used, reverse=True)
+
+
+def clear(place: Path) -> int:
+    """Remove all files, and return how many there were."""
+    return sum(_remove(entry.path) for entry in entries(place))
+
+
+def trim(place: Path, limit: int) -> None:
+    """Remove what has not been used for longest until the rest has at most `limit` bytes."""
+    total = 0
+    for entry in entries(place):
+        total += entry.size
+        if total > limit:
+            _remove(entry.path)
+
+
+def damage(path: Path) -> str:
+    """Return what is wrong with a file of the cache, or an empty string."""
+    try:
+        return "" if _read(path, None) is not None else "it cannot be read"
+    except Damaged as error:
+        return str(error)
+
+
+def writable(place: Path) -> bool:
+    """Tell whether something can be kept in a folder, which need not exist yet."""
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=place):
+            return True
+    except OSError:
+        return False
+
+
+def jit(function: Callable, key: str | None = None) -> Any:
+    """Compile a function on its first call for each combination of types, or take it from the cache.
+
+    Parameters
+    ----------
+    function : callable
+        A function that Numba can compile.
+    key : str, optional
+        What the result depends on: its own source, and that of all it calls and names. By default the file
+        that defines the function, and the numbers that it names. Types, machine, and the versions of Python
+        and Numba are added.
+
+    Returns
+    -------
+    callable
+        Numba's dispatcher.
+    """
+    import numba
+
+    dispatcher = numba.njit(function, error_model="numpy", nogil=True)
+    if key is None:
+        with contextlib.suppress(OSError, TypeError):  # typed in, not in a file
+            source = inspect.getsource(inspect.getmodule(function))  # type: ignore[arg-type]
+            known = ((name, function.__globals__.get(name)) for name in function.__code__.co_names)
+            key = repr((source, [(name, value) for name, value in known if isinstance(value, int | float)]))
+    if key is not None and not numba.config.DISABLE_JIT:
+        dispatcher._cache = _Cache(function.__name__, key)
+    return dispatcher
+
+
+class _Cache:
+    """What a dispatcher of Numba's asks before it compiles, and tells afterwards; see numba.core.caching."""
+
+    def __init__(self, name: str, key: str) -> None:
+        self._name, self._key = re.sub(r"\W", "", name), key
+        self._enabled = True
+
+    @property
+    def cache_path(self) -> str | None:
+        place = folder()
+        return None if place is None else str(place)
+
+    def enable(self) -> None:
+        self._enabled = True
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def flush(self) -> None:
+        """Forget all that was compiled from this function."""
+        for entry in entries(folder() or Path()):
+            if entry.path.name.startswith(f"{self._name}-"):
+                _remove(entry.path)
+
+    def load_overload(self, types: Any, target: Any) -> Any:
+        """Return the compiled function for these types of arguments, or None."""
+        place = folder()
+        if not self._enabled or place is None:
+            return None
+        path, key = self._entry(place, types, target.codegen())
+        try:
+            content = _read(path, key)
+            if content is not None:
+                return _rebuild(content, target)
+        except Damaged as error:
+            _remove(path)
+            _warn(path, error)
+        return None
+
+    def save_overload(self, types: Any, result: Any) -> None:
+        """Keep a compiled function; where that cannot be done nothing happens."""
+        place = folder()
+        if not self._enabled or place is None or result.lifted or result.library.has_dynamic_globals:
+            return
+        path, key = self._entry(place, types, result.codegen)
+        with contextlib.suppress(OSError):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _write(path, key, _reduce(result))
+            trim(place, LIMIT)
+
+    def _entry(self, place: Path, types: Any, codegen: Any) -> tuple[Path, bytes]:
+        """Return the file for these types on this machine, and the digest of all that it depends on."""
+        import llvmlite
+        from numba import __version__, config
+
+        settings = (config.OPT, config.BOUNDSCHECK, config.DEBUGINFO_DEFAULT)
+        machine = (sys.version, __version__, llvmlite.__version__, settings, codegen.magic_tuple())
+        parts = repr((self._name, self._key, str(types), machine))
+        key = hashlib.sha256(parts.encode()).digest()
+        return place / f"{self._name}-{key[:8].hex()}{_SUFFIX}", key
+
+
+def _reduce(result: Any) -> bytes:
+    from numba.core.serialize import dumps
+
+    return dumps(result._reduce())
+
+
+def _rebuild(content: bytes, target: Any) -> Any:
+    import pickle
+
+    from numba import __version__
+    from numba.core.compiler import CompileResult
+    from numba.core.runtime import rtsys
+
+    # Compiled code needs Numba's memory system and none of what it is compiled with; making all that ready
+    # would take longer than all the rest. What a newer Numba needs is not known.
+    if tuple(map(int, __version__.split(".")[:2])) <= _KNOWN:
+        rtsys.initialize(target)
+    else:
+        target.refresh()
+    try:
+        return CompileResult._rebuild(target, *pickle.loads(content))
+    except Exception as error:  # whole, but of another kind than this Numba reads
+        raise Damaged(f"{type(error).__name__}: {error}") from error
+
+
+def _read(path: Path, key: bytes | None) -> bytes | None:
+    """Return what was written for a key; None where nothing can be read, `Damaged` where it is not that."""
+    try:
+        with open(
+            path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))
+        ) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise Damaged("it is not a regular file")
+            if status.st_size > LIMIT:
+                raise Damaged("it is too long")
+            data = file.read()
+    except IsADirectoryError as error:
+        raise Damaged("it is a folder") from error
+    except OSError:
+        return None
+    head, digest, content = data[: len(_MAGIC) + 32], data[len(_MAGIC) + 32 :][:32], data[len(_MAGIC) + 64 :]
+    if not head.startswith(_MAGIC) or hashlib.sha256(head + content).digest() != digest:
+        raise Damaged("its digest does not match its content")
+    if key is not None and head != _MAGIC + key:
+        raise Damaged("it belongs to another function")
+    if time.time() - status.st_mtime > _DAY:
+        with contextlib.suppress(OSError):
+            os.utime(path)
+    return content
+
+
+def _open_now(path: str, flags: int) -> int:
+    """Open without waiting: a pipe in a file's place must not hang."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _write(path: Path, key: bytes, content: bytes) -> None:
+    """Write a file at once, so that whoever reads finds all of it or nothing."""
+    head = _MAGIC + key
+    descriptor, name = tempfile.mkstemp(_SUFFIX, "new-", path.parent)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(head + hashlib.sha256(head + content).digest() + content)
+        os.replace(name, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+def _remove(path: Path) -> bool:
+    """Remove a file, or an empty folder in its place, and return whether that went well."""
+    for remove in (os.unlink, os.rmdir):
+        with contextlib.suppress(OSError):
+            remove(path)
+            return True
+    return False
+
+
+def _warn(path: Path, error: Damaged) -> None:
+    """Tell of the first damaged file."""
+    global _warned
+    if not _warned:
+        _warned = True
+        warnings.warn(
+            f"compiled code in {path} is damaged: {error}; it is dropped and compiled anew. "
+            "`lag-envs cache` looks for more, `lag-envs cache --clear` drops all",
+            RuntimeWarning,
+            stacklevel=2,
+        )

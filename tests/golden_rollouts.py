@@ -1,0 +1,211 @@
+"""Roll-outs that are kept, so that whatever is rewritten later can be held against them.
+
+``python tests/golden_rollouts.py`` records them anew, into ``golden/rollouts.npz``. That is right only where
+an environment is meant to change: the file is what the package did when version 0 of its environments was
+settled. Only what a user can call is used here, so a rewrite need not touch this file.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import lag_envs
+
+GOLDEN = Path(__file__).parent / "golden" / "rollouts.npz"
+MODES = ("NextStep", "SameStep", "Disabled")
+
+#: Parameters, one per environment of a batch: mild, strong, and stiff ones side by side.
+MIXED: dict[str, dict[str, list[float]]] = {
+    "PivotedBar-v0": {"damping": [0.0, 0.5, 50.0, 0.02], "gravity": [9.81, 50.0, 9.81, 0.0]},
+    "PivotedBarFree-v0": {"com_distance": [0.3, 1e-2, 1.0, 5.0], "damping": [0.0, 0.0, 1.0, 10.0]},
+    "PivotedBarBalance-v0": {"damping": [0.0, 0.1, 50.0, 1e4], "track": [0.5, 0.6, 1.0, 0.3]},
+    "InclineTilt-v0": {"damping": [0.0, 0.03, 5.0, 1e5], "radius": [0.05, 0.1, 0.05, 0.02]},
+    "InclineBrake-v0": {"tilt": [0.0, 0.2, 1.5, 0.5], "damping": [0.0, 0.03, 0.0, 500.0]},
+    "CylinderInCylinderTilt-v0": {"radius": [0.1, 0.4, 1e-2, 0.2], "damping": [0.0, 0.24, 5.0, 1e4]},
+    "CylinderInCylinderPump-v0": {"gravity": [1.6, 9.81, 100.0, 9.81], "damping": [0.0, 0.2, 5.0, 500.0]},
+    "CylinderInCylinderDamping-v0": {"gravity": [1.6, 9.81, 100.0, 9.81], "damping": [0.0, 0.2, 5.0, 1e4]},
+}
+#: Keywords of some ids that are more than numbers.
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    "PivotedBar-v0": {"endless track": {"track": float("inf")}, "no track": {"track": None}},
+    "InclineTilt-v0": {"quasi-static": {"control": "tilt"}, "fixed target": {"target": 0.2}},
+    "CylinderInCylinderTilt-v0": {"fixed target": {"target": -0.4}},
+}
+#: A start for each id, and a target for those that have one.
+STARTS: dict[str, dict[str, Any]] = {
+    "PivotedBar-v0": {"state": [0.1, -0.2, 2.0, 3.0]},
+    "PivotedBarFree-v0": {"state": [2.0, 30.0]},
+    "PivotedBarBalance-v0": {"state": [0.1, -0.2, 3.0, 0.5]},
+    "InclineTilt-v0": {"state": [0.1, -0.2, 0.05], "target": -0.2},
+    "InclineBrake-v0": {"state": [-1.5, 0.4]},
+    "CylinderInCylinderTilt-v0": {"state": [0.3, -0.2, 1.0], "target": -0.4},
+    "CylinderInCylinderPump-v0": {"state": [0.3, -0.2, 1.0]},
+    "CylinderInCylinderDamping-v0": {"state": [3.0, 7.0]},  # soon loses contact
+}
+
+
+class Run(NamedTuple):
+    """How a roll-out is made.
+
+    Attributes
+    ----------
+    keywords : dict
+        What ``make`` or ``make_vec`` is given.
+    steps : int
+        Steps at least; the episode in progress is finished.
+    start : dict
+        Options of the first reset.
+    mode : str
+        Autoreset mode of a batch; "" for a single environment.
+    """
+
+    keywords: dict[str, Any]
+    steps: int
+    start: dict[str, Any] = {}  # noqa: RUF012
+    mode: str = ""
+
+    @property
+    def lanes(self) -> int:
+        """Number of environments."""
+        return len(next(iter(self.mixed.values()))) if self.mode else 1
+
+    @property
+    def mixed(self) -> dict[str, list[float]]:
+        """Keywords that each environment of a batch has its own value of."""
+        return {name: value for name, value in self.keywords.items() if isinstance(value, list)}
+
+
+def runs() -> dict[str, Run]:
+    """Return all runs, by name: the id, a slash, and what is special."""
+    out = {}
+    for env_id, start in STARTS.items():
+        out[f"{env_id}/defaults"] = Run({}, 400)
+        out[f"{env_id}/another dt"] = Run({"dt": 0.03, "duration": 3.0, "diagnostics": True}, 120, start)
+        for name, keywords in VARIANTS.get(env_id, {}).items():
+            out[f"{env_id}/{name}"] = Run({"duration": 4.0, **keywords}, 90)
+        # The line that ends the brake's episode is farther off.
+        steps = 110 if env_id == "InclineBrake-v0" else 40
+        duration = steps * gym.make(env_id).unwrapped.task.dt
+        for mode in MODES:
+            out[f"{env_id}/{mode}"] = Run({**MIXED[env_id], "duration": duration}, 90, mode=mode)
+    return out
+
+
+class Roll:
+    """An environment or a batch behind one interface, a single one being a batch of one.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    run : Run
+        How it is made.
+    """
+
+    def __init__(self, env_id: str, run: Run) -> None:
+        self._mode, self._n = run.mode, run.lanes
+        if run.mode:
+            self.envs: Any = gym.make_vec(env_id, num_envs=run.lanes, autoreset_mode=run.mode, **run.keywords)
+        else:
+            self.envs = gym.make(env_id, **run.keywords)
+        self._env = self.envs.unwrapped
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Reset all, or what a mask says, and return what can be seen then."""
+        observations, infos = self.envs.reset(seed=seed, options=options)
+        zeros = np.zeros(self._n)
+        return self._seen(observations, zeros, zeros.astype(bool), zeros.astype(bool), infos)
+
+    def step(self, actions: np.ndarray) -> dict[str, Any]:
+        """Take a step with actions of shape (n,), and return what can be seen then."""
+        if self._mode:
+            return self._seen(*self.envs.step(actions[:, None]))
+        return self._seen(*self.envs.step(actions))
+
+    def _seen(self, observations, rewards, terminated, truncated, infos) -> dict[str, Any]:  # type: ignore
+        n = self._n
+        over = np.reshape(terminated, n) * np.uint8(1) + np.reshape(truncated, n) * np.uint8(2)
+        seen = {
+            "observation": np.reshape(observations, (n, -1)).astype(np.float32),
+            "state": np.reshape(self._env.state, (n, -1)),
+            "reward": np.reshape(rewards, n).astype(np.float64),
+            "over": over.astype(np.uint8),
+        }
+        if self._env.target is not None:
+            seen["target"] = np.reshape(self._env.target, n)
+        if "final_obs" in infos:
+            last = seen["observation"].copy()
+            for i in np.flatnonzero(infos["_final_obs"]):
+                last[i] = infos["final_obs"][i]
+            seen["last observation"] = last
+        if not self._mode:
+            seen |= {f"info {name}": np.array([value]) for name, value in infos.items()}
+        return seen
+
+
+def play(env_id: str, run: Run, actions: np.ndarray, calls: int | None = None) -> list[dict[str, Any]]:
+    """Roll out: what can be seen after the first reset and after each call that follows.
+
+    What is over is reset by the next call where the environment does not do it itself; that call's row of
+    actions is left unused.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    run : Run
+        How it is made.
+    actions : ndarray of int8, shape (calls, n)
+        Actions, in hundredths, beyond ±1 at times.
+    calls : int, optional
+        Calls altogether; by default as many as finish the episode in progress after `run.steps`.
+    """
+    roll = Roll(env_id, run)
+    seen = [roll.reset(seed=1, options=run.start or None)]
+    while len(seen) < (calls or len(actions)):
+        over = seen[-1]["over"] > 0
+        if over.any() and calls is None and len(seen) > run.steps:
+            break
+        if over.any() and run.mode in ("", "Disabled"):
+            seen.append(roll.reset(options={"reset_mask": over} if run.mode else None))
+        else:
+            seen.append(roll.step((actions[len(seen)] / 100.0).astype(np.float32)))
+    return seen
+
+
+def stack(seen: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Return what was seen as arrays, the calls along the first axis."""
+    arrays = {name: np.array([s[name] for s in seen]) for name in seen[0]}
+    # Most calls end nothing: where none is told, the last observation is the one seen.
+    if any("last observation" in s for s in seen):
+        over = arrays["over"] > 0
+        last = np.array([s.get("last observation", s["observation"]) for s in seen])
+        arrays["last observation"] = last[over]
+    return arrays
+
+
+def record() -> dict[str, np.ndarray]:
+    """Return all runs as arrays, by "run/array"."""
+    out = {"version": np.array(lag_envs.__version__)}
+    for number, (name, run) in enumerate(runs().items()):
+        rng = np.random.default_rng(number)
+        # Held for some steps, so that they move something.
+        given = rng.integers(-120, 121, (400, run.lanes)).repeat(rng.choice([1, 4]), axis=0).astype(np.int8)
+        given = np.concatenate([given, given[::-1], given])
+        seen = play(name.partition("/")[0], run, given)
+        arrays = {"actions": given[: len(seen)], **stack(seen)}
+        out |= {f"{name}/{key}": value for key, value in arrays.items()}
+    return out
+
+
+if __name__ == "__main__":
+    GOLDEN.parent.mkdir(exist_ok=True)
+    recorded = record()
+    np.savez_compressed(GOLDEN, **recorded)  # type: ignore[arg-type]
+    ends = sum(np.count_nonzero(v) for k, v in recorded.items() if k.endswith("/over"))
+    calls = sum(v.size for k, v in recorded.items() if k.endswith("/over"))
+    print(f"{GOLDEN}: {len(runs())} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")

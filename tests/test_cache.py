@@ -1,0 +1,331 @@
+"""The cache of compiled code: whatever becomes of its files, functions go on and are right."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+
+from lag_envs.cli import main
+from lag_envs.stepping import cache
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+
+def double(x):
+    return x + x
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    """Give each test a cache of its own, and the one warning of a process."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
+    monkeypatch.setattr(cache, "_warned", False)
+    return cache.folder()
+
+
+def hits(key="some source", value=1.5):
+    """Call the function through a dispatcher of its own; return how often that found it in the cache."""
+    function = cache.jit(double, key)
+    assert function(value) == 2 * value
+    return sum(function.stats.cache_hits.values())
+
+
+def files(place):
+    return [entry.path for entry in cache.entries(place)]
+
+
+def flipped(at):
+    def flip(path):
+        data = bytearray(path.read_bytes())
+        data[at if at >= 0 else len(data) + at] ^= 1 << random.Random(at).randrange(8)
+        path.write_bytes(data)
+
+    return flip
+
+
+def replaced(make):
+    def replace(path):
+        path.unlink()
+        make(path)
+
+    return replace
+
+
+DAMAGE = {
+    "empty": lambda path: path.write_bytes(b""),
+    "one byte": lambda path: path.write_bytes(b"l"),
+    "cut in the head": lambda path: path.write_bytes(path.read_bytes()[:20]),
+    "cut in the digest": lambda path: path.write_bytes(path.read_bytes()[:60]),
+    "nothing but a head": lambda path: path.write_bytes(path.read_bytes()[:74]),
+    "cut in half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "last byte lost": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "a byte more": lambda path: path.write_bytes(path.read_bytes() + b"\0"),
+    "zeros": lambda path: path.write_bytes(bytes(path.stat().st_size)),
+    "garbage": lambda path: path.write_bytes(random.Random(0).randbytes(5000)),
+    "text": lambda path: path.write_text("not compiled"),
+    **{f"byte {at} flipped": flipped(at) for at in (0, 9, 10, 41, 42, 73, 74, 500, 5000, -1)},
+    "an empty folder": replaced(Path.mkdir),
+    "too long": lambda path: os.truncate(path, cache.LIMIT + 1),
+}
+if hasattr(os, "mkfifo"):
+    DAMAGE["a pipe"] = replaced(os.mkfifo)
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_a_damaged_file_is_dropped_with_one_warning(place, how):
+    assert (hits(), hits()) == (0, 1)
+    assert (hits("other source"), hits("other source")) == (0, 1)
+    for path in files(place):
+        DAMAGE[how](path)
+        assert cache.damage(path)
+    with pytest.warns(RuntimeWarning, match="damaged: .*compiled anew") as told:
+        assert (hits(), hits("other source")) == (0, 0)
+    assert len(told) == 1
+    assert (hits(), hits("other source")) == (1, 1)
+    assert not any(map(cache.damage, files(place)))
+
+
+def test_a_whole_file_of_something_else_is_not_believed(place):
+    hits()
+    (mine,) = files(place)
+    hits("other source")
+    (other,) = set(files(place)) - {mine}
+    os.replace(other, mine)
+    with pytest.warns(RuntimeWarning, match="belongs to another function"):
+        assert hits() == 0
+
+
+def test_a_file_that_numba_cannot_read_is_dropped(place):
+    # As another build of Numba with the same number might leave it.
+    hits()
+    (path,) = files(place)
+    key = path.read_bytes()[len(cache._MAGIC) : len(cache._MAGIC) + 32]
+    cache._write(path, key, b"no pickle")
+    with pytest.warns(RuntimeWarning, match="UnpicklingError"):
+        assert hits() == 0
+    assert hits() == 1
+
+
+def test_what_decides_the_code_decides_the_file(place, monkeypatch):
+    assert hits() == 0
+    assert hits(value=3) == 0  # another type
+    assert hits("changed source") == 0
+    monkeypatch.setattr(sys, "version", "4.0")
+    assert hits() == 0
+    assert len(files(place)) == 4
+
+
+def test_links_are_not_followed_when_dropped(place, tmp_path):
+    hits()
+    (path,) = files(place)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("precious")
+    path.unlink()
+    path.symlink_to(elsewhere)
+    with pytest.warns(RuntimeWarning):
+        assert hits() == 0
+    assert elsewhere.read_text() == "precious"
+    path.unlink()
+    path.symlink_to(tmp_path / "nowhere")
+    assert (hits(), hits()) == (0, 1)
+
+
+@pytest.mark.parametrize("kind", ["a file", "below a file", "no permission"])
+def test_without_a_folder_that_can_be_written_to(kind, tmp_path, monkeypatch, capsys):
+    parent = tmp_path / "parent"
+    if kind == "no permission":
+        parent.mkdir(mode=0o500)
+        if os.access(parent, os.W_OK):
+            parent = Path("/proc/self")  # nor may the administrator write here
+            if not parent.is_dir():
+                pytest.skip("an administrator may write everywhere here")
+    else:
+        parent.write_text("a file")
+        parent = parent / "deeper" if kind == "below a file" else parent
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(parent))
+    assert (hits(), hits()) == (0, 0)
+    assert main(["cache"]) == 0
+    assert "compiles" in capsys.readouterr().out
+    assert main(["cache", "--clear"]) == 0
+
+
+def test_a_file_that_may_not_be_read(place):
+    hits()
+    (path,) = files(place)
+    path.chmod(0)
+    expected = int(os.access(path, os.R_OK))  # an administrator may
+    assert hits() == expected
+    assert hits() == 1
+
+
+@pytest.mark.skipif(resource is None, reason="this system has no limit on the size of files")
+def test_a_full_disk(place):
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+        found = hits(), hits()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert found == (0, 0)
+    assert not files(place)
+    assert (hits(), hits()) == (0, 1)
+
+
+def test_its_size_is_bounded_and_what_is_used_stays(place, monkeypatch):
+    hits("0")
+    size = cache.entries(place)[0].size
+    monkeypatch.setattr(cache, "LIMIT", 3 * size + size // 2)
+    for name in "12":
+        hits(name)
+    for entry in cache.entries(place):  # all a year old; what is used again is young
+        os.utime(entry.path, (0, time.time() - 3e7))
+    assert hits("0") == 1
+    for name in "34":
+        hits(name)
+    assert sum(entry.size for entry in cache.entries(place)) <= cache.LIMIT
+    assert [hits(name) for name in "0341"] == [1, 1, 1, 0]
+    # What a killed process has left behind counts, and goes like the rest.
+    left = place / f"new-12345{cache._SUFFIX}"
+    left.write_bytes(bytes(size))
+    os.utime(left, (0, 0))
+    hits("5")
+    assert not left.exists()
+
+
+def test_processes_that_race(place):
+    # All compile and write the same file, read it again and again, and damage it in between.
+    code = """
+import os, random, sys, warnings
+warnings.simplefilter("ignore")
+from lag_envs.stepping import cache
+def double(x):
+    return x + x
+rng = random.Random(int(sys.argv[1]))
+for i in range(8):
+    assert cache.jit(double, "some source")(1.5) == 3.0
+    for entry in cache.entries(cache.folder()):
+        what = rng.randrange(4)
+        try:
+            if what == 0:
+                os.unlink(entry.path)
+            elif what == 1:
+                os.truncate(entry.path, rng.randrange(entry.size))
+        except (OSError, ValueError):
+            pass
+"""
+    run = [sys.executable, "-c", code]
+    processes = [
+        subprocess.Popen([*run, str(i)], env=environment(), stderr=subprocess.PIPE) for i in range(3)
+    ]
+    errors = [process.communicate()[1] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0], errors
+
+
+def environment():
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+STEP = """
+import hashlib, gymnasium as gym, numpy as np, lag_envs
+env = gym.make("InclineBrake-v0").unwrapped
+envs = gym.make_vec("InclineBrake-v0", num_envs=3)
+digest = hashlib.sha256(env.reset(seed=1)[0])
+envs.reset(seed=1)
+for i in range(50):
+    action = np.float32(np.sin(i))
+    for part in (*env.step(np.array([action]))[:2], *envs.step(np.full((3, 1), action))[:2]):
+        digest.update(np.asarray(part).tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_environments_step_on_whatever_is_left_of_their_code(place):
+    def step():
+        run = subprocess.run([sys.executable, "-c", STEP], env=environment(), capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+        return run.stdout, run.stderr
+
+    bits, silence = step()
+    assert silence == ""
+    assert len(files(place)) >= 4
+    assert step() == (bits, "")
+    rng = random.Random(1)
+    for path in files(place):
+        if not path.name.startswith("flow"):  # what is read whole is linked with what is compiled anew
+            flipped(rng.randrange(path.stat().st_size))(path)
+    again, told = step()
+    assert again == bits
+    assert told.count("RuntimeWarning") == 1
+    assert "Traceback" not in told
+    assert step() == (bits, "")
+
+
+def test_the_command(place, capsys):
+    def call(*arguments):
+        assert main(["cache", *arguments]) == 0
+        return capsys.readouterr().out
+
+    assert "functions  0" in call()
+    hits()
+    hits("other source")
+    out = call()
+    assert str(place) in out
+    assert "functions  2" in out
+    assert "damaged    0" in out
+    assert "writable   yes" in out
+    bad = files(place)[0]
+    bad.write_bytes(b"")
+    out = call()
+    assert "damaged    1" in out
+    assert str(bad) in out
+    assert "2 files removed" in call("--clear")
+    assert not files(place)
+    assert hits() == 0
+
+
+def test_where_it_lies(monkeypatch, tmp_path):
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert cache.folder() == tmp_path / "lag_envs"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    assert cache.folder() == tmp_path / ".cache" / "lag_envs"
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert cache.folder() == tmp_path / "Library" / "Caches" / "lag_envs"
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    assert cache.folder() is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (hits(), hits()) == (0, 0)
+
+
+NAMED = 1.0
+
+
+def test_numbers_that_a_function_names_decide_too(monkeypatch):
+    def found():
+        function = cache.jit(add_named)
+        return function(1.0), sum(function.stats.cache_hits.values())
+
+    assert [found(), found()] == [(2.0, 0), (2.0, 1)]
+    monkeypatch.setitem(globals(), "NAMED", 2.0)
+    assert found() == (3.0, 0)
+
+
+def add_named(x):
+    return x + NAMED

@@ -1,0 +1,99 @@
+"""What the environments do against what they did when version 0 was settled: see golden_rollouts.py.
+
+Only what a user can call is used, so that this holds whatever the package is made of.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+from golden_rollouts import GOLDEN, Roll, Run, play, runs, stack
+
+RUNS = runs()
+each_run = pytest.mark.parametrize("name", RUNS)
+TOLERANCE = 1e-12
+
+
+@functools.cache
+def kept() -> dict[str, np.ndarray]:
+    with np.load(GOLDEN) as file:
+        return dict(file)
+
+
+def arrays(name: str) -> dict[str, np.ndarray]:
+    prefix = f"{name}/"
+    return {key.removeprefix(prefix): value for key, value in kept().items() if key.startswith(prefix)}
+
+
+def assert_close(mine: np.ndarray, golden: np.ndarray, what: str, tolerance: float) -> None:
+    """Compare to a tolerance relative to the largest number in an entry's history, at least 1."""
+    assert mine.shape == golden.shape, what
+    if golden.dtype == np.float32:  # these are rounded: one unit in the last place may lie between
+        slack = np.spacing(np.abs(golden)).astype(np.float64)
+    elif golden.dtype == np.float64:
+        slack = 0.0
+    else:
+        assert np.array_equal(mine, golden), what
+        return
+    mine, golden = mine.astype(np.float64), golden.astype(np.float64)
+    finite = np.isfinite(golden)  # the friction that an unloaded contact needs is infinite
+    assert np.array_equal(mine[~finite], golden[~finite]), what
+    size = np.maximum(1.0, np.max(np.abs(golden), axis=0, where=finite, initial=0.0))
+    off = np.abs(np.subtract(mine, golden, where=finite, out=np.zeros_like(golden))) - slack
+    worst = np.unravel_index(np.argmax(off / size), off.shape)
+    assert (off <= tolerance * size).all(), f"{what} at {worst}: {mine[worst]!r}, not {golden[worst]!r}"
+
+
+def test_the_file_holds_every_run():
+    assert {key.rpartition("/")[0] for key in kept()} - {""} == set(RUNS)
+    ends = np.concatenate([arrays(name)["over"].ravel() for name in RUNS])
+    assert all(np.count_nonzero(ends == kind) > 50 for kind in (1, 2))
+    assert GOLDEN.stat().st_size < 1e6
+
+
+@each_run
+def test_whole_run(name):
+    # From its seed and actions alone. The motion makes up to 2,000 of a rounding on the way.
+    golden = arrays(name)
+    mine = stack(play(name.partition("/")[0], RUNS[name], golden["actions"], len(golden["over"])))
+    assert mine.keys() == golden.keys() - {"actions"}
+    for key, value in mine.items():
+        assert_close(value, golden[key], key, 10 * TOLERANCE)
+
+
+@each_run
+def test_each_step(name):
+    # From the state that was kept, so that nothing can add up or be amplified.
+    golden, run, env_id = arrays(name), RUNS[name], name.partition("/")[0]
+    keywords = {key: value for key, value in run.keywords.items() if key != "diagnostics"}
+    roll = Roll(env_id, Run(keywords, run.steps, mode=run.mode and "Disabled"))
+    before, after = golden["over"][:-1] > 0, golden["over"][1:] > 0
+    # Where the call was a reset there is no step to take again; a batch without autoreset is reset by a mask.
+    reset = before.any(axis=1) if run.mode in ("", "Disabled") else np.zeros(len(before), bool)
+    stepped = ~before & ~reset[:, None]
+    restarted = after & (run.mode == "SameStep")
+    # Lanes without a step to take again stand where all began. What a limit has clipped may lie beyond it by
+    # a rounding; a start there would be refused.
+    starts = np.where(stepped[..., None], golden["state"][:-1] * (1.0 - 1e-15), golden["state"][0])
+    steps = []
+    for t, start in enumerate(starts):
+        options = {"state": start}
+        if "target" in golden:
+            options["target"] = golden["target"][t]
+        if not run.mode:
+            options = {key: value[0] for key, value in options.items()}
+        roll.reset(seed=t, options=options)
+        steps.append(roll.step((golden["actions"][t + 1] / 100.0).astype(np.float32)))
+    mine = stack(steps)
+    state, wanted = mine["state"], golden["state"][1:]
+    if "Balance" in name or "Damping" in name:  # kicks are drawn anew: they hit few, and theta_dot only
+        kicked = np.abs(state[..., -1] - wanted[..., -1]) > 1e-6
+        assert np.mean(kicked[stepped & ~restarted]) < 0.1
+        stepped &= ~kicked
+    going_on = stepped & ~restarted
+    assert_close(state[going_on], wanted[going_on], "state", TOLERANCE)
+    assert_close(mine["reward"][stepped], golden["reward"][1:][stepped], "reward", TOLERANCE)
+    assert_close(mine["observation"][going_on], golden["observation"][1:][going_on], "observation", TOLERANCE)
+    assert np.array_equal(mine["over"][stepped] % 2, golden["over"][1:][stepped] % 2)
