@@ -16,6 +16,9 @@ from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
+#: A step may be as long as a swing takes for that angle [rad], so that it needs no more substeps than are
+#: taken, also after many swings have been pumped up.
+LONGEST_TURN = 5000.0
 
 
 class Task(ABC):
@@ -49,9 +52,9 @@ class Task(ABC):
     target_range: ClassVar[float | None] = None
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
-    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares:
-    #: wherever in these ranges all of them lie, every accepted start and action gives finite observations
-    #: within their space, and steps of any `dt` are taken.
+    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares.
+    #: Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
+    #: gives finite observations within their space, and every step is taken.
     usable: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(
@@ -95,6 +98,16 @@ class Task(ABC):
                 raise ValueError(
                     f"{name} must lie between {low:g} and {high:g} in this environment, got {value!r}"
                 )
+        if self.fastest * self.dt > LONGEST_TURN:
+            raise ValueError(
+                f"dt must be at most {LONGEST_TURN / self.fastest:.3g} s where speeds reach {self.fastest:.3g} "
+                f"rad/s, got {self.dt!r} s with {self.scene}"
+            )
+
+    @property
+    def fastest(self) -> float:
+        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
+        return 0.0
 
     @classmethod
     def usable_ranges(cls) -> dict[str, tuple[float, float]]:
