@@ -98,10 +98,11 @@ class Task(ABC):
                 raise ValueError(
                     f"{name} must lie between {low:g} and {high:g} in this environment, got {value!r}"
                 )
-        if self.fastest * self.dt > LONGEST_TURN:
+        fastest = self.fastest
+        if fastest * self.dt > LONGEST_TURN:
             raise ValueError(
-                f"dt must be at most {LONGEST_TURN / self.fastest:.3g} s where speeds reach {self.fastest:.3g} "
-                f"rad/s, got {self.dt!r} s with {self.scene}"
+                f"dt must be at most {LONGEST_TURN / fastest:.3g} s where speeds reach {fastest:.3g} rad/s, "
+                f"got {self.dt!r} s with {self.scene}"
             )
 
     @property
