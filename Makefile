@@ -12,7 +12,7 @@ OLDEST_GYMNASIUM := 1.2.2
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo baselines test test-slow test-oldest lint types check bench report report-docs submissions site format clean
+.PHONY: help setup demo baselines test test-slow test-libraries test-oldest lint types check audit bench bench-docs report report-docs submissions site format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -35,8 +35,12 @@ test: setup  ## run the tests and doctests, all but the slow ones
 	@sh tools/browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
-test-slow: setup  ## run the slow tests
-	$(BIN)/python -m pytest -m slow $(ARGS)
+test-slow: setup  ## install what the slow tests need (Ray, the RL Zoo) and run them; it prints how long it took
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,ray,zoo]'
+	$(BIN)/python -m pytest -m slow --no-skips --durations 10 $(ARGS)
+
+test-libraries: setup  ## run libraries by their own scripts, each in its environment; ARGS='--docs' writes the page
+	$(BIN)/python tools/libraries $(ARGS)
 
 test-oldest: setup  ## run the tests on the oldest supported Gymnasium
 	@rm -rf .venv/oldest
@@ -53,12 +57,18 @@ lint: setup
 types: setup
 	$(BIN)/python -m mypy
 
-check: lint types test  ## all that CI runs: lint, types, tests, doctests
+audit: setup  ## check that all on the leaderboard is what was noted when it came there
+	$(BIN)/lag-envs leaderboard audit --pin src/lag_envs/leaderboard/pin.json $(ARGS)
+
+check: lint types test audit  ## all that CI runs: lint, types, tests, doctests, the board's audit
 
 bench: setup  ## compare the speed with other environments
 	$(BIN)/lag-envs bench $(ARGS)
 
-report: setup  ## measure errors and write a page about them, into the folder report
+bench-docs: setup  ## the same, taken over into docs and README; on a machine with nothing else to do
+	$(BIN)/lag-envs bench --checkout . $(ARGS)
+
+report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs and README too
 	$(BIN)/lag-envs report $(ARGS)
 
 report-docs: setup  ## take the folder report over into docs and README

@@ -70,9 +70,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def adapter(n: int) -> Any:
     """Make our vector environment."""
-    from agents.sb3_vec_env import make_sb3_vec_env
+    from lag_envs.sb3 import make_vec_env
 
-    return make_sb3_vec_env(ENV, n)
+    return make_vec_env(ENV, n)
 
 
 def dummy(n: int) -> Any:

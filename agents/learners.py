@@ -33,6 +33,7 @@ from agents.run import (
     write,
 )
 from lag_envs import TASKS, __version__
+from lag_envs.hyperparams import HYPERPARAMS
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import load_task
 
@@ -44,13 +45,12 @@ ALGORITHMS = {
     "dqn": ("stable_baselines3", "DQN"),
     "tqc": ("sb3_contrib", "TQC"),
 }
-HYPERPARAMS = Path(__file__).parent / "hyperparams"
 #: Episodes of a test while training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
 #: Tests, and so points of the learning curve and checkpoints, of one run.
 TESTS = 16
 TIME_LIMIT, DISCRETISE = "gymnasium.wrappers.TimeLimit", "gymnasium.wrappers.DiscretizeAction"
-SCALE = "agents.sb3_vec_env.ScaledReward"
+SCALE = "lag_envs.sb3.ScaledReward"
 #: Libraries whose versions a result tells.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
@@ -101,7 +101,7 @@ def make_envs(run: Run) -> Any:
     """Return the native vector environment with the wrappers that the hyperparameters ask for."""
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-    from agents.sb3_vec_env import DiscreteActions, ScaledReward, make_sb3_vec_env
+    from lag_envs.sb3 import DiscreteActions, ScaledReward, make_vec_env
 
     hyper = run.hyperparameters
     options = dict(hyper.get("env_kwargs", {}))
@@ -121,7 +121,7 @@ def make_envs(run: Run) -> Any:
             factor = arguments["factor"]
         else:
             raise UserError(f"wrapper {name} is not known here; {TIME_LIMIT}, {DISCRETISE} and {SCALE} are")
-    envs = make_sb3_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
+    envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
     envs = envs if factor is None else ScaledReward(envs, factor)
     normalise = hyper.get("normalize")

@@ -35,6 +35,7 @@ from agents.value_iteration import (
 )
 from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
+from lag_envs.controllers.incline import optimal_return
 from lag_envs.envs.model import Model
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
@@ -44,7 +45,8 @@ Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT_FOLDER = Path("runs/optimum")
 RESULTS, IMAGES = ROOT / "agents" / "results" / "optimum", ROOT / "docs" / "images"
-SCHEMA = 1
+#: Versions of the results, and of what is cached.
+SCHEMA, CACHED = 2, 1
 #: Episodes that are compared.
 EPISODES = 1_000
 
@@ -61,8 +63,10 @@ how to read the numbers:
                 side, the less the finer the grid.
   lower         mean return that the greedy policy really gets in those episodes, with the 95 % confidence
                 interval of a mean. A policy that gets it exists: the optimum is not below.
-  upper         grid values extrapolated linearly to cells without width: an ESTIMATE, no bound.
-  bound         what no policy can exceed, proved; crude.
+  estimate      grid values extrapolated to cells without width, by the order of convergence that the last
+                three show; its error bar is what the last halving of the cells changed. An ESTIMATE, no
+                bound. There is none where its own greedy policy gets more.
+  bound         what no policy can exceed, proved; crude but for InclineBrake-v0, where it is the optimum.
 PivotedBar-v0 and PivotedBarBalance-v0 have a state of 4 dimensions. Solved is the task without a track, which
 is easier: its value is from above; lower is what the best agent gets, see the agents' results.
 
@@ -70,7 +74,7 @@ It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): the same command goe
 
 examples:
   python -m agents.optimum InclineBrake-v0 --quick    one id on coarse grids, in seconds; writes to FOLDER
-  python -m agents.optimum                            all ids, in about half an hour on one core
+  python -m agents.optimum                            all ids, tens of minutes on one core
   python -m agents.optimum CylinderInCylinderPump-v0 --new    anew, forgetting what was computed"""
 
 
@@ -295,7 +299,7 @@ class Solution:
         problem = self.problem
         # Not in the fingerprint: what happens between the places where the step is tried.
         parameters = {
-            "schema": SCHEMA, "env": problem.env_id, "options": problem.options, "target": target,
+            "schema": CACHED, "env": problem.env_id, "options": problem.options, "target": target,
             "level": self.level, "pushes": problem.pushes, "constants": self.task.constants(),
         }  # fmt: skip
         actions = np.linspace(-1.0, 1.0, problem.actions)
@@ -503,16 +507,11 @@ def proved_bound(env_id: str) -> tuple[float, str]:
     task: Any = load_task(place)(**fixed)
     if env_id != "InclineBrake-v0":
         return task.limit, "steps of an episode; no step pays more than 1"
-    # Without the price of speed, and never braked, the same task pays minus the time of the free fall.
-    task.gentle = 1e9
-    model = Model(task)
     states, _ = starts(env_id)
-    total, running = np.zeros(len(states)), np.ones(len(states), np.bool_)
-    while running.any():
-        states[running], rewards, ended = model(states[running], -np.ones(running.sum()))
-        total[running] += rewards
-        running[running] = ~ended
-    return float(total.mean()), "minus the time that the way to the line takes without any brake"
+    why = (
+        "with a brake that is off, then full, from the best moment on (`lag_envs.controllers.optimal_return`)"
+    )
+    return float(optimal_return(task, *states.T).mean()), why
 
 
 def seconds_to_upright(states: Array, dt: float) -> float:
@@ -539,25 +538,26 @@ def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
 
     Returns
     -------
-    linear : float
-        The limit if the error were in proportion to the cells' width, which takes it farthest.
     limit : float
         The limit by the order of the error that the last three values show, kept between 1 and 2.
+    error : float
+        What the last halving of the cells changed. If the error falls with an order of 1 or more, it is at
+        most that on the finest grid, and an order that is misjudged moves the limit by less.
     order : float
-        That order; 1 where there are not three values, or where they do not converge evenly.
+        The order; 1 where there are not three values, or where they do not converge evenly.
 
     Examples
     --------
     >>> extrapolated([5.0, 4.0])
-    (3.0, 3.0, 1.0)
+    (3.0, 1.0, 1.0)
     >>> extrapolated([9.0, 6.0, 5.25])
-    (4.5, 5.0, 2.0)
+    (5.0, 0.75, 2.0)
     """
     steps = np.diff(values)
     order = 1.0
     if len(steps) > 1 and steps[-1] != 0.0 and steps[-2] / steps[-1] > 1.0:
         order = float(np.clip(np.log2(steps[-2] / steps[-1]), 1.0, 2.0))
-    return float(values[-1] + steps[-1]), float(values[-1] + steps[-1] / (2.0**order - 1.0)), order
+    return float(values[-1] + steps[-1] / (2.0**order - 1.0)), float(abs(steps[-1])), order
 
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
@@ -585,10 +585,10 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         agent = Optimal(env_id, solution=solution)
         lower = mean_and_interval(evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES))
         answers = known_answers(env_id, agent)
-    upper, limit, order = extrapolated([grid["value"] for grid in grids])
+    limit, error, order = extrapolated([grid["value"] for grid in grids])
     bound, why = proved_bound(env_id)
-    if lower is not None:
-        upper = max(upper, lower["mean"])
+    broken = lower is not None and lower["mean"] > limit + error
+    estimate = None if broken else {"value": round(limit, 4), "error": round(error, 4)}
     return {
         "schema": SCHEMA,
         "env": env_id,
@@ -607,10 +607,9 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "episodes": EPISODES,
         "first_seed": FIRST_FRESH_SEED,
         "lower": lower,
-        "upper_estimate": round(min(upper, bound), 4),
-        "likely": round(limit, 4),
+        "estimate": estimate,
         "order": round(order, 2),
-        "bound": {"value": round(bound, 4), "why": why},
+        "bound": {"value": round(bound, 4), "why": why, "exact": env_id == "InclineBrake-v0"},
         "known": answers,
         "cpu_seconds": round(sum(g["cpu_seconds"] for g in grids) + time.process_time() - started, 1),
         "machine": machine(),
@@ -633,9 +632,9 @@ def explanation(env_id: str, source: str, problem: Problem, grids: Sequence[dict
             "interpolated linearly, negative ones by the mirror image."
         )
     text += (
-        f" Values are means over the starts of {EPISODES:,} episodes. upper_estimate: the last two grid "
-        "values extrapolated linearly to cells without width; likely: extrapolated by the order of "
-        "convergence that the last three show (between 1 and 2). Both are estimates, no bounds."
+        f" Values are means over the starts of {EPISODES:,} episodes. estimate: the grid values extrapolated "
+        "to cells without width by the order of convergence that the last three show (between 1 and 2); its "
+        "error is what the last halving of the cells changed. It is no bound."
     )
     if env_id != source:
         return text + (
@@ -767,8 +766,10 @@ def work(env_id: str, args: argparse.Namespace) -> None:
         draw(env_id, args.folder, images / f"value-{env_id}.png", levels[0] if args.quick else levels[1])
     lower = result["lower"]
     low = "see the agents' results" if lower is None else f"{lower['mean']:.3f} {lower['interval']}"
+    found = result["estimate"]
+    estimate = "none" if found is None else f"{found['value']:.3f} ± {found['error']:.3f}"
     print(
-        f"{env_id}: lower {low}, upper estimate {result['upper_estimate']:.3f}, bound "
+        f"{env_id}: lower {low}, estimate {estimate}, bound "
         f"{result['bound']['value']:.3f}, {result['cpu_seconds']:.0f} s of CPU time\n"
         f"  -> {results / env_id}.json",
         flush=True,

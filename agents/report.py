@@ -6,7 +6,7 @@ import io
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ IMAGES = "images"
 NOTES = Path(__file__).with_name("notes.toml")
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 OPTIMA = Path(__file__).with_name("results") / "optimum"
+BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
+SCALE = Path(__file__).with_name("results") / "scale.json"
 DOCS = Path(__file__).parents[1] / "docs"
 
 # --- figures -----------------------------------------------------------------------------------------------
@@ -102,7 +104,8 @@ def scores_figure(envs: Mapping[str, Data]) -> Any:
                 else:
                     text = f"◂ {number(found['value'])}{'' if name == NOMINAL else ' (often)'}"
                     ax.text(lowest, row + shift, text, va="center", fontsize=7, color=colour)
-        ax.set_yticks(range(len(env["agents"])), list(env["agents"]), fontsize=8)
+        names = [brief(name, agent) for name, agent in env["agents"].items()]
+        ax.set_yticks(range(len(names)), names, fontsize=8)
         ax.set_ylim(len(env["agents"]) - 0.5, -0.5)
         ax.set_xlabel(_what(env), fontsize=8)
         if lowest > -math.inf:
@@ -183,7 +186,7 @@ def robustness_figure(env_id: str, env: Data) -> Any:
             text = text.replace("-0.00", "0.00")
             ax.text(j, i, text, ha="center", va="center", fontsize=7, color="black" if bright else "white")
     ax.set_xticks(range(len(columns)), columns, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
-    ax.set_yticks(range(len(agents)), list(agents), fontsize=8)
+    ax.set_yticks(range(len(agents)), [brief(name, agent) for name, agent in agents.items()], fontsize=8)
     ax.set_title(f"{env_id}: {_what(env)}", fontsize=10)
     return figure
 
@@ -203,10 +206,16 @@ def improvement_figure(envs: Mapping[str, Data]) -> Any:
             if not math.isnan(value):
                 colour = "black" if value > 0.55 else "white"
                 ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+        names = {name: brief(name, agent) for name, agent in env["agents"].items()}
         ax.set_xticks(
-            range(len(columns)), columns, rotation=40, ha="right", rotation_mode="anchor", fontsize=7
+            range(len(columns)),
+            [names[name] for name in columns],
+            rotation=40,
+            ha="right",
+            rotation_mode="anchor",
+            fontsize=7,
         )
-        ax.set_yticks(range(len(rows)), rows, fontsize=8)
+        ax.set_yticks(range(len(rows)), [names[name] for name in rows], fontsize=8)
     figure.supylabel("probability that a run of this ...", fontsize=9)
     figure.supxlabel("... is better than this", fontsize=9)
     return figure
@@ -233,9 +242,10 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
         _reading(data),
     ]
     for env_id, env in envs.items():
-        parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else []), _range(env)]
-        parts += _optimum(env_id)
-        parts += [_env_table(env, data["episodes"]), *([_problems(env)] if env.get("problems") else [])]
+        parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else [])]
+        parts += [_range(env_id, env), *_optimum(env_id)]
+        parts += [_env_table(env, data["episodes"]), *_behaviour(env_id)]
+        parts += [_problems(env)] if env.get("problems") else []
         parts.append(
             _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
         )
@@ -245,7 +255,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     ]
     parts.append(_image("agents-scores.png", "Results of all agents with intervals"))
     if data["learners"]:
-        parts += ["### Learners", _learners_table(data["learners"])]
+        parts += ["### Learners", _learners_table(data["learners"], envs)]
         parts.append(
             "What a learner's policy reaches in the course of its training, over steps and over seconds:"
         )
@@ -268,19 +278,16 @@ def summary(data: Data) -> str:
     for env_id, env in data["envs"].items():
         best: dict[str, str] = {}
         for name, agent in env["agents"].items():  # the best first
-            best.setdefault(agent["kind"], f"{name}: {with_interval(agent['conditions'][NOMINAL])}")
-        random, known = env["known"] or (math.nan, math.nan)
-        estimate = KNOWN_RETURNS[env_id].estimate if env_id in KNOWN_RETURNS else math.nan
+            text = f"{labelled(name, agent)}: {with_interval(agent['conditions'][NOMINAL])}"
+            best.setdefault(agent["kind"], text)
         rows.append(
             [
                 f"`{env_id}`",
-                number(random),
-                number(known),
-                number(estimate),
+                *(f"{value:g}" for value in env["known"] or ("", "")),
                 *(best.get(kind, "") for kind in ("classical", "learned", "optimal")),
             ]
         )
-    head = ["environment", "random", "best known", "optimum, estimated"]
+    head = ["environment", "score 0", "score 1"]
     head += [f"best {kind} agent: score" for kind in ("classical", "learned")] + ["optimal policy: score"]
     return table(head, rows)
 
@@ -298,75 +305,152 @@ def _reading(data: Data) -> str:
         " known, which need not be the optimum. Where no range is known, the return itself stands there."
         " Learners: interquartile mean over training seeds, and in brackets its"
         f" {100 * LEVEL:g} % interval by a stratified bootstrap; mean return ± standard error over seeds"
-        " (a single run is treated like what follows)."
+        " (a single run is treated like what follows). Behind a learner's name stands what it had, in"
+        " figures as seeds × thousands of steps: one seed says nothing of the next, and with fewer steps a"
+        " learner is no match for one with more."
         " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
         " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
         " a tenth; it shows what lives off the discretisation. *Worst*: the lowest result under changed"
-        " parameters, noise and delay. Time and steps are those of one training run."
+        " parameters, noise and delay. *Training*: time of one run."
     )
 
 
-def _range(env: Data) -> str:
+def _range(env_id: str, env: Data) -> str:
     if env["known"] is None:
         return "No range is set for scores; the numbers are mean returns."
     random, best = env["known"]
-    return f"Mean return of random actions {random:g}, best known {best:g}."
+    text = f"Score 0 is a mean return of {random:g}, score 1 one of {best:g}."
+    found = json.loads(SCALE.read_text(encoding="utf-8"))["envs"].get(env_id) if SCALE.exists() else None
+    if not found or env_id not in KNOWN_RETURNS:
+        return text
+    policy = KNOWN_RETURNS[env_id].policy
+    measured = [
+        f"{what} {plus_minus(row['mean'], row['error'])} in {row['episodes']:,} episodes"
+        for what, row in (
+            ("random actions", found["random"]),
+            (f"{policy}, the best policy known,", found[policy]),
+        )
+    ]
+    return f"{text} Measured (`python -m agents.scale`): {'; '.join(measured)}."
 
 
 def _env_table(env: Data, episodes: int) -> str:
     what = "score" if env["known"] else "return"
-    head = [
-        "agent",
-        "seeds",
-        "mean return",
-        f"{what} ({100 * LEVEL:g} %)",
-        "ten times as often",
-        "worst",
-        "training",
-    ]
+    head = ["agent", "mean return", f"{what} ({100 * LEVEL:g} %)", "ten times as often", "worst", "training"]
     rows = []
     for name, agent in env["agents"].items():
         conditions = agent["conditions"]
         nominal, often = conditions[NOMINAL], conditions.get(OFTEN)
         others = {c: v["value"] for c, v in conditions.items() if c not in (NOMINAL, OFTEN)}
         worst = min(others, key=others.__getitem__, default=None)
-        learned = agent["kind"] == "learned"
         fewer = nominal["episodes"] != episodes
         rows.append(
             [
-                name + (f" ({nominal['episodes']:,} episodes)" if fewer else ""),
-                str(len(agent["seeds"])) if learned else "",
+                labelled(name, agent) + (f" ({nominal['episodes']:,} episodes)" if fewer else ""),
                 plus_minus(nominal["return"], nominal["return_error"]),
                 with_interval(nominal),
                 "" if often is None else with_interval(often),
                 "" if worst is None else f"{number(others[worst])}: {worst}",
-                f"{agent['seconds']:,.0f} s, {agent['steps']:,.0f} steps" if learned else "",
+                f"{agent['seconds']:,.0f} s" if agent["kind"] == "learned" else "",
             ]
         )
     return table(head, rows)
+
+
+def labelled(name: str, agent: Data) -> str:
+    """Return an agent's name, and of a learner what it had: with one seed, or few steps, it is no match.
+
+    Examples
+    --------
+    >>> labelled("sac", {"kind": "learned", "seeds": [0], "steps": 40_000.0})
+    'sac, 1 seed of 40,000 steps'
+    """
+    if agent["kind"] != "learned":
+        return name
+    seeds = len(agent["seeds"])
+    return f"{name}, {seeds} seed{'s' * (seeds > 1)} of {agent['steps']:,.0f} steps"
+
+
+def brief(name: str, agent: Data) -> str:
+    """Return an agent's name as figures have it, with a learner's seeds and thousands of steps.
+
+    Examples
+    --------
+    >>> brief("sac", {"kind": "learned", "seeds": [0], "steps": 40_000.0})
+    'sac 1 × 40k'
+    """
+    if agent["kind"] != "learned":
+        return name
+    return f"{name} {len(agent['seeds'])} × {agent['steps'] / 1000.0:.0f}k"
+
+
+def _behaviour(env_id: str) -> list[str]:
+    """Tell what `python -m agents.behaviour` measured."""
+    if not BEHAVIOUR.exists():
+        return []
+    found = json.loads(BEHAVIOUR.read_text(encoding="utf-8"))
+    agents = found["envs"].get(env_id)
+    if not agents:
+        return []
+
+    def cell(values: Sequence[float]) -> str:
+        ends = (
+            f"{value:.3g}" if value >= 1e-3 or value == 0.0 else "< 0.001"
+            for value in (min(values), max(values))
+        )
+        return " to ".join(dict.fromkeys(ends))
+
+    head = ["how they act", *next(iter(agents.values()))]
+    rows = [
+        [f"{name}, {len(next(iter(by.values())))} seeds" if len(next(iter(by.values()))) > 1 else name]
+        + [cell(values) for values in by.values()]
+        for name, by in agents.items()
+    ]
+    text = (
+        f"In the same {found['episodes']:,} episodes, in the mean where nothing else is said; of learners the"
+        " range of their seeds. *Lost*: what rewards lack to 1 per step (`python -m agents.behaviour`)."
+    )
+    return [text, table(head, rows)]
 
 
 def _problems(env: Data) -> str:
     return "Left out:\n\n" + "\n".join(f"- {problem}" for problem in env["problems"])
 
 
-def _learners_table(learners: Data) -> str:
-    rows = [
-        [
-            name,
-            with_interval({"value": found["value"], **_ends(found["interval"])}),
-            f"{len(found['envs'])}: {', '.join(found['envs'])}",
-            str(found["runs"]),
-        ]
-        for name, found in learners.items()
-    ]
-    text = "Over all environments with a score, each resampled by itself. Compare only equal environments."
-    return text + "\n\n" + table(["learner", f"score ({100 * LEVEL:g} %)", "environments", "runs"], rows)
+def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
+    rows = []
+    for name, found in learners.items():
+        agents = [envs[env_id]["agents"][name] for env_id in found["envs"]]
+        rows.append(
+            [
+                name,
+                with_interval({"value": found["value"], **_ends(found["interval"])}),
+                f"{len(found['envs'])}: {', '.join(found['envs'])}",
+                _span(len(agent["seeds"]) for agent in agents),
+                _span(agent["steps"] for agent in agents),
+            ]
+        )
+    text = (
+        "Over all environments with a score, each resampled by itself. **This is no comparison of"
+        " algorithms**: look at what each had; compare only equal environments, seeds and steps."
+    )
+    head = ["learner", f"score ({100 * LEVEL:g} %)", "environments", "seeds of each", "steps of a seed"]
+    return text + "\n\n" + table(head, rows)
+
+
+def _span(values: Iterable[float]) -> str:
+    ends = sorted(values)
+    return " to ".join(dict.fromkeys(f"{value:,.0f}" for value in (ends[0], ends[-1])))
 
 
 def _improvement_table(envs: Mapping[str, Data]) -> str:
     rows = [
-        [env_id, one, other, with_interval({"value": found["value"], **_ends(found["interval"])})]
+        [
+            env_id,
+            labelled(one, env["agents"][one]),
+            labelled(other, env["agents"][other]),
+            with_interval({"value": found["value"], **_ends(found["interval"])}),
+        ]
         for env_id, env in envs.items()
         for one, others in env["improvement"].items()
         for other, found in others.items()
@@ -451,23 +535,34 @@ def _optimum(env_id: str) -> list[str]:
     if not file.exists():
         return []
     found = json.loads(file.read_text(encoding="utf-8"))
-    known = KNOWN_RETURNS.get(env_id)
-    text = f"**Optimum.** By value iteration, over the starts of {found['episodes']:,} episodes: "
-    if found["lower"] is None:
-        text += f"solved is {found['solved']}, which is easier; "
-    else:
-        low, high = found["lower"]["interval"]
-        text += (
-            f"its greedy policy gets {found['lower']['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}); "
+    bound, estimate, lower = found["bound"], found["estimate"], found["lower"]
+    easier = "" if lower is not None else f" of {found['solved']}, which is easier,"
+    if bound["exact"]:
+        first = (
+            f"It is known: {bound['value']:.4f} in the mean over the starts of {found['episodes']:,}"
+            f" episodes, {bound['why']}. No policy exceeds it; one that acts at intervals just misses it."
         )
-    text += (
-        f"at most {found['upper_estimate']:.6g}, an estimate, extrapolated linearly to a grid without width"
-        f" ({found['likely']:.6g} by the order of convergence that the grids show). Proved is only that it is"
-        f" at most {found['bound']['value']:.4g}: {found['bound']['why']}."
-    )
-    if known is not None and known.best - known.random < 0.95 * (known.estimate - known.random):
-        text += " **The range is too wide to call a score a percentage of the optimum.**"
+    else:
+        first = f"Proved is only that it is at most {bound['value']:.4g}: {bound['why']}."
+    if estimate is None:
+        second = f"Value iteration{easier} gives no estimate: its own policy gets more."
+    else:
+        second = (
+            f"Value iteration{easier} estimates {plus_minus(estimate['value'], estimate['error'])} for the"
+            f" starts of {found['episodes']:,} episodes: extrapolated to a grid without width, with an error"
+            " bar of what the last halving of the cells changed. That is no proof."
+        )
+    parts = [first, second]
+    if lower is not None:
+        low, high = lower["interval"]
+        parts.append(f"Its greedy policy gets {lower['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}).")
+    known = KNOWN_RETURNS.get(env_id)
+    if known is not None and estimate is not None:
+        upper = min(bound["value"], estimate["value"] + estimate["error"])
+        if known.best - known.random < 0.95 * (upper - known.random):
+            parts.append("**The range is too wide to call a score a percentage of the optimum.**")
     picture = DOCS / IMAGES / f"value-{env_id}.png"
+    text = "**Optimum.** " + " ".join(parts)
     return [text, *([_image(picture.name, f"{env_id}: value function")] if picture.exists() else [])]
 
 
@@ -479,7 +574,7 @@ def adapter() -> str:
         ours, theirs = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
         rows.append([row["kind"], str(row["num_envs"]), ours, theirs, f"{row['ratio'][1]:.1f}"])
     text = (
-        f"`make_sb3_vec_env` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
+        f"`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
         f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
     )

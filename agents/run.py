@@ -37,7 +37,7 @@ class Run:
     env, algo, seed, steps : str, str, int, int
         Id of the environment, name of the learner, seed, steps to train for.
     hyperparameters : dict
-        As in the files of `agents/hyperparams`.
+        As in the files of `lag_envs/hyperparams`.
     """
 
     folder: Path

@@ -1,39 +1,54 @@
 """Measure the mean returns that `lag_envs.scores` and the leaderboard's `REFERENCES` are set to.
 
-``python -m agents.scale`` prints, for each environment, what random actions, the reference and the best
-policy known return, beside the numbers in use. A policy that takes long plays 1,000 episodes, less its luck
-in them as far as the reference tells (`ranking.corrected`).
+``python -m agents.scale`` plays, for each environment, random actions, the best policy known and the board's
+reference, and prints means and standard errors beside the numbers in use. A policy that takes long plays the
+first of the episodes only, and the luck in them is taken out by what the reference gets there and in all (a
+control variate); what the reference is set to comes from other episodes, independent of all that.
+``agents/results/scale.json`` keeps the numbers (``--output``), and README shows them.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
+import json
 import math
 import sys
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.evaluate import evaluate_batch
 from agents.optimum import Optimal
-from agents.run import UserError, check_env
+from agents.results import to_json
+from agents.run import UserError, check_env, write
 from lag_envs import TASKS
-from lag_envs.controllers import make_controller
+from lag_envs.benchmark import machine
+from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.leaderboard.protocol import REFERENCES
-from lag_envs.leaderboard.ranking import corrected
 from lag_envs.scores import KNOWN_RETURNS
 
-#: Seeds of nobody else; episodes that are played together, and of policies that take long.
-FIRST_SEED, BATCH, FEW = 4_000_000_000, 65_536, 1_000
-SLOW = ("iLQR", "optimal")
+Array = NDArray[np.float64]
+
+#: Seeds of nobody else, and those of the references' own means; episodes that are played together; how many
+#: policies play that take long.
+FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
+SLOW = {"iLQR": 1_000, "optimal": 4_096}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 for an environment that does not exist."""
+    """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
-    p.add_argument("--batches", type=int, default=1, help=f"of {BATCH:,} episodes (default %(default)s)")
+    p.add_argument("--batches", type=int, default=8, help=f"of {BATCH:,} episodes (default %(default)s)")
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
+    p.add_argument(
+        "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
+    )
     args = p.parse_args(arguments)
     try:
         envs = [check_env(name) for name in args.env] or list(TASKS)
@@ -42,39 +57,93 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"agents.scale: error: {error}", file=sys.stderr)
         return 2
+    kept: dict[str, Any] = {}
+    if args.output and args.output.exists():
+        kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-        known = KNOWN_RETURNS[env_id]
-        reference, mean = REFERENCES.get(env_id, (None, None))
-        show(env_id, "random", many(env_id, "random", args.batches), known.random)
-        if reference is not None:
-            show(env_id, reference, many(env_id, reference, args.batches), mean)
-        if known.policy in SLOW and not args.quick:
-            show(env_id, known.policy, few(env_id, known.policy, reference), known.best)
-        elif known.policy not in (*SLOW, reference):
-            show(env_id, known.policy, many(env_id, known.policy, args.batches), known.best)
+        kept[env_id] = measured(env_id, args.batches, args.quick)
+        if args.output:
+            about = {"date": datetime.date.today().isoformat(), "machine": machine()}
+            seeds = {"first_seed": FIRST_SEED, "first_seed_of_references": REFERENCE_SEED}
+            in_order = {name: kept[name] for name in TASKS if name in kept}
+            write(args.output, to_json(about | seeds | {"envs": in_order}))
     return 0
 
 
-def many(env_id: str, name: str, batches: int) -> np.ndarray:
+def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
+    """Measure an environment's policies, and print a line for each.
+
+    Returns
+    -------
+    dict
+        By policy ``mean``, standard ``error`` and the ``episodes`` that it played; ``reference`` is the
+        board's, and ``optimum``, for ``InclineBrake-v0``, what is known of it.
+    """
+    known, reference = KNOWN_RETURNS[env_id], REFERENCES.get(env_id)
+    found: dict[str, Any] = {}
+
+    def show(name: str, mean: float, error: float, episodes: int, used: float | None) -> None:
+        found[name] = {"mean": round(mean, 6), "error": round(error, 6), "episodes": episodes}
+        print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}   in use: {used}", flush=True)
+
+    for name, value in (("random", known.random), (known.policy, known.best)):
+        if name not in SLOW:
+            returns = many(env_id, name, batches)
+            show(name, *mean_and_error(returns), len(returns), value)
+    if known.policy in SLOW and not quick:
+        agent = Optimal(env_id) if known.policy == "optimal" else make_controller(env_id, known.policy)
+        returns = evaluate_batch(env_id, agent, FIRST_SEED, SLOW[known.policy])
+        same = None if reference is None else many(env_id, reference[0], batches)
+        show(known.policy, *without_luck(returns, same), len(returns), known.best)
+    if reference is not None:
+        returns = many(env_id, reference[0], batches, REFERENCE_SEED)
+        show("reference", *mean_and_error(returns), len(returns), reference[1])
+    if env_id == "InclineBrake-v0":
+        best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
+        show("optimum", *mean_and_error(best), len(best), known.optimum)
+    return found
+
+
+def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array:
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
-    firsts = (FIRST_SEED + k * BATCH for k in range(batches))
+    firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 
-def few(env_id: str, name: str, reference: str | None) -> np.ndarray:
-    """Return a slow policy's returns, without its luck."""
-    agent = Optimal(env_id) if name == "optimal" else make_controller(env_id, name)
-    played = {"returns": evaluate_batch(env_id, agent, FIRST_SEED, FEW)}
-    if reference is not None:
-        played["reference"] = evaluate_batch(env_id, make_controller(env_id, reference), FIRST_SEED, FEW)
-    return corrected(env_id, [played])[0]
+def optima(first: int) -> Array:
+    """Return the largest returns of a batch of the braking task."""
+    envs = gym.make_vec("InclineBrake-v0", BATCH)
+    envs.reset(seed=first)
+    bare: Any = envs.unwrapped
+    best = optimal_return(bare.task, *bare.state.T)
+    envs.close()
+    return best
 
 
-def show(env_id: str, name: str, returns: np.ndarray, used: float | None) -> None:
-    """Print a line."""
-    error = returns.std() / math.sqrt(len(returns))
-    print(f"{env_id:28} {name:20} {returns.mean():10.4f} ± {error:.4f}   in use: {used}", flush=True)
+def without_luck(returns: Array, reference: Array | None) -> tuple[float, float]:
+    """Return mean and standard error of returns in the first of the episodes that a reference played.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> luck = np.random.default_rng(0).normal(size=10_000)
+    >>> mean, error = without_luck(5.0 + 2.0 * luck[:100], luck)
+    >>> abs(mean - 5.0) < 0.05, error < 0.03
+    (True, True)
+    """
+    if reference is None:
+        return mean_and_error(returns)
+    same = reference[: len(returns)]
+    slope = float(np.cov(returns, same)[0, 1] / same.var(ddof=1))
+    rest, its = mean_and_error(returns - slope * same)
+    mean, error = mean_and_error(reference)
+    return rest + slope * mean, math.hypot(its, slope * error)
+
+
+def mean_and_error(returns: Array) -> tuple[float, float]:
+    """Return the mean and its standard error."""
+    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(len(returns))
 
 
 if __name__ == "__main__":

@@ -146,7 +146,7 @@ def optimal(
     policy, arrays = tabulate(solution, COARSE[env_id])
     sizes = " x ".join(map(str, solution.programs[0].grid.shape))
     return write(
-        folder, env=env_id, name="optimal", authors=AUTHORS, license=LICENSE, kind="optimal", policy=policy,
+        folder, env=env_id, name="optimal", authors=AUTHORS, license=LICENSE, policy=policy,
         arrays={0: arrays},
         description=f"value iteration on {sizes} nodes, coarsened to a table; greedy one step ahead",
     )  # fmt: skip
@@ -161,7 +161,7 @@ def learned(env_id: str, runs: Path, folder: Path) -> Submission:
     name = ALGORITHMS[algo][1] if algo in ALGORITHMS else algo
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
-        description="Stable-Baselines3, hyperparameters in agents/hyperparams",
+        description="Stable-Baselines3, hyperparameters as `lag-envs hyperparams` prints them",
     )  # fmt: skip
     print(f"  acts as the models do: actions differ by {off:.1e} at most, over {count} observations of each")
     return made
@@ -170,7 +170,7 @@ def learned(env_id: str, runs: Path, folder: Path) -> Submission:
 def controller(env_id: str, name: str, folder: Path) -> Submission:
     """Write a built-in controller as a submission."""
     return write(
-        folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE, kind="controller",
+        folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
         policy={"architecture": "controller", "name": name},
     )  # fmt: skip
 

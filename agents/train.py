@@ -36,9 +36,9 @@ EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
 
 The same command goes on where a run was broken off, by Ctrl-C or by a kill; seeds that are finished are left
 as they are. A run that goes on from its checkpoint gives the numbers that it would have given uninterrupted.
-Hyperparameters are in agents/hyperparams, in the form of the RL Zoo, which takes them unchanged:
-  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs \\
-      --conf-file agents/hyperparams/ppo.yml
+Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
+  lag-envs hyperparams ppo > ppo.yml
+  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
 
 examples:
   python -m agents.train PivotedBar-v0                          one seed of PPO, in less than a minute

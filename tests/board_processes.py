@@ -13,7 +13,10 @@ from pathlib import Path
 import fake_submissions
 from fake_submissions import write
 
-from lag_envs.leaderboard import submission
+from lag_envs.leaderboard import (
+    ranking,  # noqa: F401, so that not every process imports SciPy
+    submission,
+)
 from lag_envs.leaderboard.board import Board, finish
 
 #: What changes files. Each call is a moment to be killed at.

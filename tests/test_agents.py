@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from agents import bench, demo, report, scale
-from agents.sb3_vec_env import SB3VecEnv, ScaledReward, make_sb3_vec_env
+from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import KNOWN_RETURNS, score
 from lag_envs.tasks import TASKS
 
@@ -35,7 +35,7 @@ def test_score():
 
 def pair(env_id, n=3, seed=7, **options):
     """Return the adapter and SB3's own vector environment over single ones, seeded alike."""
-    ours = make_sb3_vec_env(env_id, n, **options)
+    ours = make_vec_env(env_id, n, **options)
     theirs = DummyVecEnv([lambda: gym.make(env_id, **options)] * n)
     for envs in (ours, theirs):
         envs.seed(seed)
@@ -91,7 +91,7 @@ def test_adapter_passes_options_and_infos_on():
 
 
 def test_adapter_attributes():
-    envs = make_sb3_vec_env(ENV, 3, render_mode="rgb_array", mass=[0.1, 0.2, 0.3])
+    envs = make_vec_env(ENV, 3, render_mode="rgb_array", mass=[0.1, 0.2, 0.3])
     envs.seed(1)
     observations = envs.reset()
     assert [s.shape for s in envs.get_attr("state")] == [(4,)] * 3
@@ -110,12 +110,12 @@ def test_adapter_attributes():
 
 def test_adapter_refuses_another_autoreset_mode():
     with pytest.raises(ValueError, match="SameStep"):
-        SB3VecEnv(gym.make_vec(ENV, 2))
+        VecEnv(gym.make_vec(ENV, 2))
 
 
 def test_spread_starts():
     """The environments then end their first episodes one after the other."""
-    envs = make_sb3_vec_env(ENV, 4, spread=20, duration=0.4)
+    envs = make_vec_env(ENV, 4, spread=20, duration=0.4)
     envs.seed(1)
     first = envs.reset()
     ends = {t: np.flatnonzero(envs.step(np.zeros((4, 1), np.float32))[2]).tolist() for t in range(1, 41)}
@@ -127,7 +127,7 @@ def test_spread_starts():
 def test_sb3_wrappers_and_learner_work_on_the_adapter():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        envs = VecMonitor(make_sb3_vec_env(ENV, 4, duration=0.5))
+        envs = VecMonitor(make_vec_env(ENV, 4, duration=0.5))
         model = PPO("MlpPolicy", VecNormalize(ScaledReward(envs, 0.1)), n_steps=32, batch_size=64, n_epochs=1)
         model.learn(256)
     assert {e["l"] for e in model.ep_info_buffer} == {25}
@@ -218,15 +218,26 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
 # --- the scale of scores ---
 
 
-def test_scale_measures_what_is_in_use(monkeypatch, capsys):
+def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(scale, "BATCH", 500)
-    monkeypatch.setattr(scale, "FEW", 20)
-    assert scale.main(["InclineBrake-v0", "--batches", "2"]) == 0
+    file = tmp_path / "scale.json"
+    assert scale.main(["InclineBrake-v0", "--batches", "2", "--output", str(file)]) == 0
+    found = json.loads(file.read_text())["envs"]["InclineBrake-v0"]
+    assert list(found) == ["random", "switching line", "reference", "optimum"]
+    assert {row["episodes"] for row in found.values()} == {1000}
+    # The same starts: so little is lost by acting at intervals.
+    assert 0.0 < found["optimum"]["mean"] - found["switching line"]["mean"] < 4e-4
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 2
+    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 4
     for line in lines:
         mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
         assert abs(mean - used) < 5.0 * error
     assert scale.main(["CylinderInCylinderPump-v0", "--quick"]) == 0
     assert "optimal" not in capsys.readouterr().out
+    monkeypatch.setitem(scale.SLOW, "iLQR", 20)
+    assert scale.main(["CylinderInCylinderTilt-v0", "--batches", "1", "--output", str(file)]) == 0
+    assert list(json.loads(file.read_text())["envs"]) == ["InclineBrake-v0", "CylinderInCylinderTilt-v0"]
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if " iLQR " in line)
+    mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
+    assert abs(mean - used) < 5.0 * error < 1.0
     assert scale.main(["InclineBrak-v0"]) == 2 and scale.main(["--batches", "0"]) == 2

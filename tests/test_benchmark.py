@@ -97,6 +97,9 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--seconds", "nan"], "a number above 0 is needed, got 'nan'"),
         (["bench", "--output", "."], "--output must name a file"),
         (["bench", "--output", "no/such/folder.json"], "there is no folder"),
+        (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
+        (["bench", "--checkout", ".", "InclineTilt-v0"], "leave out IDs, --quick, --cold, --sizes"),
+        (["bench", "--checkout", "nowhere"], "nowhere/README.md is not there"),
         (["fly"], "invalid choice: 'fly'"),
     ],
 )
@@ -286,6 +289,46 @@ def test_targets(ratio, met):
     assert results["single, made: at least 2 x CartPole-v1"]["met"] is None
     assert results["cold start, cache empty: below 2.5 s"]["met"] is True
     assert results["cold start, cache filled: below 0.5 s"]["met"] is False
+
+
+def report_of(ratios):
+    """Return a report in which, at the targets' sizes, an environment is so many times as fast."""
+    rows = []
+    for target, ratio in zip(benchmark.TARGETS, ratios, strict=True):
+        rows += [made("gymnasium", "CartPole-v1", target.kind, target.num_envs, [1e7])]
+        rows += [made("lag_envs", ID, target.kind, target.num_envs, [ratio * 1e7] if ratio else [])]
+        rows[-1].problem = None if ratio else "failed: OSError: no luck"
+    return {
+        "date": "2020-02-20", "machine": {"processor": "P"}, "versions": {"gymnasium": "1"},
+        "settings": {"rounds": 1, "clock": "wall"}, "rows": [benchmark.summary(r, rows) for r in rows],
+        "cold_start": {"empty": {"median": 1.234}},
+    }  # fmt: skip
+
+
+def test_checkout_takes_the_table_over(tmp_path):
+    (tmp_path / "docs").mkdir()
+    marks = "".join(f"<!-- {name}:begin --><!-- {name}:end -->\n" for name in ("fast", "bench"))
+    (tmp_path / "README.md").write_text(marks)
+    report = report_of([2.0, 5.99, 20.0, 1.5])
+    benchmark.take_over(report, tmp_path)
+    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(benchmark.to_json(report))
+    text = (tmp_path / "README.md").read_text()
+    assert (
+        f"| {ID} | 50 ns, 2.0× | 16.7 ns, **5.99×, missed** | 5 ns, 20.0× | 66.7 ns, **1.50×, missed** |"
+        in text
+    )
+    assert "| CartPole-v1 | 100 ns | 100 ns | 100 ns | 100 ns |" in text
+    assert "2020-02-20" in text and "took 1.23 s with its cache empty" in text
+    assert "alone 2 to 2 times" in text and "2 of 4 aims are missed" in text
+    assert "all aims are met" in benchmark.claim(report_of([2.0, 6.0, 3.0, 3.0]))
+    assert "| failed: OSError: no luck |" in benchmark.markdown(report_of([2.0, 6.0, None, 3.0]))
+
+
+def test_what_was_broken_off_is_not_taken_over(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "PEERS", benchmark.PEERS[:1])
+    monkeypatch.setattr(benchmark, "measure", lambda *_: False)
+    monkeypatch.setattr(benchmark, "take_over", lambda *_: pytest.fail("taken over"))
+    assert not benchmark.bench(tiny(tmp_path, checkout=str(tmp_path)))["complete"]
 
 
 @pytest.mark.parametrize(

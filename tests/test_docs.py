@@ -14,9 +14,13 @@ import pytest
 from reference import flow, scales
 from rollouts import IDS, actions, make
 
+from lag_envs.benchmark import TARGETS
+from lag_envs.envs.program import BLOCK
 from lag_envs.report.docs import generated
 from lag_envs.report.report import SECTIONS
+from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, load_task
 
 ROOT = Path(__file__).parents[1]
@@ -258,12 +262,39 @@ def test_stated_returns(env_id):
     policies = [lambda o: rng.uniform(-1.0, 1.0, len(o)), lambda o: np.full(len(o), zero)]
     policies += [LAWS[env_id]] if env_id in LAWS else []
     rows = {row["Id"]: row for row in table(page(make(env_id))["Optimal Value"])}
-    _, *cells = rows[env_id].values()
+    _, *cells, best = rows[env_id].values()
+    assert_measured(best, env_id, KNOWN_RETURNS[env_id].policy)
     for cell, policy in zip(cells, policies, strict=True):
         stated, error = cell.split(" ± ")
         mean, standard_error = returns(env_id, policy)
         assert agrees(stated, mean) or abs(float(stated) - mean) <= standard_error, (mean, cell)
         assert agrees(error, standard_error), (standard_error, cell)
+
+
+def scale():
+    """Return what `python -m agents.scale` measured, by environment and policy."""
+    return json.loads((ROOT / "agents" / "results" / "scale.json").read_text(encoding="utf-8"))["envs"]
+
+
+def assert_measured(cell, env_id, policy):
+    """Hold a mean ± standard error against what was measured."""
+    found, (mean, error) = scale()[env_id][policy], cell.split(" ± ")
+    assert agrees(mean, found["mean"]) and agrees(error, found["error"]), (env_id, cell, found)
+
+
+@each_id
+def test_scale_is_what_was_measured(env_id):
+    """It was set once; what was measured since lies within the errors of both, or it would mislead."""
+    known, found = KNOWN_RETURNS[env_id], scale()[env_id]
+    best = found[known.policy]
+    assert known.error == pytest.approx(best["error"], rel=0.2)
+    assert abs(known.best - best["mean"]) < 3.0 * known.error
+    # What counts as random was set from fewer episodes.
+    assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
+    assert (known.optimum is not None) == ("optimum" in found)
+    if known.optimum is not None:
+        assert known.optimum == pytest.approx(found["optimum"]["mean"], abs=1e-4)
+        assert best["mean"] < found["optimum"]["mean"] < best["mean"] + 5e-4  # the same starts
 
 
 # --- README and the other pages ---
@@ -287,10 +318,13 @@ def test_readme_names_every_id():
 
 @each_id
 def test_readme_row(env_id):
-    """README's table repeats what page and scale of scores say."""
+    """README's table repeats what page and measurements say."""
     env, row = make(env_id), environments()[env_id]
-    known = KNOWN_RETURNS[env_id]
-    assert agrees(row["optimum"].removeprefix("≥ "), known.best) and agrees(row["random"], known.random)
+    best, _, optimum = row["best known"].partition("; optimum ")
+    assert_measured(best, env_id, KNOWN_RETURNS[env_id].policy)
+    assert_measured(row["random"], env_id, "random")
+    if optimum or "optimum" in scale()[env_id]:
+        assert agrees(optimum, scale()[env_id]["optimum"]["mean"])
     stated = re.search(r"is at most ([\d.]+) rad/s", plain(page(env)["Numerical Accuracy"]))
     assert row["certified"] == (stated[1] if stated else "exact")
     (control,) = table(page(env)["Action Space"])
@@ -329,7 +363,53 @@ def test_make_targets(file):
 def test_generated_parts_are_as_generated():
     """README's tables and docs/accuracy.md follow from the JSON files beside them."""
     for path, text in generated(ROOT).items():
-        assert path.read_text(encoding="utf-8") == text, f"{path.name}: make report-docs writes it anew"
+        assert path.read_text(encoding="utf-8") == text, (
+            f"{path.name}: `make report ARGS='--docs .'` writes it anew"
+        )
+
+
+def test_speeds():
+    """One table with all ids at four sizes; what misses its aim says so, and README claims no more."""
+    speed = json.loads((ROOT / "docs" / "speed.json").read_text(encoding="utf-8"))
+    assert speed["complete"]
+    block = readme().partition("<!-- bench:begin -->")[2].partition("<!-- bench:end -->")[0]
+    rows = {row.pop("id"): list(row.values()) for row in table(block)}
+    assert list(rows) == [*IDS, "CartPole-v1", "*aim*"]
+    aims = [float(cell.strip("*×")) for cell in rows["*aim*"]]
+    assert aims == [target.ratio for target in TARGETS] and len(aims) == 4
+    found = {(r["id"], r["kind"], r["num_envs"]): r for r in speed["rows"] if r["library"] == "lag_envs"}
+    for env_id, target in itertools.product(IDS, TARGETS):
+        cell = rows[env_id][TARGETS.index(target)]
+        row = found[env_id, target.kind, target.num_envs]
+        time, ratio = re.findall(r"([\d.,]+) ns.*?([\d.]+)×", cell)[0]
+        assert float(time.replace(",", "")) == pytest.approx(1e9 / row["steps_per_second"][1], rel=6e-3)
+        assert agrees(ratio, row["ratio"][1])
+        assert ("missed" in cell) == (row["ratio"][1] < target.ratio)
+        assert row["ratio"][1] > 1.0  # README's first sentence
+
+
+def test_numbers_in_the_prose():
+    """What README and docs/numerics.md say of the code's own numbers is so."""
+    pages = {
+        name: plain((ROOT / name).read_text(encoding="utf-8")) for name in ("README.md", "docs/numerics.md")
+    }
+    k = make("PivotedBarFree-v0").task.constants()
+    doubling = math.log(2.0) / math.sqrt(k["weight"])
+    said = {
+        "README.md": [
+            f"doubles an error every {doubling:.2f} s",
+            f"stepped in blocks of {BLOCK},",
+            "more than a million substeps",
+        ],
+        "docs/numerics.md": [
+            f"more than {pendulum.MAX_SUBSTEPS:,} substeps",
+            f"blocks of {BLOCK} environments",
+            f"order is {PivotedBar().order} for the bar, {CylinderInCylinder().order} for the shell and"
+            f" {pendulum.ORDER} where",
+        ],
+    }
+    assert pendulum.MAX_SUBSTEPS == 1_000_000
+    assert [(page, text) for page, texts in said.items() for text in texts if text not in pages[page]] == []
 
 
 def test_figures_of_the_report_are_there():

@@ -317,7 +317,7 @@ def corners(env_id):
     ranges = make(env_id).task.usable_ranges()
     ranges = {name: ranges[name] for name in parameters(env_id)[0]} | {"dt": (1e-6, 1.0)}
     if "tilt" in ranges:
-        ranges["tilt"] = (0.0, 1.57)
+        ranges["tilt"] = (0.0, 0.5 * math.pi)
     for values in itertools.product(*ranges.values()):
         keywords = dict(zip(ranges, values, strict=True)) | {"duration": 20.0}
         if "shell_radius" in keywords:  # the smallest shell has room for one radius, the largest for less

@@ -9,10 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy
+from mpmath import mp, mpf
 from sympy import cos, sin
 
 from lag_envs import lagrange
 from lag_envs.lagrange import coordinates, euler_lagrange, symbolic, t
+from lag_envs.report.reference import linear
 from lag_envs.scenes import SCENES, CylinderInCylinder, Incline, Motion, PivotedBar
 from lag_envs.stepping.pendulum import Drive
 from lag_envs.stepping.slope import Pull, Turn
@@ -357,6 +359,40 @@ def test_frame_energy_of_the_bar():
     assert energy[1] - energy[0] == pytest.approx(work, rel=1e-13)
 
 
+@pytest.mark.parametrize("tilt", [math.pi / 2, -math.pi / 2])
+def test_a_vertical_plane(tilt):
+    """The cylinder rolls down a wall as on any slope, but nothing presses it to it: no friction is enough."""
+    side = math.copysign(1.0, tilt)
+    for damping in (0.0, 0.3):
+        plane = Incline(tilt=tilt, damping=damping)
+        end = plane.simulate([0.1, -0.2], [0.0], 0.5)[1]
+        with mp.workdps(40):
+            drag, pull = mpf(damping) / mpf(1.5), side * mpf(9.81) / mpf(1.5)
+            exact = linear(drag, pull, mpf(0), mpf(0.1), mpf(-0.2), mpf(0.5))
+            assert max(abs(a - b) for a, b in zip(end, exact, strict=True)) < 1e-15
+        assert plane.energy_balance([0.1, -0.2], 0.0, 0.5)["residual"] == pytest.approx(0.0, abs=1e-14)
+    forces = Incline(tilt=tilt).forces([0.1, -0.2])
+    assert abs(forces["normal"]) < 1e-15 and forces["friction"] == pytest.approx(side * 9.81 / 3.0)
+    assert forces["needed_friction"] == math.inf
+    # The same plane, by tilting it: with the control, and on the way.
+    assert Incline(control="tilt").forces([0.1, -0.2], tilt)["needed_friction"] == math.inf
+    assert Incline(control="tilt_rate").forces([0.1, -0.2, tilt], 0.0)["needed_friction"] == math.inf
+    for beyond in (math.nextafter(tilt, 2.0 * tilt), 1.01 * tilt):
+        refuses(Incline, "tilt must be at (most|least)", tilt=beyond)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-13, 9.9e-13, 1.01e-12, 1e-9, 1.0])
+@pytest.mark.parametrize("mass", [1e-3, 1.0, 1e3])
+def test_what_counts_as_no_load(share, mass):
+    """A normal force up to 1e-12 of the weight is none, on the plane and in the shell."""
+    angle = math.acos(share)
+    plane, shell = Incline(mass=mass, control="tilt"), CylinderInCylinder(mass=mass, control="damping")
+    for forces in (plane.forces([0.0, 0.0], angle), shell.forces([angle, 0.0])):
+        assert math.isinf(forces["needed_friction"]) == (share <= 1e-12)
+        if share > 1e-12:
+            assert forces["needed_friction"] == pytest.approx(1.0 / 3.0 * math.sin(angle) / share, rel=1e-3)
+
+
 def test_contact_is_lost():
     shell = CylinderInCylinder(control="damping")
     forces = shell.forces([[3.0, 0.0], [3.0, 50.0]], [0.0, 0.0])
@@ -381,9 +417,11 @@ def test_every_parameter_is_checked(scene, field):
         assert str(bad)[:5] in message
     for bad in (True, np.True_, "1", 1j, [1.0], np.array([1.0]), object):
         refuses(scene, f"^{field.name} must be a real number, got", **{field.name: bad})
-    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
-    unit = field.metadata["unit"]
-    for limit, rule, beyond in ((above, "above", 0.0), (least, "at least", -1e-9), (below, "below", 0.0)):
+    unit, above = field.metadata["unit"], field.metadata["above"]
+    rules = {"above": ("above", 0.0), "below": ("below", 0.0)}
+    rules |= {"least": ("at least", -1e-9), "most": ("at most", 1e-9)}
+    for key, (rule, beyond) in rules.items():
+        limit = field.metadata[key]
         if limit is not None:
             bad = limit + beyond
             message = refuses(scene, f"^{field.name} must be {rule} {limit:g}", **{field.name: bad})

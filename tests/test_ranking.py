@@ -8,10 +8,11 @@ import pytest
 
 from agents.evaluate import evaluate_batch
 from lag_envs.controllers import make_controller
-from lag_envs.leaderboard.protocol import REFERENCES
+from lag_envs.leaderboard.protocol import REFERENCES, Reference
 from lag_envs.leaderboard.ranking import (
     RESAMPLES,
     THRESHOLDS,
+    Scores,
     columns,
     compare,
     corrected,
@@ -21,9 +22,12 @@ from lag_envs.leaderboard.ranking import (
     median_time,
     normalised,
     optimality_gap,
+    policy_error,
     profile,
     ranked,
     redrawn,
+    scored,
+    slope,
     wilson,
 )
 from lag_envs.scores import KNOWN_RETURNS, score
@@ -47,10 +51,15 @@ def returns(scores):
     return (KNOWN.random + np.asarray(scores) * (KNOWN.best - KNOWN.random)).tolist()
 
 
+def table(scores):
+    """Return scores, given for each policy and episode, as of a row."""
+    return Scores(np.atleast_2d(np.asarray(scores, np.float64)))
+
+
 def board(**rows):
-    """Return the places of rows, whose scores are given for each policy and episode."""
-    scores = {id: np.atleast_2d(table) for id, table in rows.items()}
-    return ranked(scores, {id: redrawn(id, table) for id, table in scores.items()})
+    """Return the places of rows."""
+    scores = {id: row if isinstance(row, Scores) else table(row) for id, row in rows.items()}
+    return ranked(scores, {id: redrawn(id, each) for id, each in scores.items()})
 
 
 def policies(*means, episodes=4):
@@ -62,10 +71,8 @@ def policies(*means, episodes=4):
 
 
 def test_scale_is_that_of_the_scores():
-    assert normalised(ENV, [KNOWN.random, KNOWN.best]).tolist() == [0.0, 1.0]
-    assert normalised(ENV, returns([[0.5, 2.0]])) == pytest.approx(np.array([[0.5, 2.0]]))
-    with pytest.raises(ValueError, match="Unknown-v0 has no scale"):
-        normalised("Unknown-v0", [0.0])
+    assert normalised(KNOWN, [KNOWN.random, KNOWN.best]).tolist() == [0.0, 1.0]
+    assert normalised(KNOWN, returns([[0.5, 2.0]])) == pytest.approx(np.array([[0.5, 2.0]]))
 
 
 def test_interquartile_mean():
@@ -98,19 +105,20 @@ def test_probability_of_improvement():
 
 def test_intervals_of_two_policies():
     """Two seeds a < b give means a, b and their middle with 1/4, 1/4, 1/2, so the interval is [a, b]."""
-    drawn = redrawn("any", policies(0.2, 0.4))
+    drawn = redrawn("any", table(policies(0.2, 0.4)))
     assert drawn.shape == (RESAMPLES, 2)
     assert ends(iqm(drawn)) == pytest.approx((0.2, 0.4))
     share = np.mean(np.isclose(iqm(drawn), 0.3))
     assert share == pytest.approx(0.5, abs=0.05)
     # Against one that lies in between, all of 0, 1/2 and 1 may come out.
-    chance = compare(policies(0.2, 0.4), policies(0.3, 0.3), drawn, redrawn("other", policies(0.3, 0.3)))
+    same = table(policies(0.3, 0.3))
+    chance = compare(table(policies(0.2, 0.4)), same, drawn, redrawn("other", same))
     assert chance == (0.5, 0.0, 1.0) and chance.undecided
 
 
 def test_a_single_policy_is_drawn_anew_by_episodes():
     scores = np.random.default_rng(0).normal(0.8, 0.3, (1, 1000))
-    drawn = redrawn("single", scores)
+    drawn = redrawn("single", table(scores))
     assert drawn.shape == (RESAMPLES, 1)
     low, high = ends(iqm(drawn))
     error = 1.96 * scores.std() / np.sqrt(1000)
@@ -175,8 +183,8 @@ def test_numbers_are_the_same_each_time_and_whoever_else_is_there():
     a, b, c = (rng.normal(m, 0.3, (5, 20)) for m in (0.6, 0.55, 0.5))
     first, second = board(a=a, b=b), board(a=a, b=b, c=c)
     assert first == second[:2]
-    np.testing.assert_array_equal(redrawn("a", a), redrawn("a", a))
-    assert (redrawn("a", a) != redrawn("b", a)).any()
+    np.testing.assert_array_equal(redrawn("a", table(a)), redrawn("a", table(a)))
+    assert (redrawn("a", table(a)) != redrawn("b", table(a))).any()
 
 
 def test_columns_of_a_row():
@@ -194,54 +202,130 @@ def test_columns_of_a_row():
         "robustness": {"mass +20 %": returns(np.arange(5.0)), "late": [None] * 5},
         "often": returns([0.5] * 5),
     }
-    row = columns(ENV, result, redrawn("a", scores))
+    row = columns(ENV, result, 10, KNOWN, table(scores))
     assert row["score"] == pytest.approx(np.sort(scores.mean(axis=1))[1:-1].mean())
-    assert row["interval"][0] <= row["score"] <= row["interval"][1]
     assert row["return"] == pytest.approx(np.mean(returns(scores)))
     assert row["gap"] == pytest.approx(1.0 - scores.mean())
     assert row["success"]["rate"] == 0.75 and row["success"]["low"] < 0.75 < row["success"]["high"]
     assert (row["settle"], row["effort"]) == (2.0, 0.25)
-    assert row["robustness"] == {"mass +20 %": pytest.approx(2.0)} and row["often"] == pytest.approx(0.5)
+    moved = scores.mean(axis=1) - scores[:, :10].mean(axis=1)
+    assert row["robustness"] == {"mass +20 %": pytest.approx(iqm(np.arange(5.0) + moved))}
+    assert row["often"] == pytest.approx(iqm(0.5 + moved))
     assert len(row["profile"]) == len(THRESHOLDS)
     # What is not measured is None, as for an agent that cannot act more often.
     bare = {"policies": [{"returns": returns(row)} for row in scores], "often": [None] * 5}
-    row = columns(ENV, bare, redrawn("a", scores))
+    row = columns(ENV, bare, 10, KNOWN, table(scores))
     assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
 
 
 # --- luck ---
 
 
+MEAN = Reference("LQR", 452.7, 0.139, 524_288)
+
+
 def test_luck_is_taken_out():
-    env_id = "PivotedBarBalance-v0"
-    mean = REFERENCES[env_id][1]
     luck = np.random.default_rng(0).normal(3.0, 50.0, (2, 4000))
 
     def policies(returns):
-        return [{"returns": r, "reference": mean + x} for r, x in zip(returns, luck, strict=True)]
+        return [{"returns": r, "reference": MEAN.mean + x} for r, x in zip(returns, luck, strict=True)]
 
     # One that is half as lucky as the reference, and one that has nothing to do with it.
-    half = corrected(env_id, policies(400.0 + 0.5 * luck))
-    np.testing.assert_allclose(half, 400.0, rtol=1e-12)
+    half = policies(400.0 + 0.5 * luck)
+    np.testing.assert_allclose(corrected(MEAN, half), 400.0, rtol=1e-12)
+    assert slope(half) == pytest.approx(0.5) and policy_error(MEAN, half) == pytest.approx(0.5 * MEAN.error)
     other = np.random.default_rng(1).normal(30.0, 1.0, luck.shape)
-    np.testing.assert_allclose(corrected(env_id, policies(other)).mean(axis=1), other.mean(axis=1), atol=0.1)
+    np.testing.assert_allclose(corrected(MEAN, policies(other)).mean(axis=1), other.mean(axis=1), atol=0.1)
     # Where there is no reference, or none was recorded, or it is always the same, returns stay.
-    assert corrected(env_id, [{"returns": [1.0, 2.0]}]).tolist() == [[1.0, 2.0]]
-    assert corrected("PivotedBar-v0", policies(other)).tolist() == other.tolist()
-    still = [{"returns": [1.0, 2.0], "reference": [mean, mean]}]
-    assert corrected(env_id, still).tolist() == [[1.0, 2.0]]
+    assert corrected(MEAN, [{"returns": [1.0, 2.0]}]).tolist() == [[1.0, 2.0]]
+    assert corrected(MEAN, [{"returns": [1.0, 2.0], "reference": None}]).tolist() == [[1.0, 2.0]]
+    assert corrected(None, policies(other)).tolist() == other.tolist()
+    still = [{"returns": [1.0, 2.0], "reference": [MEAN.mean, MEAN.mean]}]
+    assert corrected(MEAN, still).tolist() == [[1.0, 2.0]]
+
+
+class Range:
+    random, best = 0.0, 452.7
+
+
+def test_the_reference_has_its_own_mean_and_the_error_of_that():
+    """It corrects itself: of its own episodes nothing is left, so its interval is that of the others."""
+    own = np.random.default_rng(0).normal(440.0, 100.0, 1000)
+    scores = scored(Range, MEAN, [{"returns": own, "reference": own}])
+    assert scores.own and scores.table.mean() == pytest.approx(MEAN.mean / 452.7)
+    low, high = ends(iqm(redrawn("reference", scores)))
+    assert (high - low) / 2 == pytest.approx(1.96 * MEAN.error / 452.7, rel=0.05)
+    assert (high + low) / 2 == pytest.approx(MEAN.mean / 452.7, abs=2e-5)
+    assert not scored(Range, None, [{"returns": own, "reference": own}]).own
+    assert not scored(Range, MEAN, [{"returns": own + 0.1 * np.arange(1000), "reference": own}]).own
+
+
+@pytest.mark.parametrize("policies", [1, 5])
+@pytest.mark.parametrize("part", [0.0, 0.5, 1.0, 2.0])
+def test_every_interval_holds_the_error_of_the_references_mean(part, policies):
+    """As far as a row was corrected by it, whoever it is."""
+    rng = np.random.default_rng(2)
+    luck = rng.normal(0.0, 50.0, (policies, 1000))
+    noise = rng.normal(0.0, 3.0, (policies, 1000))
+    rows = [
+        {"returns": 300.0 + part * x + e, "reference": MEAN.mean + x}
+        for x, e in zip(luck, noise, strict=True)
+    ]
+    scores = scored(Range, MEAN, rows)
+    assert scores.error == pytest.approx(abs(part) * MEAN.error / 452.7, abs=0.02 * MEAN.error / 452.7)
+    alone = scored(Range, MEAN._replace(error=0.0), rows)
+    wide, narrow = (np.subtract(*ends(iqm(redrawn("a", each)))) for each in (scores, alone))
+    assert wide**2 == pytest.approx(narrow**2 + (2 * 1.96 * scores.error) ** 2, rel=0.15)
+
+
+def test_the_references_error_moves_all_rows_together():
+    """Two that were corrected alike are not further apart for it; against one that was not, it counts."""
+    luck = np.random.default_rng(3).normal(0.0, 50.0, 1000)
+    far = MEAN._replace(error=5.0)
+
+    def row(mean, part):
+        return scored(Range, far, [{"returns": mean + part * luck, "reference": MEAN.mean + luck}])
+
+    assert [p.rank for p in board(a=row(301.0, 1.0), b=row(300.0, 1.0))] == [1, 2]
+    assert [p.rank for p in board(a=row(301.0, 1.0), b=row(300.0, 0.0))] == [1, 1]
+
+
+def test_intervals_of_corrected_rows_cover_the_truth():
+    """Over many boards with known truths: of the reference, of one like it, and of a learner."""
+    rng, error, inside = np.random.default_rng(4), 4.0, {"reference": 0, "like": 0, "learner": 0}
+    rounds = 120
+    for k in range(rounds):
+        measured = Reference("x", 400.0 + error * rng.normal(), error, 1)  # the truth is 400
+        seeds = rng.normal(300.0, 2.0, 10)
+
+        def play(part, means, k=k, measured=measured):
+            rows = []
+            for mean in means:
+                luck = rng.normal(0.0, 60.0, 400)
+                rows.append({"returns": mean + part * luck + rng.normal(0.0, 5.0, 400) * (mean < 400.0),
+                             "reference": 400.0 + luck})  # fmt: skip
+            return ends(iqm(redrawn(f"{k} {part}", scored(Range, measured, rows))))
+
+        for name, found, truth in (
+            ("reference", play(1.0, [400.0]), 400.0),
+            ("like", play(0.9, [380.0]), 380.0),
+            ("learner", play(0.7, seeds), 300.0),
+        ):
+            inside[name] += found[0] <= truth / 452.7 <= found[1]
+    assert all(0.88 <= count / rounds for count in inside.values()), inside
 
 
 @pytest.mark.parametrize("env_id", REFERENCES)
 def test_references_are_controllers_that_are_known_and_help(env_id):
-    name, mean = REFERENCES[env_id]
+    name, mean, error, episodes = REFERENCES[env_id]
     known = KNOWN_RETURNS[env_id]
-    assert 0.9 < score(env_id, mean) <= 1.0005
-    if known.policy == name:
-        assert known.best == pytest.approx(mean, abs=0.05)
+    assert 0.9 < score(env_id, mean) <= 1.003 and episodes >= 65_536
     agent = make_controller(env_id, name)
     few = evaluate_batch(env_id, agent, 10**10, 500)
     assert abs(few.mean() - mean) < 5.0 * few.std() / len(few) ** 0.5  # not another controller's mean
+    assert error == pytest.approx(few.std() / episodes**0.5, rel=0.25)
+    if known.policy == name:
+        assert known.best == pytest.approx(mean, abs=5.0 * error)
 
 
 # --- against rliable ---
@@ -273,12 +357,13 @@ def test_intervals_and_profile_are_those_of_rliable():
         found = library.get_interval_estimates({"a": data}, statistic, reps=2000, random_state=state)
         return found[1]["a"].ravel()
 
+    x, y = table(x), table(y)
     assert ends(iqm(redrawn("x", x))) == pytest.approx(theirs(runs_x, metrics.aggregate_iqm), abs=0.01)
     chance = compare(x, y, redrawn("x", x), redrawn("y", y))
     expected = theirs((runs_x, runs_y), metrics.probability_of_improvement)
     assert chance[1:] == pytest.approx(expected, abs=0.04)
-    shares, _ = library.create_performance_profile({"a": x.reshape(-1, 1)}, THRESHOLDS, reps=2)
-    np.testing.assert_allclose(profile(x), shares["a"])
+    shares, _ = library.create_performance_profile({"a": x.table.reshape(-1, 1)}, THRESHOLDS, reps=2)
+    np.testing.assert_allclose(profile(x.table), shares["a"])
 
 
 # --- what intervals promise, and the time it takes ---
@@ -287,7 +372,7 @@ def test_intervals_and_profile_are_those_of_rliable():
 def test_intervals_cover_as_often_as_they_say():
     rng = np.random.default_rng(8)
     samples = rng.normal(0.5, 0.2, (80, 20))
-    found = [ends(iqm(redrawn(str(i), np.stack([s, s], axis=1)))) for i, s in enumerate(samples)]
+    found = [ends(iqm(redrawn(str(i), table(np.stack([s, s], axis=1))))) for i, s in enumerate(samples)]
     assert 0.85 <= np.mean([low < 0.5 < high for low, high in found]) <= 1.0
 
 

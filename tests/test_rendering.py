@@ -176,6 +176,7 @@ def test_shell_turns_by_the_integral_of_its_rate():
         ("InclineTilt-v0", {"radius": 1e-9}),
         ("InclineBrake-v0", {"tilt": 0.0}),
         ("InclineBrake-v0", {"tilt": 1.5}),
+        ("InclineBrake-v0", {"tilt": math.pi / 2}),
         ("InclineBrake-v0", {"radius": 1e6}),
         ("InclineBrake-v0", {"radius": 1e-9}),
         ("CylinderInCylinderTilt-v0", {"radius": 0.4999}),
@@ -188,6 +189,12 @@ def test_unusual_parameters_are_drawn_too(env_id, options):
     frame = pygame.surfarray.array3d(rendering.paint(task, moment(task)))
     assert time.process_time() - start < 0.5
     assert frame.std() > 0.0
+
+
+@pytest.mark.parametrize("tilt", [0.5, 0.8, math.pi / 2])
+def test_a_steep_plane_has_its_ground_too(tilt):
+    frame = picture("InclineBrake-v0", tilt=tilt)
+    assert np.all(frame == (0xE3, 0xE3, 0xE3), axis=-1).mean() > 0.15
 
 
 def test_far_away_start_stays_in_the_picture():
@@ -376,3 +383,30 @@ def test_dashes_cover_the_line():
 def test_numbers_keep_their_width():
     assert rendering._number(-1.5) == "−1.500"
     assert rendering._number(123456.0) == "1.23e+05"
+
+
+# --- playing by hand ---
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
+    """Gymnasium's play, as it is called without arguments: keys are pressed, then the window is closed."""
+    from gymnasium.utils.play import play
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = gym.make(env_id, render_mode="rgb_array")
+    down, up = pygame.KEYDOWN, pygame.KEYUP
+    script = [(down, "a"), (down, "d"), (up, "a"), (down, "x"), (up, "d"), (pygame.QUIT, "")]
+    rest = env.unwrapped.task.rest_action
+    played = []
+
+    def press(before, after, action, reward, terminated, truncated, info):
+        played.append(action.tolist())
+        kind, key = script[len(played) - 1]
+        pygame.event.post(pygame.event.Event(kind, {"key": ord(key)} if key else {}))
+
+    play(env, callback=press, seed=1, fps=1000)
+    assert played == [[rest], [-1.0], [rest], [1.0], [1.0], [rest]]
+    env.reset(seed=1)
+    env.step(np.array([rest], dtype=np.float32))
+    assert env.unwrapped.control == 0.0

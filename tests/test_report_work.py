@@ -1,24 +1,29 @@
-"""Work-precision: orders of convergence, accuracy, the batch that is timed, what a missing peer leaves."""
+"""Work-precision: orders of convergence, rivals in their best forms, what is said of who is faster."""
 
 import dataclasses
+import json
+import re
 import sys
 from fractions import Fraction
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lag_envs.report import peers, work_precision
+from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
+from lag_envs.report.equations import Equation, Problems
+from lag_envs.report.rivals import Compiled, Ours
 from lag_envs.report.runner import Result
-from lag_envs.report.steppers import METHODS, comparison, plain_series
+from lag_envs.report.steppers import METHODS, comparison
 from lag_envs.report.timing import Kernels
-from lag_envs.report.work_precision import Contestant, Point
+from lag_envs.report.verdicts import MODES, OURS, TARGETS, Point
+from lag_envs.report.work_precision import Series
 
-ORDERS = [Contestant("ours", f"order {n}", plain_series(n), n, False) for n in (4, 8, 14, 20)]
-ORDERS += [
-    Contestant("comparison", name, comparison(name, VARIANTS["PivotedBar"].scene().flow), method.order, False)
-    for name, method in METHODS.items()
+BAR = VARIANTS["PivotedBar"].scene()
+SERIES = [
+    s for s in work_precision.series(BAR) if s.method.partition(" ")[0] != "plain" or s.order in (4, 14)
 ]
 
 
@@ -27,115 +32,458 @@ def single_steps():
     return work_precision.single_steps("PivotedBar", ensemble("PivotedBar", 16))
 
 
-@pytest.mark.parametrize("method", ORDERS, ids=lambda method: method.method)
+@cache
+def truths(name, count, steps=1):
+    dt = work_precision.control_step(name)
+    return [work_precision.truth(case, dt, steps) for case in ensemble(name, count, seed=5)]
+
+
+def worst(rival, name, together, steps=1, count=6):
+    """Return the largest error of a rival, run as the report runs it."""
+    some = truths(name, count, steps)
+    sample = rival.build(Problems([t.case for t in some]), work_precision.control_step(name), steps, together)
+    return max(t.error(end) for t, end in zip(some, sample.end(), strict=True))
+
+
+@pytest.mark.parametrize("method", SERIES, ids=lambda method: method.method)
 def test_order_of_convergence(method):
-    """The error of one step of length h grows like h^(order + 1)."""
+    """The error of one step of length h grows like h^(order + 1), however cosine and sine are come by."""
     assert work_precision.measured_order(method, single_steps()) == pytest.approx(method.order, abs=0.2)
 
 
+# --- ours ---
+
+
 @pytest.mark.parametrize("name", VARIANTS)
-def test_a_step_is_exact(name):
+@pytest.mark.parametrize("mode", MODES)
+def test_a_step_is_exact(name, mode):
     """A regression of the shipped stepper's accuracy fails here."""
-    dt = work_precision.control_step(name)
-    cases = ensemble(name, 12, seed=5)
-    kernels = Kernels(cases[0].scene, cases[0].scene.flow)
-    truths = [work_precision.truth(case, dt, 1) for case in cases]
-    assert max(t.error(kernels.end(t.case, dt, 1)) for t in truths) < 1e-15
+    assert worst(Ours(Ours.METHOD, 1), name, mode == "batch", count=12) < 1e-15
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_batch_has_the_bits_of_simulate(name):
-    """The kernel that is timed is the one whose errors are measured; fast states take substeps."""
-    dt, steps = VARIANTS[name].dt, 3
+def test_ours_is_what_simulate_does(name):
+    """What is timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
+    dt, steps = work_precision.control_step(name), 3
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
     ]
-    scene = cases[0].scene
-    for flow in (scene.flow, comparison("RK4", scene.flow)):
-        kernels = Kernels(scene, flow)
-        rows = kernels.fill(cases)
-        assert kernels.batch(rows, len(cases), steps, *kernels.arguments(scene, dt)) == 0
-        ends = [kernels.scene.simulate(c.state, [c.control] * steps, dt)[-1] for c in cases]
-        assert np.array_equal(kernels.states(rows, len(cases)), ends)
+    found = ((Ours.METHOD, 1, dt, 3), (Ours.METHOD, 2, dt / 2, 6), (Ours.ONE_CALL, 1, steps * dt, 1))
+    for method, n, length, count in found:
+        ends = [c.scene.simulate(c.state, [c.control] * count, length)[-1] for c in cases]
+        for together in (False, True):
+            sample = Ours(method, n).build(Problems(cases), dt, steps, together)
+            assert np.array_equal(sample.end(), ends), (method, n, together)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize("name", VARIANTS)
+def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
+    """No order and no tolerance but the scene's own is compared with anybody."""
+    for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
+        found = work_precision.rivals(name, horizon, "compiled", quick)
+        assert {r.method for r in found if r.family == "ours"} <= {Ours.METHOD, Ours.ONE_CALL}
+        assert {r.family for r in found} == {"ours", "compiled"}
+        assert not any("series" in r.method for r in found)
+    flows = []
+    original = Kernels.__init__
+    monkeypatch.setattr(
+        Kernels, "__init__", lambda self, scene, flow: (flows.append(flow), original(self, scene, flow))[1]
+    )
+    case = ensemble(name, 1)[0]
+    Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False)
+    assert flows == [case.scene.flow]
+
+
+def test_a_refused_step_is_no_point():
+    case = ensemble("PivotedBar", 1)[0]._replace(state=(0.0, 1e12))
+    with pytest.raises(ArithmeticError, match="refused"):
+        Ours(Ours.METHOD, 1).build(Problems([case]), 0.02, 1, False).end()
 
 
 def test_kernels_refuse_other_constants():
-    bar = VARIANTS["PivotedBar"].scene()
     with pytest.raises(ValueError, match="compiled for the constants"):
-        Kernels(bar, bar.flow).arguments(dataclasses.replace(bar, damping=0.0), 0.02)
+        Kernels(BAR, BAR.flow).arguments(dataclasses.replace(BAR, damping=0.0), 0.02)
 
 
+# --- rivals: no form is fast because it is broken ---
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("PivotedBar", "RK4"), ("PivotedBar", "RK4, carried"), ("PivotedBar", "ETD4RK, carried"),
+        ("Incline, drag", "DOP853"),
+        *((name, "DOP853, carried") for name in VARIANTS if name != "Incline, drag"),
+    ],
+)  # fmt: skip
+def test_steppers_are_accurate(name, method, mode):
+    assert method in Compiled.methods(Problems(ensemble(name, 1)).equation)
+    assert worst(Compiled(method, 32), name, mode == "batch") < 1e-9
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
-def test_libraries_are_given_the_scene(name):
+def test_all_steppers_are_accurate(name):
+    """In every form, and with the same bits in a batch as alone."""
+    some = [t.case for t in truths(name, 6)]
+    for method in Compiled.methods(Problems(some).equation):
+        order = METHODS[method.removesuffix(Compiled.CARRIED)].order
+        assert worst(Compiled(method, 256), name, False) < max(10.0 ** (-4 * order + 2), 1e-11), method
+        ends = [
+            Compiled(method, 2).build(Problems(some), 0.02, 3, together).end() for together in (False, True)
+        ]
+        assert np.array_equal(*ends), method
+
+
+@pytest.mark.parametrize("name", ["PivotedBar", "CylinderInCylinder, tilt", "Incline, moving"])
+def test_held_controls_are_one_call(name):
+    """Over many control steps a stepper takes substeps, or one step for several."""
+    fine, coarse = (worst(Compiled("DOP853, carried", n), name, True, 40) for n in (4, 1 / 4))
+    assert fine < 1e-12 and coarse < 1e-2
+    assert Compiled("RK4", 1 / 4).substeps(40) == 10
+
+
+@pytest.mark.parametrize("method", ["dopri5", "dop853", "lsoda", "Radau"])
+@pytest.mark.parametrize("name", VARIANTS)
+def test_libraries_are_given_the_scene(name, method):
     """SciPy ends where the exact flow does, on every equation, over several control steps."""
-    dt = work_precision.control_step(name)
-    case = ensemble(name, 1, seed=2)[0]
-    exact = work_precision.truth(case, dt, 4)
-    end = peers.SciPy([case], ("DOP853", 1e-12)).move(np.array([case.state]), dt, 4)[0]
-    assert exact.error(end) < 1e-11
+    rival = peers.SciPy(method, 1e-11)
+    for together in (False, True) if rival.batched else (False,):
+        assert worst(rival, name, together, steps=4, count=3) < 1e-8
 
 
-@pytest.mark.parametrize("package", [p for p in peers.PEERS if p not in ("scipy", "mujoco")])
-def test_libraries_take_batches(package):
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("steps", [1, 20])
+@pytest.mark.parametrize("name", VARIANTS)
+def test_heyoka(name, steps, mode):
+    """Its compiled step in a loop, and propagate_until over a longer time, alone and in blocks."""
+    pytest.importorskip("heyoka")
+    assert worst(peers.Heyoka("Taylor", 1e-15), name, mode == "batch", steps, count=19) < 1e-13
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_heyokas_own_step_is_what_is_timed(mode, monkeypatch):
+    """The loop around heyoka's machine code has the bits of its propagate_until."""
+    pytest.importorskip("heyoka")
+    problems, ends = Problems(ensemble("CylinderInCylinder, tilt", 19)), []
+    ends.append(peers.Heyoka("Taylor", 1e-10).build(problems, 0.05, 1, mode == "batch").end())
+    monkeypatch.setattr(peers, "_stepper", lambda integrator: None)
+    ends.append(peers.Heyoka("Taylor", 1e-10).build(problems, 0.05, 1, mode == "batch").end())
+    assert np.array_equal(*ends)
+
+
+@pytest.mark.parametrize(
+    ("method", "setting"), [("Euler", 256), ("implicitfast", 256), ("RK4", 16)], ids=lambda x: str(x)
+)
+def test_mujoco(method, setting):
+    """Its own model of the bar is the bar, over several control steps, more than one rollout holds."""
+    pytest.importorskip("mujoco")
+    limit = 1e-9 if method == "RK4" else 1e-2
+    assert worst(peers.MuJoCo(method, setting), "PivotedBar", False, steps=5, count=3) < limit
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    ("package", "method"),
+    [pytest.param("diffrax", "Tsit5", marks=pytest.mark.slow), ("torchdiffeq", "dopri8")],
+)
+def test_libraries_take_batches(package, method, mode):
     pytest.importorskip(package)
-    cases = ensemble("CylinderInCylinder, tilt", 3)
-    peer = peers.PEERS[package]
-    moved = peer(cases, (peer.settings[0][0], 1e-12)).move(np.array([c.state for c in cases]), 0.05, 2)
-    ends = [c.scene.simulate(c.state, [c.control] * 2, 0.05)[-1] for c in cases]
-    assert np.abs(moved - ends).max() < 1e-7
+    rival = peers.PEERS[package](method, 1e-11)
+    assert worst(rival, "CylinderInCylinder, tilt", mode == "batch", steps=2, count=3) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("name", ["PivotedBar", "Incline, moving", "Incline, drag"])
+@pytest.mark.parametrize("package", [p for p in peers.PEERS if p != "mujoco"])
+def test_all_libraries_at_their_finest(package, name, mode):
+    pytest.importorskip(package)
+    for method, settings in peers.PEERS[package].settings.items():
+        rival = peers.PEERS[package](method, settings[-1])
+        if rival.batched or mode == "single":
+            assert worst(rival, name, mode == "batch", count=3) < verdicts.ACCURATE, method
+
+
+def test_a_scene_of_ones_own():
+    """Rivals take any equation: one that is no flow of ours, with two angles that are carried along."""
+
+    class Coupled(Equation):
+        """Two pendulums with a spring; closed form for small swings in phase: cos(√p t)."""
+
+        size, lifted, parameters = 4, 8, 1
+
+        def rate(self, t, y, p, xp):
+            a, b, va, vb, *pairs = y
+            ca, sa, cb, sb = pairs or (xp.cos(a), xp.sin(a), xp.cos(b), xp.sin(b))
+            turns = (-(va * sa), va * ca, -(vb * sb), vb * cb) if pairs else ()
+            spring = 3.0 * (b - a)
+            return va, vb, spring - p[0] * sa, -spring - p[0] * sb, *turns
+
+    class Some:
+        equation = Coupled()
+        p = np.array([[9.0, 4.0]])
+        y = np.array([[1e-6, 1e-6]] * 2 + [[0.0, 0.0]] * 2 + [[1.0, 1.0], [1e-6, 1e-6]] * 2)
+
+        def __len__(self):
+            return 2
+
+        def states(self, y, span):
+            return np.array(y[:4].T)
+
+    exact = 1e-6 * np.cos(np.sqrt(Some.p[0]) * 0.4)
+    found = [Compiled("RK4", 8), Compiled("DOP853, carried", 1), peers.SciPy("dop853", 1e-12)]
+    for rival in found + ([peers.Heyoka("Taylor", 1e-15)] if _has("heyoka") else []):
+        for together in (False, True):
+            ends = rival.build(Some(), 0.1, 4, together).end()
+            assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
+    wrong = Some()
+    wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # what is not carried is not asked for
+    assert Compiled("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(exact, rel=1e-4, abs=0)
+    with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
+        Compiled("ETD4RK", 1).build(Some(), 0.1, 4, False)
+    assert "Verlet" in Compiled.methods(Problems(ensemble("PivotedBar", 1)).equation)
+
+
+def _has(package):
+    try:
+        __import__(package)
+    except ImportError:
+        return False
+    return True
 
 
 def test_a_missing_library_is_a_row(monkeypatch):
     monkeypatch.setitem(sys.modules, "heyoka", None)
-    rows = list(work_precision.library("PivotedBar", "heyoka", quick=True))
+    rows = list(work_precision.points("PivotedBar", "heyoka", quick=True))
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
     table = next(t for t in work_precision.content(rows, []).tables if t.name.endswith("problems"))
-    assert table.rows == [["PivotedBar", "one step", "heyoka Taylor", "0.0001", "heyoka is not installed"]]
+    assert table.rows == [
+        ["PivotedBar", "one step, alone", "heyoka Taylor, 0.0001", "heyoka is not installed"]
+    ]
+
+
+def test_what_takes_too_long_is_not_run(monkeypatch):
+    monkeypatch.setattr(work_precision, "LIMIT", 0.0)
+    monkeypatch.setattr(work_precision, "QUICK", {"one step": work_precision.QUICK["one step"]})
+    rows = list(work_precision.points("PivotedBar", "scipy", quick=True))
+    assert rows and all(row["problem"].startswith("not run, it would take") for row in rows)
+    assert len({(row["mode"], row["method"]) for row in rows}) == len(rows)
+
+
+# --- what is said ---
+
+
+def row(
+    method, ns, error, *, family="compiled", variant="PivotedBar", horizon="one step", mode="single", **more
+):
+    """Return the row of a point; several errors, one may be None."""
+    errors = error if isinstance(error, list) else [error]
+    kept = [e for e in errors if e is not None]
+    return {
+        "kind": "point", "variant": variant, "horizon": horizon, "mode": mode, "family": family,
+        "method": method, "setting": 1, "batched": True, "ns": ns, "clock": 100.0, "errors": errors,
+        "error": max(kept, default=None), "median": max(kept, default=None), "members": len(errors),
+        "diverged": len(errors) - len(kept), "digest": method,
+    } | more  # fmt: skip
+
+
+def both(*args, **options):
+    return [row(*args, mode=mode, **options) for mode in MODES]
+
+
+OWN = both(OURS, 100.0, 1e-16, family="ours")
+
+
+def claimed(rows, horizon="One step"):
+    found = [c for c in work_precision.content(rows, []).claims if c.text.startswith(horizon)]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_faster_rival_is_a_defeat_in_every_text():
+    rows = OWN + both("DOP853, carried", 80.0, 1e-13) + both("RK4", 20.0, 1e-7)
+    content = work_precision.content(rows, [])
+    claim = claimed(rows)
+    assert claim.holds is False
+    assert claim.evidence == (
+        "0 of 2; faster: PivotedBar alone: DOP853, carried, 1 substep, 0.8 ×; "
+        "PivotedBar in a batch: DOP853, carried, 1 substep, 0.8 ×"
+    )
+    text = " ".join(content.text)
+    assert "To 1e-06: a rival is faster in 2 of 2 comparisons and takes 0.2 (PivotedBar alone: RK4" in text
+    assert "To 1e-12: a rival is faster in 2 of 2 comparisons and takes 0.8 (PivotedBar alone: DOP853" in text
+    assert content.summary.rows[0] == [
+        "PivotedBar", "alone", "1e-16", 100.0, "RK4, 1 substep: 0.2 ×",
+        "DOP853, carried, 1 substep: 0.8 ×", "DOP853, carried, 1 substep: 0.8 ×",
+    ]  # fmt: skip
+    assert "To 1e-12: a rival is faster in 2 of 2" in content.summary.caption
+
+
+def test_a_slower_rival_is_a_win():
+    rows = OWN + both("DOP853", 250.0, 1e-13) + both("RK4", 20.0, 1e-7)
+    assert claimed(rows).holds is True
+    assert claimed(rows).evidence == "2 of 2; the fastest rivals take 2.5 to 2.5 × our time"
+    assert (
+        "To 1e-12: ours is faster in 2 of 2, where the fastest rival takes 2.5 times as long."
+        in work_precision.content(rows, []).summary.caption
+    )
+
+
+def test_a_rival_that_gets_there_alone_is_a_defeat():
+    rows = both(OURS, 100.0, 1e-10, family="ours") + both("DOP853", 250.0, 1e-13)
+    assert claimed(rows).holds is False and "ours not at all" in claimed(rows).evidence
+    assert "ours does not get there and a rival does in 2" in " ".join(work_precision.content(rows, []).text)
+
+
+def test_a_lost_member_reaches_nothing():
+    rows = OWN + both("RK4", 20.0, [1e-14, None])
+    assert claimed(rows).holds is True
+
+
+def test_forms_that_are_broken_are_told():
+    content = work_precision.content([*OWN, *both("RK4", 20.0, 1e-12)], [])
+    assert next(c for c in content.claims if c.text.startswith("No form")).holds is True
+    rows = [*OWN, *both("RK4", 20.0, 1e-12), *both("RK4, carried", 9.0, 1e-3), *both("Verlet", 9.0, 1e-3)]
+    claim = next(c for c in work_precision.content(rows, []).claims if c.text.startswith("No form"))
+    assert claim.holds is False and "RK4, carried on PivotedBar alone: 1.0e-03" in claim.evidence
+    assert "Verlet" not in claim.evidence  # its order is 2
+
+
+def test_batches_with_other_bits_are_told():
+    same = [*OWN, *both("RK4", 20.0, 1e-12)]
+    claims = work_precision.content(same, []).claims
+    assert next(c for c in claims if c.text.startswith("The batches")).evidence == "2 of 2"
+    claims = work_precision.content([*same[:-1], same[-1] | {"digest": "else"}], []).claims
+    assert next(c for c in claims if c.text.startswith("The batches")).holds is False
+
+
+def test_sentences_count_what_the_table_has():
+    """Random points: every count and every ratio in a sentence is found again in the table."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for variant in VARIANTS:
+        for horizon in verdicts.HORIZONS:
+            place = {"variant": variant, "horizon": horizon}
+            rows += both(OURS, 100.0, 1e-16, family="ours", **place)
+            rows += [
+                row(
+                    name, float(rng.uniform(20, 300)), float(10.0 ** rng.uniform(-16, -2)), mode=mode, **place
+                )
+                for name in METHODS
+                for mode in MODES
+            ]
+    content = work_precision.content(rows, [])
+    table = next(t for t in content.tables if t.name.endswith("targets"))
+    assert_sentences_agree(content.text, table.columns, table.rows)
+
+
+def assert_sentences_agree(text, columns, rows):
+    """Check the paragraphs about who is faster against the table of targets."""
+    found = [dict(zip(columns, line, strict=True)) for line in rows]
+    seen = 0
+    for paragraph in text:
+        horizon = paragraph.partition(".")[0].lower()
+        for target, sentence in re.findall(r"To (1e-\d\d): (.*?)\.(?= To 1e|$)", paragraph):
+            here = [r for r in found if r["horizon"] == horizon and r["error"] == float(target)]
+            ratios = sorted(r["other / ours"] for r in here if r["other / ours"] is not None)
+            lost, won = [r for r in ratios if r < 1.0], [r for r in ratios if r >= 1.0]
+            for words, some in (("a rival is faster in", lost), ("ours is faster in", won)):
+                counts = re.findall(rf"{words} (\d+) of (\d+)", sentence)
+                assert counts == ([(str(len(some)), str(len(here)))] if some else [])
+            if lost:
+                assert f"takes {lost[0]:.2g} (" in sentence and f"{lost[-1]:.2g} (" in sentence
+            if won:
+                assert re.search(rf"takes {won[0]:.2g}( to {won[-1]:.2g})? times as long", sentence)
+            for words, ours, other in (
+                ("nobody else gets there", True, False), ("nobody gets there", False, False),
+                ("ours does not get there and a rival does", False, True),
+            ):  # fmt: skip
+                count = sum(bool(r["ours"]) == ours and bool(r["fastest other"]) == other for r in here)
+                assert (f"{words} in {count} (" in sentence) == bool(count)
+            seen += 1
+    assert seen == len({(r["horizon"], r["error"]) for r in found}) > 0
+
+
+def committed():
+    """Return the section that docs/accuracy.md and the README show."""
+    path = Path(__file__).parents[1] / "docs" / "accuracy.json"
+    sections = json.loads(path.read_text(encoding="utf-8"))["sections"]
+    return next(section for section in sections if section["name"] == "work_precision")
+
+
+def test_committed_sentences_count_what_the_table_has():
+    section = committed()
+    table = next(t for t in section["tables"] if t["name"].endswith("targets"))
+    assert_sentences_agree(section["text"], table["columns"], table["rows"])
+
+
+def test_committed_claims_follow_from_the_table():
+    section = committed()
+    table = next(t for t in section["tables"] if t["name"].endswith("targets"))
+    rows = [dict(zip(table["columns"], line, strict=True)) for line in table["rows"]]
+    for horizon, target in verdicts.CLAIMED.items():
+        here = [r for r in rows if (r["horizon"], r["error"]) == (horizon, target)]
+        lost = [r for r in here if r["fastest other"] and (r["other / ours"] or 0.0) < 1.0]
+        claim = next(c for c in section["claims"] if c["text"].startswith(f"{horizon.capitalize()}: nobody"))
+        assert claim["holds"] is not bool(lost)
+        assert all(r["fastest other"] in claim["evidence"] for r in lost)
+
+
+def test_only_what_is_shipped_is_committed_as_ours():
+    table = next(t for t in committed()["tables"] if t["name"].endswith("targets"))
+    ours = {line[table["columns"].index("ours")] for line in table["rows"]} - {None}
+    words = {Ours.METHOD, Ours.ONE_CALL, f"{Ours.METHOD}, 2 substeps", f"{Ours.METHOD}, a step for 2"}
+    assert OURS in ours <= words
+
+
+def test_jobs_are_brought_to_one_scale():
+    """A job that ran while the machine was twice as slow is not twice as slow a rival."""
+    slow = both("Taylor", 300.0, 1e-13, family="heyoka", clock=200.0)
+    ns = {p.name: p.ns for p in verdicts.gathered(OWN + slow)}
+    assert ns == {OURS: 100.0, "heyoka Taylor": 150.0}
+
+
+def test_without_a_batch_it_is_one_after_the_other():
+    radau = row("Radau", 300.0, 1e-13, family="scipy", batched=False)
+    assert [p.mode for p in verdicts.gathered([radau])] == ["single", "batch"]
+    lost = row("Taylor", 300.0, 1e-13, family="heyoka")  # its batch was not run
+    assert [p.mode for p in verdicts.gathered([lost])] == ["single"]
+
+
+def test_errors_below_amplified_rounding_are_none():
+    rows = OWN + both("DOP853", 50.0, 3e-12)
+    assert claimed(rows).holds is True
+    floor = {"kind": "rounding", "variant": "PivotedBar", "horizon": "one step", "amplified": 1e-12}
+    assert claimed([*rows, floor]).holds is False
 
 
 def test_a_lost_job_is_a_row_and_claims_nothing():
     """Without rows every claim is open; the problem is told."""
-    lost = Result("work_precision", "times: PivotedBar", "key", problem="stopped after 120 s")
+    lost = Result("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
     content = work_precision.content([], [lost])
     assert all(claim.holds is None for claim in content.claims)
     assert any("stopped after 120 s" in row for table in content.tables for row in table.rows)
 
 
-def test_a_point_is_matched_by_error_and_time():
-    def point(ns, *errors):
-        worst = None if None in errors else max(errors)
-        return Point("v", "one step", "batch", "ours", "m", 1, worst, worst, errors, ns)
+def test_the_picture_has_the_fastest_form_of_each():
+    def point(method, ns, error):
+        return Point("PivotedBar", "one step", "single", "compiled", method, 1, error, error, [error], ns)
 
-    other = point(10.0, 1e-9, 1e-8)
-    assert work_precision.matched(other, [point(10.0, 1e-9, 1e-8, 1.0)], 0.0)
-    assert not work_precision.matched(other, [point(11.0, 0.0, 0.0), point(9.0, 0.0, 2e-8)], 0.0)
-    assert not work_precision.matched(other, [point(9.0, 0.0, None)], 0.0)
-    assert work_precision.matched(other, [point(9.0, 0.0, 2e-8)], 1e-8)
-
-
-def test_rows_become_points_and_a_picture():
-    """Substeps multiply the time; a library without a batch is drawn at its own time."""
-    about = {"variant": "PivotedBar", "horizon": "one step"}
-    errors = {"error": 1e-9, "median": 1e-10, "errors": [1e-9], "members": 1, "diverged": 0}
-    rows = [
-        about | {"kind": "time", "method": "RK4", "single": 50.0, "batch": 8.0},
-        about | {"kind": "time", "method": "lag_envs", "single": 80.0, "batch": 10.0},
-        about | {"kind": "error", "family": "comparison", "method": "RK4", "substeps": 4, **errors},
-        about | {"kind": "error", "family": "ours", "method": "lag_envs", "substeps": 1, **errors},
-        about | {"kind": "library", "family": "scipy", "method": "RK45", "setting": 1e-5, **errors}
-        | {"single": 1e5, "batch": None},
-        about | {"kind": "rounding", "amplified": 1e-16},
-    ]  # fmt: skip
-    times = {(p.method, p.mode): p.ns for p in work_precision.gathered(rows)}
-    assert times == {
-        ("RK4", "single"): 200.0, ("RK4", "batch"): 32.0,
-        ("lag_envs", "single"): 80.0, ("lag_envs", "batch"): 10.0,
-        ("RK45", "single"): 1e5, ("RK45", "batch"): 1e5,
-    }  # fmt: skip
-    content = work_precision.content(rows, [])
-    assert content.claims[0].holds
-    assert len(content.pictures[0].draw().axes) == 2
-    assert content.summary.rows[0][4] == "RK4, 4 substeps: 2.5 ×"
+    points = [point("RK4", 50.0, 1e-9), point("RK4, carried", 20.0, 1e-8), point("RK4, carried", 60.0, 1e-8)]
+    assert [(p.method, p.ns) for p in diagrams.curves(points)["RK4"]] == [
+        ("RK4, carried", 20.0),
+        ("RK4", 50.0),
+    ]
+    figure = diagrams.draw("PivotedBar", points, {})
+    assert len(figure.axes) == 2
+    known = {*diagrams.STYLES, *diagrams.OURS}
+    assert {
+        f"{verdicts.LIBRARIES[p]} {m}".partition(",")[0] for p, c in peers.PEERS.items() for m in c.settings
+    } <= known
+    assert set(METHODS) <= known
 
 
 def test_long_horizons_are_exact_products():
@@ -145,3 +493,13 @@ def test_long_horizons_are_exact_products():
         for horizon in work_precision.HORIZONS.values():
             steps = horizon.steps(dt)
             assert Fraction(dt) * steps == Fraction(dt * steps)
+
+
+def test_targets_are_compared_once():
+    found = verdicts.compared(verdicts.gathered(OWN), {})
+    assert [(d.mode, d.target) for d in found] == [(mode, target) for mode in MODES for target in TARGETS]
+
+
+def test_series_are_only_measured_for_their_order():
+    assert all(isinstance(s, Series) for s in work_precision.series(BAR))
+    assert comparison("RK4", BAR.flow, True) is comparison("RK4", BAR.flow, True)

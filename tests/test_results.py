@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import warnings
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents import measure, report, results
+from agents import behaviour, measure, report, results
 from agents.analysis import (
     NOMINAL,
     OFTEN,
@@ -25,7 +26,7 @@ from agents.analysis import (
 )
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
-from lag_envs.controllers import Constant, do_nothing
+from lag_envs.controllers import CONTROLLERS, Constant, do_nothing, make_controller
 from lag_envs.report.docs import replaced
 from lag_envs.tasks import TASKS, load_task
 
@@ -402,7 +403,10 @@ def test_page_and_figures_of_any_results(tmp_path):
     assert not stale.exists()
     text = (tmp_path / results.PAGE).read_text()
     assert text == report.page(data) and "nan" not in text
-    assert "| a\\|b |  | 9.90 ± 0.20 | 0.990 (0.950, 1.030) |" in text
+    assert "| a\\|b | 9.90 ± 0.20 | 0.990 (0.950, 1.030) |" in text
+    # What a learner had stands beside whatever it is said to reach.
+    assert "| ppo, 5 seeds of 1,000 steps | " in text and "| td3, 1 seed of 1,000 steps | " in text
+    assert re.search(r"\| sac\+ \| .* \| 3 \| 1,000 \|", text)
     assert "Left out:" in text and "sac+" in text
     linked = {line.split("images/")[1].rstrip(")") for line in text.splitlines() if "](images/" in line}
     drawn = {file.name for file in (tmp_path / results.PICTURES).iterdir()}
@@ -411,8 +415,90 @@ def test_page_and_figures_of_any_results(tmp_path):
         assert file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size < 120_000
 
 
-def test_notes_are_about_environments_that_exist():
-    assert set(report.load_notes()) == set(TASKS)
+def assert_reproduced(env_id, name, policies):
+    """Play the committed episodes again."""
+    agents = summary(ROOT)["envs"][env_id]["agents"]
+    stated = agents[name]["conditions"][NOMINAL]["return"]
+    found = np.mean([evaluate_batch(env_id, policy, 1_000_000_000, 1000).mean() for policy in policies])
+    assert found == pytest.approx(stated, rel=1e-4, abs=1e-6), name
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_committed_results_of_controllers_come_out_again(env_id):
+    for name in CONTROLLERS[env_id]:
+        if name != "iLQR":  # it takes minutes
+            assert_reproduced(env_id, name, [make_controller(env_id, name)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", TASKS)
+def test_committed_results_of_learners_come_out_again(env_id):
+    learned = {
+        name: policies for name, policies in behaviour.agents(env_id) if name not in CONTROLLERS[env_id]
+    }
+    assert learned
+    for name, policies in learned.items():
+        assert_reproduced(env_id, name, policies)
+
+
+def test_how_agents_act_is_what_is_committed():
+    """One learner and one controller of it, played anew."""
+    kept = json.loads(behaviour.OUTPUT.read_text())
+    assert list(kept["envs"]) == list(TASKS) and kept["episodes"] == behaviour.EPISODES
+    found = behaviour.measured(ENV)
+    assert set(found) == set(kept["envs"][ENV]) == {"ppo", "switching line"}
+    for name, measures in found.items():
+        for what, values in measures.items():
+            np.testing.assert_allclose(kept["envs"][ENV][name][what], values, rtol=1e-3, atol=1e-4)
+    assert found["switching line"]["median [m/s]"][0] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_how_agents_act_by_hand():
+    """Constant brakes: nothing has to be learnt, and time and speed have closed forms."""
+    played = behaviour.play(ENV, Constant(1.0), 50)
+    measured = behaviour.crossed(played)
+    k = played.task.constants()
+    x, v = played.states[0].T
+    rate = k["brake"] * 6.0
+    settled = k["pull"] / rate
+
+    def place(t):
+        return x + settled * t + (v - settled) * (1.0 - np.exp(-rate * t)) / rate
+
+    low, high = np.zeros(50), np.full(50, 20.0)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = np.where(place(middle) < 0.0, middle, low), np.where(place(middle) < 0.0, high, middle)
+    assert measured["across after [s]"] == pytest.approx(low.mean(), rel=1e-6)
+    assert measured["highest twentieth [m/s]"] == pytest.approx(settled, rel=1e-2)
+    assert measured["price of the speed"] == 0.0
+    np.testing.assert_allclose(played.rewards.sum(axis=0), -low, rtol=1e-6)
+
+
+def test_arrival_by_hand():
+    """One episode is there for good after the second step, one never."""
+    task = load_task(TASKS["PivotedBarFree-v0"][0])(**TASKS["PivotedBarFree-v0"][1])
+    angles = np.array([[0.0, 0.0], [np.pi, np.pi], [0.0, 0.0], [np.pi, 0.0], [np.pi - 0.1, 0.0]])
+    played = behaviour.Played(
+        "PivotedBarFree-v0", task, np.stack([angles, 0.0 * angles], axis=-1), np.zeros((4, 2)), np.zeros(2),
+        np.array([4, 4]), np.array([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [0.75, 0.0]]),
+    )  # fmt: skip
+    assert played.settled().tolist() == [3 * task.dt, np.inf]
+    found = behaviour.upright(played)
+    assert found == {
+        "upright after [s]": 3 * task.dt,
+        "lost by then": 2.25,
+        "lost afterwards": 0.25,
+        "episodes without": 1.0,
+    }
+
+
+def test_notes_are_about_environments_that_exist_and_hold_no_numbers():
+    """A number needs a command that measures it, and those stand in tables."""
+    notes = report.load_notes()
+    assert set(notes) == set(TASKS)
+    for text in notes.values():
+        assert not re.search(r"\d", text.replace("TD3", "")), text
     assert "It is best." in report.page(invented(), {"PivotedBar-v0": "It is best."})
 
 

@@ -38,18 +38,25 @@ def net(seed, widths=(4, 3, 1)):
 
 def learned(folder, **changed):
     arrays = {seed: net(seed) for seed in range(5)}
-    given = ABOUT | {"kind": "learned", "policy": NET, "training": TRAINING, "arrays": arrays}
+    given = ABOUT | {"policy": NET, "training": TRAINING, "arrays": arrays}
     return write(folder, **(given | changed))
 
 
 def linear(folder, **changed):
-    given = ABOUT | {"kind": "controller", "policy": {"architecture": "linear"}, "arrays": {0: LINEAR}}
+    given = ABOUT | {"policy": {"architecture": "linear"}, "arrays": {0: LINEAR}}
     return write(folder, **(given | changed))
+
+
+def network(folder, policy, arrays, **changed):
+    """Write five networks, of which the first has these arrays, and the others do nearly the same."""
+    last = max(name for name in arrays if name.startswith("bias_"))
+    others = {seed: arrays | {last: arrays[last] + np.float32(1e-3 * seed)} for seed in range(5)}
+    return learned(folder, policy=policy, arrays=others, **changed)
 
 
 def built_in(folder, **policy):
     table = {"architecture": "controller", "name": "PD"} | policy
-    return write(folder, kind="controller", policy=table, **ABOUT)
+    return write(folder, policy=table, **ABOUT)
 
 
 @pytest.fixture
@@ -116,7 +123,7 @@ def test_network_is_what_the_arrays_say(tmp_path):
     arrays = net(0, (4, 6, 5, 1)) | {"obs_mean": rng.normal(size=4), "obs_var": rng.uniform(0.5, 2.0, 4)}
     policy = NET | {"hidden": [6, 5], "activation": "relu", "squash": "tanh", "mean_limit": 0.4}
     policy["normalise"] = {"epsilon": 1e-4, "clip": 1.5}
-    made = linear(tmp_path / "a", policy=policy, arrays={0: arrays})
+    made = network(tmp_path / "a", policy, arrays)
     agent = made.policies[0][1].agent()
     observations = rng.normal(size=(100, 4)).astype(np.float32)
     x = np.clip((observations - arrays["obs_mean"]) / np.sqrt(arrays["obs_var"] + 1e-4), -1.5, 1.5)
@@ -149,7 +156,7 @@ def test_bins_are_those_of_gymnasium(tmp_path):
     assert np.abs(env.bin_centers[0] - bin_centres(7)).max() < 1e-6
     policy = {"architecture": "mlp", "hidden": [], "bins": 7}
     arrays = {"weight_0": np.zeros((7, 4)), "bias_0": np.arange(7.0) % 5}
-    made = linear(tmp_path / "a", policy=policy, arrays={0: arrays})
+    made = network(tmp_path / "a", policy, arrays)
     assert made.policies[0][1].agent().predict(np.zeros(4))[0] == np.float32(bin_centres(7)[4])
 
 
@@ -215,7 +222,7 @@ def test_every_controller_of_every_environment_can_be_submitted(tmp_path):
     policy = {"architecture": "controller"}
     for env in ("PivotedBar-v0", "InclineBrake-v0"):
         for i, name in enumerate(CONTROLLERS[env]):
-            about = ABOUT | {"env": env, "kind": "controller", "policy": policy | {"name": name}}
+            about = ABOUT | {"env": env, "policy": policy | {"name": name}}
             write(tmp_path / f"{env}{i}", **about)
 
 
@@ -322,7 +329,7 @@ def test_file_exchanged_while_it_is_read(folder, tmp_path, monkeypatch):
         return real(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "open", exchange)
-    refused(folder, "policy_0.safetensors cannot be read")
+    refused(folder, r"policy_0.safetensors changed while it was read: it is no plain file")
 
 
 def test_file_that_grows_while_it_is_read(folder, monkeypatch):
@@ -371,8 +378,12 @@ def test_text_that_is_no_toml_or_a_bomb(folder, content, reason):
         ("schema = 1", "schema = 2", "schema must be 1"),
         ("schema = 1", "schema = true", "schema must be 1"),
         ("schema = 1", "schema = 1.0", "schema must be 1"),
-        ("protocol = 1", "protocol = 2", "protocol must be 1"),
-        ("protocol = 1", "", "protocol is missing"),
+        ("schema = 1", "schema = 1979-05-27", "schema must be 1"),
+        ("schema = 1", "schema = 1\nprotocol = 0", "protocol must be a whole number"),
+        ("schema = 1", 'schema = 1\nprotocol = "1"', "protocol must be a whole number"),
+        ("schema = 1", "schema = 1\nschema = 1", "no TOML"),
+        ("schema = 1", "schema = 1\nprotocol = 9999-12-31", "protocol must be a whole number"),
+        ("schema = 1", f"schema = 0x{'f' * 900}", "schema must be 1"),
         (f'env = "{ENV}"', 'env = "Nothing-v0"', "env must be one of"),
         (f'env = "{ENV}"', 'env = ["InclineTilt-v0"]', "env must be one of"),
         (f'env = "{ENV}"', 'env = "InclineBrake-v0"', "must have the shape"),
@@ -385,10 +396,22 @@ def test_text_that_is_no_toml_or_a_bomb(folder, content, reason):
         ('name = "An agent"', 'name = "a\\u001b[2J"', "name must be one line"),
         ('name = "An agent"', 'name = "a\\u202eb"', "name must be one line"),
         ('name = "An agent"', 'name = "a\\nb"', "name must be one line"),
+        ('name = "An agent"', 'name = "a\\u200bb"', r"name must be one line .*invisible U\+200B"),
+        ('name = "An agent"', 'name = "a\\u3164b"', r"name must be one line .*invisible U\+3164"),
+        ('name = "An agent"', 'name = "a\\u2800"', r"name must be one line .*invisible U\+2800"),
+        ('name = "An agent"', 'name = "a\\u00a0b"', r"name must be one line .*invisible U\+00A0"),
+        ('name = "An agent"', 'name = "a\\ufe0f"', r"name must be one line .*invisible U\+FE0F"),
+        ('name = "An agent"', 'name = "a\\U000e0041"', r"name must be one line .*invisible U\+E0041"),
+        ('name = "An agent"', 'name = "a\\u0301\\u0301\\u0301"', "more than 2 marks"),
+        ('name = "An agent"', 'name = "\\u0301a"', "begins with a mark"),
         ('name = "An agent"', f'name = "{"a" * 61}"', "at most 60"),
         ('authors = ["A. Nobody"]', "authors = []", "authors must be a list of 1 to 20"),
         ('authors = ["A. Nobody"]', 'authors = "me"', "authors must be a list"),
-        ('authors = ["A. Nobody"]', 'authors = [" "]', "authors must be of the form"),
+        ('authors = ["A. Nobody"]', 'authors = [" "]', "must have a letter or a digit each"),
+        ('authors = ["A. Nobody"]', 'authors = ["A", "..."]', "must have a letter or a digit each"),
+        ('authors = ["A. Nobody"]', 'authors = [""]', "must have a letter or a digit each"),
+        ('authors = ["A. Nobody"]', 'authors = ["\\u3164"]', r"invisible U\+3164"),
+        ('authors = ["A. Nobody"]', 'authors = ["A\\u00adB"]', r"invisible U\+00AD"),
         ('authors = ["A. Nobody"]', "authors = [1]", "authors must be one line"),
         ('authors = ["A. Nobody"]', "authors = [" + '"a", ' * 21 + "]", "authors must be a list"),
         ('license = "MIT"', 'license = ""', "license must be of the form"),
@@ -398,8 +421,10 @@ def test_text_that_is_no_toml_or_a_bomb(folder, content, reason):
         ('license = "MIT"', """license = "MIT"\ncode = 'https://a.org/"x"'""", "code must be of the form"),
         ('license = "MIT"', 'license = "MIT"\ndescription = "a\\tb"', "description must be one line"),
         ('license = "MIT"', 'license = "MIT"\ndescription = 1979-05-27', "description must be one line"),
-        ('kind = "controller"', 'kind = "best"', "kind must be one of"),
-        ('kind = "controller"', 'kind = "learned"', r"\[training\] is missing"),
+        ("schema = 1", 'schema = 1\nkind = "best"', 'kind must be "controller"'),
+        ("schema = 1", "schema = 1\nkind = [1]", 'kind must be "controller"'),
+        ("schema = 1", 'schema = 1\nkind = "<b>learned</b>"', 'kind must be "controller"'),
+        ("schema = 1", 'schema = 1\nkind = "learned"', 'kind must be "controller" .* without .training'),
         ("[policy]", "[[policy]]", "must be a table"),
         ("[policy]", "[policie]", r"policy is missing"),
         ('architecture = "linear"', 'architecture = "pickle"', "architecture must be one of"),
@@ -523,18 +548,40 @@ def test_controller_with_something_wrong(tmp_path, policy, reason):
         built_in(tmp_path / "a", **policy)
 
 
-def test_controller_with_arrays_or_of_another_kind(tmp_path):
+def test_controller_with_arrays(tmp_path):
     built_in(tmp_path / "a")
     (tmp_path / "a" / "policy_0.safetensors").write_bytes(save(LINEAR))
     refused(tmp_path / "a", "a built-in controller has no arrays")
-    for kind in ("learned", "optimal"):
-        built_in(tmp_path / kind)
-        training = '[training]\nseeds = []\nenv_steps = 1\nseconds = 1\nhardware = ""\n'
-        replace(tmp_path / kind, "[policy]", f"{training}[policy]")
-        replace(tmp_path / kind, 'kind = "controller"', f'kind = "{kind}"')
-        refused(tmp_path / kind, 'as kind "controller"')
 
 
+def test_kind_follows_from_the_architecture(tmp_path):
+    table = linear(tmp_path / "table", policy=TABLE, arrays={0: GRID})
+    plain, trained = linear(tmp_path / "a"), learned(tmp_path / "b", policy=FEEDBACK, arrays=FEEDBACKS)
+    kinds = [
+        made.kind for made in (learned(tmp_path / "net"), table, built_in(tmp_path / "it"), plain, trained)
+    ]
+    assert kinds == ["learned", "optimal", "controller", "controller", "learned"]
+    for i, folder in enumerate(("net", "table", "it", "a", "b")):  # may be stated, as it once had to be
+        for kind in ("learned", "optimal", "controller"):
+            shutil.copytree(tmp_path / folder, tmp_path / f"{folder}-{kind}")
+            replace(tmp_path / f"{folder}-{kind}", "schema = 1", f'schema = 1\nprotocol = 1\nkind = "{kind}"')
+            if kind == kinds[i]:
+                assert load(tmp_path / f"{folder}-{kind}").kind == kind
+            else:
+                refused(tmp_path / f"{folder}-{kind}", f'kind must be "{kinds[i]}" for this architecture')
+
+
+def test_a_network_needs_its_training(tmp_path):
+    with pytest.raises(Refused, match=r"\[training\] is missing"):
+        learned(tmp_path / "a", training=None)
+    with pytest.raises(Refused, match="at least 5 policies"):
+        learned(tmp_path / "a", arrays={0: net(0)})
+    with pytest.raises(Refused, match="at least 5 policies"):  # one who trained says so, five times
+        linear(tmp_path / "a", training=TRAINING)
+
+
+FEEDBACK = {"architecture": "linear"}
+FEEDBACKS = {s: LINEAR | {"offset": np.full(1, 0.1 * s)} for s in range(5)}
 GRID = {"axis_0": np.array([-1.0, 1.0]), "axis_1": np.array([0.0, 1.0, 2.0]), "table": np.zeros((2, 3))}
 TABLE = {"architecture": "table", "kind": "action", "axes": ["x", "w"]}
 
@@ -669,7 +716,7 @@ def test_arrays_with_something_wrong(folder, content, reason):
 def test_negative_variance(tmp_path):
     arrays = net(0) | {"obs_mean": np.zeros(4), "obs_var": np.array([1.0, 1.0, -1e-9, 1.0])}
     with pytest.raises(Refused, match="obs_var must not be below 0"):
-        linear(tmp_path / "a", policy=NET | {"normalise": {}}, arrays={0: arrays})
+        network(tmp_path / "a", NET | {"normalise": {}}, arrays)
 
 
 def test_every_single_bit_flip_is_refused_or_harmless(folder):
@@ -744,14 +791,14 @@ def test_export_acts_as_the_model(algo, options, tmp_path):
     made.save(tmp_path / "model.zip")
     assert _algorithm(tmp_path / "model.zip") == {"DDPG": "td3"}.get(algo, algo.lower())
     table, arrays = convert(made, normalise)
-    agent = linear(tmp_path / "a", policy=table, arrays={0: arrays}).policies[0][1].agent()
+    agent = network(tmp_path / "a", table, arrays).policies[0][1].agent()
     off, count = difference(made, normalise, agent, ENV)
     assert off <= 1e-5 and count == 16_384
     if algo == "SAC" and "use_sde" in options:
         assert table["mean_limit"] == 2.0
     # A change that can be felt is noticed.
     arrays["weight_0"] = -arrays["weight_0"]
-    agent = linear(tmp_path / "b", policy=table, arrays={0: arrays}).policies[0][1].agent()
+    agent = network(tmp_path / "b", table, arrays).policies[0][1].agent()
     assert difference(made, normalise, agent, ENV)[0] > 1e-3
 
 
@@ -855,7 +902,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
     solution = Solution(problem, 0.25, folder=None, quiet=True)
     coarse = replaced(COARSE[env], levels=(0.25,) * len(problem.axes), targets=problem.targets)
     policy, arrays = tabulate(solution, coarse)
-    about = ABOUT | {"env": env, "kind": "optimal", "policy": policy, "arrays": {0: arrays}}
+    about = ABOUT | {"env": env, "policy": policy, "arrays": {0: arrays}}
     agent = write(tmp_path / "a", **about).policies[0][1].agent()
     rng = np.random.default_rng(0)
     nodes = np.stack([rng.choice(axis, 200) for axis in solution.programs[0].grid.axes], axis=1)
@@ -963,6 +1010,6 @@ def test_networks_have_a_limit_together(tmp_path, monkeypatch):
 def test_plans_have_a_limit(tmp_path):
     with pytest.raises(Refused, match=r"opening.*10"):
         write(
-            tmp_path / "it", kind="controller", **(ABOUT | {"env": "PivotedBar-v0"}),
+            tmp_path / "it", **(ABOUT | {"env": "PivotedBar-v0"}),
             policy={"architecture": "controller", "name": "iLQR", "numbers": {"opening": 1e6}},
         )  # fmt: skip

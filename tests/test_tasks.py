@@ -499,6 +499,9 @@ CROSSINGS = [
     (0.1, 1.0, 1.0, {"tilt": 0.0, "damping": 5.0, "dt": 1.0}),
     (0.015 * (1 - 1e-9), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 1.0}),
     (0.015 * (1 - 1e-6), 1.0, -1.0, {"tilt": 0.0, "damping": 100.0, "dt": 0.5}),
+    # down a wall
+    (0.01, 1.0, -1.0, {"tilt": PI / 2}),
+    (0.2, 1.0, 1.0, {"tilt": PI / 2, "dt": 1.0, "damping": 10.0}),
     # stiff: the speed is gone at once, or just before the line
     (1e-6, 1.0, 0.0, {"damping": 1e3}),
     (1e-6, 1.0, 0.0, {"damping": 1e5}),

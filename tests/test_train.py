@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,8 +17,10 @@ import yaml
 
 from agents import learners, run, train
 from agents.evaluate import evaluate, evaluate_batch
-from agents.learners import ALGORITHMS, HYPERPARAMS, hyperparameters, load_policy
+from agents.learners import ALGORITHMS, hyperparameters, load_policy
 from agents.run import Run, UserError
+from lag_envs import cli
+from lag_envs.hyperparams import HYPERPARAMS
 from lag_envs.leaderboard.policies import bin_centres
 from lag_envs.tasks import TASKS
 
@@ -290,7 +292,6 @@ def test_help_is_quick():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed: pip install 'lag-envs[ray]'")
 def test_on_a_local_ray_cluster(command, config, tmp_path):
     arguments = (ENV, "--seeds", "2", "--config", str(config))
     status, output = command(*arguments, "--ray", "local")
@@ -309,17 +310,67 @@ def test_ray_that_is_not_there(command, config):
     assert status == 2 and ("pip install" in output or "no Ray cluster at" in output)
 
 
+# --- the RL Zoo ---
+
+
+def test_hyperparams_prints_the_file(capsys):
+    for algo in ALGORITHMS:
+        assert cli.main(["hyperparams", algo]) == 0
+        assert capsys.readouterr().out == (HYPERPARAMS / f"{algo}.yml").read_text()
+    assert cli.main(["hyperparams", "pppo"]) == 2
+    assert "did you mean ppo?" in capsys.readouterr().err
+
+
+def test_hyperparameters_name_what_the_package_brings():
+    """The Zoo imports the wrappers by name, where there is no clone."""
+    for file in HYPERPARAMS.glob("*.yml"):
+        for entry in yaml.safe_load(file.read_text()).values():
+            for wrapper in entry.get("env_wrapper", []) + entry.get("vec_env_wrapper", []):
+                module, _, name = next(iter(wrapper)).rpartition(".")
+                assert module in ("gymnasium.wrappers", "lag_envs.sb3")
+                assert hasattr(import_module(module), name)
+
+
+def test_any_script_of_the_zoo_finds_the_environments(tmp_path):
+    """A script that, as `record_video`, neither imports packages nor takes --gym-packages."""
+    (tmp_path / "rl_zoo3").mkdir()
+    (tmp_path / "rl_zoo3" / "__init__.py").write_text("")
+    script = (
+        "import sys; from gymnasium.envs import registry; print(*sys.argv[1:], 'PivotedBar-v0' in registry)"
+    )
+    (tmp_path / "rl_zoo3" / "record_video.py").write_text(f"if __name__ == '__main__':\n    {script}\n")
+
+    def zoo(*arguments, path=tmp_path):
+        return subprocess.run(
+            [sys.executable, "-m", "lag_envs.zoo", *arguments], cwd=tmp_path, capture_output=True, text=True,
+            env=os.environ | {"PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{path}"},
+        )  # fmt: skip
+
+    for given in (["-n", "5"], ["-n", "5", "--gym-packages", "json"]):
+        done = zoo("record_video", *given)
+        assert done.stdout.split() == ["-n", "5", "True"], done.stderr
+    done = zoo("record_vide")
+    assert done.returncode == 1 and "no script 'record_vide'" in done.stderr and "Trace" not in done.stderr
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("rl_zoo3") is None, reason="the RL Zoo is not installed: pip install rl_zoo3")
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_the_zoo_takes_the_hyperparameters(algo, tmp_path):
-    done = subprocess.run(
-        [
-            sys.executable, "-m", "rl_zoo3.train", "--algo", algo, "--env", ENV, "--gym-packages", "lag_envs",
-            "--conf-file", str(HYPERPARAMS / f"{algo}.yml"), "-n", "200", "--eval-freq", "-1",
-            "-f", str(tmp_path), "-P",
-        ],
-        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT / "src")},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert list(tmp_path.glob(f"{algo}/{ENV}_1/{ENV}.zip"))
+def test_the_zoo_trains_shows_and_films(algo, tmp_path):
+    def zoo(module, *arguments):
+        done = subprocess.run(
+            [sys.executable, "-m", *module, "--algo", algo, "--env", ENV, "-f", "logs", *arguments],
+            cwd=tmp_path, capture_output=True, text=True,
+            env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "SDL_VIDEODRIVER": "dummy"},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
+    config = tmp_path / "config.yml"
+    config.write_text((HYPERPARAMS / f"{algo}.yml").read_text())
+    packages = ["--gym-packages", "lag_envs"]
+    train = ["--conf-file", "config.yml", "-n", "200", "--eval-freq", "-1", "-P"]
+    zoo(["rl_zoo3.train"], *packages, *train)
+    assert list(tmp_path.glob(f"logs/{algo}/{ENV}_1/{ENV}.zip"))
+    assert "Episode Reward" in zoo(["rl_zoo3.enjoy"], *packages, "-n", "600")
+    zoo(["lag_envs.zoo", "record_video"], *packages, "-n", "20")
+    assert list(tmp_path.glob(f"logs/{algo}/{ENV}_1/videos/*.mp4"))

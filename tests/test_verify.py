@@ -1,17 +1,20 @@
 """Verification: scores recomputed, the same bits again, and the numbers that the board shows."""
 
 import argparse
+import gzip
 import json
+from functools import partial
 from itertools import pairwise
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_submission import ENV, NET, built_in, learned, linear, net
+from test_submission import ENV, NET, built_in, learned, linear, net, network
 
 from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.results import build, check, compare, unpacked
 from lag_envs.leaderboard.submission import Refused, load, write
-from lag_envs.leaderboard.verify import compare, declare_verify, episode, run_verify, verify
+from lag_envs.leaderboard.verify import declare_verify, replay, run_verify, verify
 from lag_envs.scores import KNOWN_RETURNS
 from lag_envs.tasks import TASKS
 
@@ -51,7 +54,8 @@ def test_seeds_follow_from_bytes_and_nonce():
 def test_result_is_of_json_types_and_complete(result, submission):
     again = json.loads(json.dumps(result, allow_nan=False))
     assert again == result
-    assert (result["protocol"], result["env"], result["nonce"]) == (protocol.PROTOCOL, ENV, "nonce")
+    assert check(result) is result
+    assert (result["env"], result["nonce"], result["build"]) == (ENV, "nonce", build())
     assert result["digest"] == submission.digest and result["episodes"] == 6
     (policy,) = result["policies"]
     assert policy["seed"] == 0 and len(policy["trajectory"]) == 64
@@ -94,27 +98,125 @@ def test_same_bits_again_and_others_with_another_nonce(result, submission):
         assert other[name] != result[name]
 
 
+WAY = KNOWN_RETURNS[ENV].best - KNOWN_RETURNS[ENV].random
+
+
 def test_results_are_compared(result):
     other = json.loads(json.dumps(result))
-    assert compare(result, other) == (True, 0.0)
-    other["policies"][0]["trajectory"] = "0" * 64
-    other["policies"][0]["returns"][3] += 6.0
-    same, off = compare(result, other)
-    known = KNOWN_RETURNS[ENV]
-    assert not same and off == pytest.approx(1.0 / (known.best - known.random))
+    assert compare(result, other, WAY) == (True, True, 0.0, [])
     with pytest.raises(ValueError, match="differ in nonce: 'nonce' and 'x'"):
-        compare(result, other | {"nonce": "x"})
+        compare(result, other | {"nonce": "x"}, WAY)
+    with pytest.raises(ValueError, match="differ in their conditions"):
+        compare(result, other | {"robustness": {}}, WAY)
 
 
-def test_replay_goes_through_the_same_bits(tmp_path):
-    made = learned(tmp_path / "a")
-    few = verify(made, "n", 3)
-    for policy in (0, 4):
-        returns = few["policies"][policy]["returns"]
-        for i in (0, 2):
+@pytest.mark.parametrize("changed", [{"build": "0" * 64}, {"versions": {}}, {"machine": {}}, {"build": None}])
+def test_bits_count_on_the_same_build_only(result, changed):
+    other = json.loads(json.dumps(result))
+    other["policies"][0]["trajectory"] = "0" * 64
+    other["policies"][0]["returns"] = [r + 4e-4 * WAY for r in other["policies"][0]["returns"]]
+    found = compare(result, other, WAY)
+    assert not found.same and found.build and found.far == ["the bits, though both are of the same build"]
+    found = compare(result, other | changed, WAY)
+    assert not found.same and not found.build and found.far == []
+    assert found.difference == pytest.approx(4e-4)
+
+
+def spoil(result, name, value, episode=None):
+    """Return a result of another build with something else in it."""
+    other = json.loads(json.dumps(result)) | {"build": None}
+    if episode is None:
+        other[name] = value
+    else:
+        other["policies"][0][name][episode] = value
+    return other
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "episode", "told"),
+    [
+        ("returns", 1e3, 2, "mean returns by"),
+        ("returns", -50.0, 3, "the returns of 16.7%"),
+        ("success", None, 1, "the successes of 16.7%"),
+        ("settle", 123.0, 0, "the times of 16.7%"),
+        ("effort", 0.9, 5, "the efforts of 16.7%"),
+        ("reference", 1.0, 4, "the reference's returns of 16.7%"),
+        ("often", [0.0], None, "the means under acting often"),
+    ],
+)
+def test_whatever_is_another_is_found_on_any_build(result, name, value, episode, told):
+    if value is None:
+        value = not result["policies"][0][name][episode]
+    other = spoil(result, name, value, episode)
+    assert any(what.startswith(told) for what in compare(result, other, WAY).far)
+
+
+def test_a_condition_that_is_another_is_found(result):
+    name = next(iter(result["robustness"]))
+    other = spoil(result, "robustness", result["robustness"] | {name: [0.0]})
+    assert compare(result, other, WAY).far == [f"the means under {name}"]
+
+
+def test_one_episode_of_many_may_go_another_way(result):
+    """As it does where a rounding decides; but no two, and not so that it shows in the score."""
+    many = json.loads(json.dumps(result)) | {"episodes": 1000, "build": None}
+    for name in ("returns", "success", "settle", "effort", "reference"):
+        many["policies"][0][name] = (many["policies"][0][name] * 200)[:1000]
+    other = json.loads(json.dumps(many))
+    for i in range(10):
+        other["policies"][0]["returns"][i] += (-1) ** i * 0.5 * WAY
+    assert compare(many, other, WAY).far == []
+    other["policies"][0]["returns"][10:12] = [r + 0.1 * WAY for r in other["policies"][0]["returns"][10:12]]
+    assert compare(many, other, WAY).far == ["the returns of 1.2% of the episodes of seed 0"]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda r: r.update(extra=1),
+        lambda r: r.pop("often"),
+        lambda r: r.update(episodes="6"),
+        lambda r: r.update(episodes=7),
+        lambda r: r.update(policies=[]),
+        lambda r: r["policies"][0]["returns"].pop(),
+        lambda r: r["policies"][0]["returns"].__setitem__(0, None),
+        lambda r: r["policies"][0]["success"].__setitem__(0, 1),
+        lambda r: r["policies"][0].update(trajectory="x"),
+        lambda r: r["robustness"].update(more=[]),
+        lambda r: r.update(replays=[{}]),
+        lambda r: r.update(digest="<b>"),
+        lambda r: r.update(seconds=float("nan")),
+    ],
+)
+def test_results_have_a_schema(result, spoil):
+    other = json.loads(json.dumps(result))
+    spoil(other)
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        check(other)
+
+
+def test_a_result_is_not_unpacked_for_ever(monkeypatch):
+    monkeypatch.setattr("lag_envs.leaderboard.results.UNPACKED", 1000)
+    with pytest.raises(ValueError, match="it unpacks to more than 1,000 bytes"):
+        unpacked(gzip.compress(b" " * 1000 + b"{}"))
+    for content in (b"", b"PK", gzip.compress(b"{}")[:-4], gzip.compress(b"{}")[:12] + b"\xff" * 9):
+        with pytest.raises(ValueError, match=r"it cannot be unpacked|Expecting value"):
+            unpacked(content)
+
+
+@pytest.mark.parametrize("make", [learned, partial(built_in, name="random"), partial(built_in, name="PD")])
+def test_replays_are_of_the_verified_episodes(tmp_path, make):
+    """To the bit, also where a policy draws its actions for all episodes together."""
+    made = make(tmp_path / "a")
+    few = verify(made, "n", 5)
+    for policy in (0, len(made.policies) - 1):
+        told, episodes = replay(made, few, policy, [3, 0])
+        verified = few["policies"][policy]
+        for name in ("returns", "success", "settle", "effort", "reference"):
+            assert told[name] == [verified[name][3], verified[name][0]]
+        for i, found in zip((3, 0), episodes, strict=True):
             seed = protocol.first_seed(made.digest, "n", policy) + i
-            found = episode(made, policy, seed)
-            assert found["return"] == returns[i]
+            assert found["return"] == verified["returns"][i]
             assert found["seed"] == policy and found["reset_seed"] == seed and found["dt"] == 0.05
             steps = len(found["actions"])
             assert len(found["states"]) == steps + 1 == len(found["rewards"]) + 1
@@ -175,12 +277,12 @@ def test_every_environment_has_a_goal_and_disturbances():
     ],
 )
 def test_success_is_what_one_would_call_so(env, name, success, tmp_path):
-    from lag_envs.leaderboard.verify import _play, _Record
+    from lag_envs.leaderboard.verify import _Record, play
 
     policy = {"architecture": "controller", "name": name}
-    made = write(tmp_path / "a", env=env, kind="controller", policy=policy, **ABOUT)
+    made = write(tmp_path / "a", env=env, policy=policy, **ABOUT)
     record = _Record(env, 20)
-    _play(env, made.policies[0][1].agent(), 1, 20, watch=record)
+    play(env, made.policies[0][1].agent(), range(1, 21), watch=record)
     found = record.result()
     assert np.mean(found["success"]) == success
     times = [t for t in found["settle"] if t is not None]
@@ -196,8 +298,10 @@ def test_network_that_overflows_is_refused(tmp_path):
     arrays["weight_0"] = np.full((3, 4), 1e308)
     arrays["weight_1"] = np.array([[1e308, -1e308, 0.0]])
     arrays["bias_0"], arrays["bias_1"] = np.zeros(3), np.zeros(1)
-    made = linear(tmp_path / "a", policy=NET | {"activation": "relu"}, arrays={7: arrays})
-    with pytest.raises(Refused, match="policy of seed 7: it returned an action that is not a finite number"):
+    made = network(tmp_path / "a", NET | {"activation": "relu"}, arrays)
+    with pytest.raises(
+        Refused, match=r"policy of seed \d: it returned an action that is not a finite number"
+    ):
         verify(made, "", 2)
 
 
@@ -259,12 +363,27 @@ def test_command_tells_results_and_refusals(tmp_path, capsys, result):
     good["policies"][0]["trajectory"] = "0" * 64
     good["policies"][0]["returns"] = [r + 0.1 for r in good["policies"][0]["returns"]]
     out.write_text(json.dumps([good]))
+    assert command(*again) == 1
+    assert "too far from it: the bits, though both are of the same build" in capsys.readouterr().out
+    good["build"] = None
+    out.write_text(json.dumps([good]))
     assert command(*again) == 0
     assert "scores differ by" in capsys.readouterr().out
     good["policies"][0]["returns"][0] += 100.0
     out.write_text(json.dumps([good]))
     assert command(*again) == 1
-    assert "more than the tolerance" in capsys.readouterr().out
+    assert "too far from it: mean returns by" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "content", ["", "{}", "[1]", '[{"digest": 1}]', '[{"digest": "x", "policies": 5}]', "[" * 10**5]
+)
+def test_command_refuses_what_are_no_results(tmp_path, content):
+    from lag_envs.errors import UserError
+
+    (tmp_path / "before.json").write_text(content)
+    with pytest.raises(UserError, match=r"before\.json cannot be read"):
+        command(tmp_path, "--against", tmp_path / "before.json")
 
 
 @pytest.mark.parametrize(

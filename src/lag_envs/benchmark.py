@@ -88,7 +88,12 @@ class Target(NamedTuple):
         return f"{self.kind}, {self.num_envs:,}" if self.kind == "vector" else f"single, {self.kind}"
 
 
-TARGETS = (Target("made", 1, 2.0), Target("vector", 64, 6.0), Target("vector", 16384, 3.0))
+TARGETS = (
+    Target("made", 1, 2.0),
+    Target("vector", 64, 6.0),
+    Target("vector", 1024, 3.0),
+    Target("vector", 16384, 3.0),
+)
 #: Seconds from the start of a process to its end after one step, by state of the cache of compiled code.
 COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
@@ -106,6 +111,7 @@ class Settings:
     cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
     date: str = ""
     output: str | None = None
+    checkout: str | None = None  #: whose docs and README take the result over
 
 
 @dataclass
@@ -321,10 +327,11 @@ def bench(settings: Settings) -> dict[str, Any]:
     report["targets"] = verdicts(results, cold)
     print("\n".join(table(report)))
     if settings.output:
-        Path(settings.output).write_text(
-            json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-        )
+        Path(settings.output).write_text(to_json(report), encoding="utf-8")
         print(f"written to {settings.output}")
+    if settings.checkout and complete:
+        take_over(report, Path(settings.checkout))
+        print(f"written to docs/speed.json and README.md in {settings.checkout}")
     return report
 
 
@@ -572,6 +579,92 @@ def table(report: dict[str, Any]) -> list[str]:
     if not report["complete"]:
         lines += ["", "broken off: these are the samples until then"]
     return lines
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """Return README's table: every environment at the sizes of `TARGETS`; what misses its aim is marked.
+
+    Parameters
+    ----------
+    report : dict
+        What `bench` returns; of these sizes, with CartPole-v1 among them.
+    """
+    rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
+    rival = ("gymnasium", "CartPole-v1")
+
+    def cell(library: str, id: str, target: Target) -> str:
+        row = rows[library, id, target.kind, target.num_envs]
+        if "steps_per_second" not in row:
+            return row["problem"] or "not measured"
+        time = 1e9 / row["steps_per_second"][1]
+        text = f"{time:,.0f} ns" if time >= 99.5 else f"{time:.3g} ns"
+        if (library, id) == rival:
+            return text
+        ratio = row["ratio"][1]
+        return f"{text}, {ratio:.1f}×" if ratio >= target.ratio else f"{text}, **{ratio:.2f}×, missed**"
+
+    sizes = ["1 (`gym.make`)" if t.kind == "made" else f"{t.num_envs:,} at once" for t in TARGETS]
+    lines = [
+        ["id", *sizes],
+        ["---"] * (1 + len(sizes)),
+        *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in _ours(report)),
+        ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
+        ["*aim*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
+    ]
+    machine, settings = report["machine"], report["settings"]
+    parts = [
+        "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
+        f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
+        f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
+        "\n".join("| " + " | ".join(line) + " |" for line in lines),
+    ]
+    if cold := report["cold_start"]:
+        starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
+        parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
+    return "\n\n".join(parts)
+
+
+def claim(report: dict[str, Any]) -> str:
+    """Return README's sentence on speed: the ranges of its table, and how many aims are missed."""
+    rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
+    found = [
+        sorted(row["ratio"][1] for row in rows if (row["kind"], row["num_envs"]) == target[:2])
+        for target in TARGETS
+    ]
+    places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
+    ranges = ", ".join(
+        f"{place} {ratios[0]:.3g} to {ratios[-1]:.3g} times"
+        for place, ratios in zip(places, found, strict=True)
+        if ratios
+    )
+    missed = sum(
+        ratio < target.ratio for target, ratios in zip(TARGETS, found, strict=True) for ratio in ratios
+    )
+    aims = f"{missed} of {sum(map(len, found))} aims are missed" if missed else "all aims are met"
+    return (
+        "- Fast: a step, observation, reward, endings and resets included, is quicker than one of Gymnasium's"
+        f" `CartPole-v1`: {ranges}; {aims}. See [Speed](#speed)."
+    )
+
+
+def _ours(report: dict[str, Any]) -> list[str]:
+    return list(dict.fromkeys(row["id"] for row in report["rows"] if row["library"] == "lag_envs"))
+
+
+def take_over(report: dict[str, Any], checkout: Path) -> None:
+    """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
+    from lag_envs.report.docs import replaced
+
+    (checkout / "docs" / "speed.json").write_text(to_json(report), encoding="utf-8")
+    readme = checkout / "README.md"
+    text = replaced(readme.read_text(encoding="utf-8"), "bench", markdown(report))
+    readme.write_text(replaced(text, "fast", claim(report)), encoding="utf-8")
+
+
+def to_json(report: dict[str, Any]) -> str:
+    """Return a report as JSON, with lists of numbers on a line."""
+    text = json.dumps(report, indent=1, allow_nan=False)
+    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:

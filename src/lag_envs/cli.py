@@ -49,7 +49,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 def _line(id: str) -> tuple[str, ...]:
     task = _task(id)
-    low, high = _controls(task)
+    low, high = task.control_range
     name, _, unit = task.scene.control_unit.partition(" [")
     control = f"{name} {low:g} to {high:g} {unit.rstrip(']')}".rstrip()
     return (
@@ -76,7 +76,7 @@ def run_info(args: argparse.Namespace) -> int:
 
     task = _task(_known(args.id))
     scene = task.scene
-    low, high = _controls(task)
+    low, high = task.control_range
     text = [args.id, "", *_description(task)]
     text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
     states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
@@ -133,31 +133,18 @@ def _own_parameters(task: Task) -> list[tuple[str, ...]]:
 
 def _accuracy(task: Task) -> list[str]:
     """Say what is proved of a step with the largest control, and how far one substep goes."""
-    scene, angle = task.scene, task.scene.angle
-    low, high = _controls(task)
-
-    def bound(speed: float | None = None) -> Any:
-        """Return the bound of the worse of the two controls, from the farthest start or at a given θ'."""
-        state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
-        if speed is not None and angle is not None:
-            state[angle + 1] = speed
-        bounds = [scene.truncation_bound(state, u, task.dt) for u in (low, high)]
-        return max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
-
-    first = bound()
-    if first is None:
+    scene = task.scene
+    edge = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+    bounds = [scene.truncation_bound(edge, u, task.dt) for u in task.control_range]
+    first = max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
+    speed = task.certified_speed()
+    if first is None or speed is None:
         return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
-    near, far = 0.0, 1e4
-    if bound(near).substeps > 1:
+    reach = "no step is certified for a single substep: the number follows from the bound before each step"
+    if speed >= 0.0:
+        shown = math.floor(10.0 * speed) / 10.0
         reach = (
-            "no step is certified for a single substep: the number follows from the bound before each step"
-        )
-    else:
-        for _ in range(60):
-            middle = 0.5 * (near + far)
-            near, far = (middle, far) if bound(middle).substeps == 1 else (near, middle)
-        reach = (
-            f"one substep is certified up to |theta_dot| = {near:.3g} rad/s; above, the bound tells how many"
+            f"one substep is certified up to |theta_dot| = {shown:g} rad/s; above, the bound tells how many"
         )
     return [
         f"Taylor series of order {first.order}",
@@ -186,6 +173,11 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--output", metavar="FILE", help="write everything, raw samples included, to this JSON file"
+    )
+    parser.add_argument(
+        "--checkout",
+        metavar="FOLDER",
+        help="take everything over into docs/speed.json and README.md of this checkout",
     )
     parser.add_argument(
         "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
@@ -219,6 +211,17 @@ def run_bench(args: argparse.Namespace) -> int:
     )
     if args.output:
         _check_writable(Path(args.output))
+    if args.checkout is not None:
+        for option in ("ids", "quick", "cold", "sizes"):
+            if getattr(args, option):
+                raise UserError(
+                    "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes"
+                )
+        for name in ("README.md", "docs/speed.json"):
+            if not os.access(Path(args.checkout, name), os.W_OK):
+                raise UserError(
+                    f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
+                )
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
     given = {
         name: getattr(args, name)
@@ -231,6 +234,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "clock": args.clock,
         "date": args.date,
         "output": args.output,
+        "checkout": args.checkout,
     }
     return in_own_process(Settings(**(quick | given | plain)))
 
@@ -288,6 +292,9 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
     )
+    parser.add_argument(
+        "--docs", metavar="PROJECT", help="then write docs/accuracy and README's part of it in this checkout"
+    )
 
 
 def run_report(args: argparse.Namespace) -> int:
@@ -301,11 +308,37 @@ def run_report(args: argparse.Namespace) -> int:
     for name in names:
         if name not in SECTIONS:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
+    if args.docs and (args.quick or names != SECTIONS):
+        raise UserError("--docs takes a whole report: leave out --quick and --sections")
     settings = Settings(args.folder, args.quick, names, args.processes, args.date)
     try:
-        return 0 if make_report(settings) else 130
+        if not make_report(settings):
+            return 130
+        if args.docs:
+            from lag_envs.report import docs
+
+            return docs.main([args.folder, args.docs])
+        return 0
     except (NotAReport, OSError) as error:
         raise UserError(str(error)) from error
+
+
+# --- hyperparams ---
+
+
+def declare_hyperparams(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``hyperparams``."""
+    parser.add_argument("learner", metavar="LEARNER", help="ppo, sac, td3, tqc or dqn")
+
+
+def run_hyperparams(args: argparse.Namespace) -> int:
+    """Print the hyperparameters of a learner."""
+    from lag_envs.hyperparams import HYPERPARAMS, learners
+
+    if args.learner not in learners():
+        raise UserError(f"there is no learner {args.learner!r}; {hint(args.learner, learners())}")
+    print((HYPERPARAMS / f"{args.learner}.yml").read_text(encoding="utf-8"), end="")
+    return 0
 
 
 # --- leaderboard, verify, export ---
@@ -315,7 +348,9 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
     """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
 
     def call(given: Any) -> Any:
-        for package in ("jinja2", "safetensors", "scipy", "sympy", "tqdm"):
+        for package in (
+            "confusable_homoglyphs", "jinja2", "pydantic", "safetensors", "scipy", "sympy", "tqdm",
+        ):  # fmt: skip
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
         from lag_envs.leaderboard.board import BoardError
@@ -396,6 +431,7 @@ the cold start of whole processes. Ctrl-C ends the measurement and keeps what th
 examples:
   lag-envs bench --quick                             one environment, under a minute
   lag-envs bench --output speed.json                 everything, a few minutes
+  lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 InclineTilt-v0 --sizes 64,16384
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
@@ -412,10 +448,25 @@ Ctrl-C the same command goes on. heyoka, diffrax, torchdiffeq and MuJoCo take pa
 
 examples:
   lag-envs report --quick                            a first look, under a minute
-  lag-envs report                                    everything, under 15 minutes on two cores
+  lag-envs report                                    everything, about half an hour on two cores
+  lag-envs report --docs .                           the same, and what this checkout says of it
   lag-envs report --sections bound,stability maps    two parts, into the folder maps""",
         declare_report,
         run_report,
+    ),
+    Command(
+        "hyperparams",
+        "print hyperparameters for the RL Zoo",
+        """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the form of
+the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with.
+
+examples:
+  lag-envs hyperparams ppo > ppo.yml
+  python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
+  python -m rl_zoo3.enjoy --algo ppo --env PivotedBar-v0 --gym-packages lag_envs -f logs
+  python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs""",
+        declare_hyperparams,
+        run_hyperparams,
     ),
     Command(
         "export",
@@ -544,20 +595,6 @@ def _task(id: str) -> Task:
 
     place, fixed = TASKS[id]
     return load_task(place)(**fixed)
-
-
-def _controls(task: Task) -> tuple[float, float]:
-    """Return the controls of the actions -1 and 1 at the centre of the starts."""
-    from types import SimpleNamespace
-
-    import numpy as np
-
-    from lag_envs.envs.program import constants_of
-
-    k = SimpleNamespace(**constants_of(task))
-    y = task.scene.lift(np.asarray(task.centre, dtype=np.float64))
-    low, high = (float(task.control(a, y, k, task.dt, np)) for a in (-1.0, 1.0))
-    return low, high
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -11,39 +11,41 @@ from typing import NamedTuple
 class Known(NamedTuple):
     """Mean returns that are known of an environment with its default parameters.
 
-    In a clone, ``python -m agents.scale`` measures `random` and `best` anew.
+    The first two are the scale, set once: what is measured later, and more precisely, does not change them.
+    In a clone, ``python -m agents.scale`` measures all of them anew; ``agents/results/scale.json`` has what
+    came out.
 
     Parameters
     ----------
     random : float
-        Of uniformly random actions, over 65,536 episodes.
+        Of uniformly random actions.
     best : float
-        Of the best policy known: over 65,536 episodes or more, or where it takes long, over 1,000 and
-        corrected by how lucky a quick controller was in the same ones.
+        Of the best policy known.
+    error : float
+        Standard error of `best`, as far as the luck of its episodes goes.
     policy : str
-        Which one that is.
-    estimate : float
-        What the optimum is at most, as value iteration estimates it: extrapolated to a grid without width,
-        not proved. It too is corrected for luck: what ``agents/results/optimum`` tells is of 1,000 episodes.
-        Where a relaxed task was solved, the optimum is lower.
+        Which policy that is.
+    optimum : float, optional
+        The optimum, in the same episodes as `best`, where it is known; None elsewhere. What is estimated of
+        it there, tells ``docs/agents.md``.
     """
 
     random: float
     best: float
+    error: float
     policy: str
-    estimate: float
+    optimum: float | None = None
 
 
-# Standard errors of the best: .01 to .03, but for Brake .001, Balance .14 and Damping .2.
 KNOWN_RETURNS = {
-    "PivotedBar-v0": Known(-0.72, 419.01, "iLQR", 423.1),
-    "PivotedBarFree-v0": Known(-2.41, 422.49, "iLQR", 423.2),
-    "PivotedBarBalance-v0": Known(21.4, 452.7, "LQR", 498.0),
-    "InclineTilt-v0": Known(9.41, 181.57, "iLQR", 181.9),
-    "InclineBrake-v0": Known(-4.325, -1.724, "switching line", -1.724),
-    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, "iLQR", 197.7),
-    "CylinderInCylinderPump-v0": Known(6.25, 145.70, "optimal", 147.4),
-    "CylinderInCylinderDamping-v0": Known(293.3, 367.1, "optimal", 367.6),
+    "PivotedBar-v0": Known(-0.72, 419.01, 0.012, "iLQR"),
+    "PivotedBarFree-v0": Known(-2.41, 422.49, 0.013, "iLQR"),
+    "PivotedBarBalance-v0": Known(21.4, 452.7, 0.14, "LQR"),
+    "InclineTilt-v0": Known(9.41, 181.57, 0.026, "iLQR"),
+    "InclineBrake-v0": Known(-4.325, -1.724, 0.0004, "switching line", optimum=-1.7238),
+    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.004, "iLQR"),
+    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.04, "optimal"),
+    "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.06, "optimal"),
 }
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from lag_envs.controllers.basic import Constant, Random, do_nothing
 from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR, plan_pumping
 from lag_envs.controllers.ilqr import ILQR
-from lag_envs.controllers.incline import SwitchingLine, TiltCascade
+from lag_envs.controllers.incline import SwitchingLine, TiltCascade, optimal_return
 from lag_envs.controllers.pd import PD
 from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, lqr, plan_swing_up
 from lag_envs.errors import hint
@@ -39,6 +39,7 @@ __all__ = [
     "do_nothing",
     "lqr",
     "make_controller",
+    "optimal_return",
     "plan_pumping",
     "plan_swing_up",
 ]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lag_envs.controllers.basic import Array, Law
 from lag_envs.controllers.linear import regulator
 from lag_envs.envs.model import Model
+from lag_envs.stepping.slope import Pull, crossing_time
 from lag_envs.tasks.incline import Brake, Tilt
 
 #: Points of the curve along which a cylinder is braked.
@@ -103,3 +105,68 @@ class SwitchingLine(Law):
         between = free / np.minimum(free - braked, -1e-300)
         share = np.where(free >= 0.0, 0.0, np.where(braked <= 0.0, 1.0, between))
         return (self.task.limit_control * share).reshape(state.shape[:-1])
+
+
+def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
+    """Return the largest return of the braking task: what no policy exceeds, however often it acts.
+
+    Of all motions that cross the line at a given speed, the one that rolls freely and then brakes fully is
+    the fastest at every place: before the switch nothing is faster, and after it nothing that still gets
+    down to that speed. So only the place of the switch is sought. The later it is, the more speed is left at
+    the line, and the less a further m/s there saves, while its price stays: one place is best. A policy that
+    holds its brake for a step at a time comes close, by braking partly in the step with the switch.
+
+    Parameters
+    ----------
+    task : Brake
+        The task; its slope must not be level.
+    x : array_like [m]
+        Places, before the line at 0.
+    v : array_like [m/s]
+        Speeds, not uphill.
+
+    Returns
+    -------
+    ndarray
+        The returns; minus the episode's seconds where it is better to be late for the line.
+
+    Raises
+    ------
+    ValueError
+        Where nothing pulls the cylinder to the line.
+
+    Examples
+    --------
+    >>> from lag_envs.tasks.incline import Brake
+    >>> round(float(optimal_return(Brake(), x=-2.0, v=0.5)), 4)
+    -1.7373
+    """
+    k = task.constants()
+    if not k["pull"] > 0.0:
+        raise ValueError(
+            f"tilt={task.scene.tilt:g} rad and gravity={task.scene.gravity:g} m/s² pull nothing to the line"
+        )
+    free = Pull(k["pull"], k["drag"])
+    full = Pull(k["pull"], k["drag"] + k["brake"] * task.limit_control)
+    x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
+
+    def crossing(place: Array, speed: Array, force: Pull) -> tuple[Array, Array]:
+        """Return when 0 is passed, and how fast: the integral of x'' = pull - drag x' over the way."""
+        time = crossing_time(place, speed, force, np.inf, np)
+        return time, speed + force.pull * time + force.drag * place
+
+    early, late = x, np.zeros_like(x)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # in branches that are not taken
+        for _ in range(50):  # until a rounding lies between the two
+            switch = 0.5 * (early + late)
+            _, fast = crossing(x - switch, v, free)
+            time, slow = crossing(switch, fast, full)
+            # Seconds saved by a m/s more at the line, where the brake sets in that much later.
+            saved = (slow / fast * np.exp(full.drag * time) - 1.0) / full.pull
+            later = (slow <= task.gentle) | (saved > task.price)
+            early, late = np.where(later, switch, early), np.where(later, late, switch)
+        first, fast = crossing(x - late, v, free)
+        second, slow = crossing(late, fast, full)
+        longest, _ = crossing(x, v, full)
+    crossed = -(first + second + task.price * np.maximum(slow - task.gentle, 0.0))
+    return np.where(longest > task.duration, np.maximum(crossed, -task.duration), crossed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
 from collections.abc import Mapping
 from typing import Any, SupportsFloat
@@ -195,6 +196,12 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._viewer = Viewer(self.task, self.render_mode)
         return self._viewer.draw(self.state, self.control, self.target)
 
+    def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
+        """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""
+        rest = self.task.rest_action
+        keys = {"": rest, "a": -1.0, "d": 1.0, "ad": rest}
+        return {pressed: np.array([action], FLOAT32) for pressed, action in keys.items()}
+
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._viewer is not None:
@@ -225,9 +232,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
-        if value is not None and value.max_episode_steps is None and math.isfinite(self.task.limit):
-            value = dataclasses.replace(value, max_episode_steps=int(self.task.limit))
-        self._spec = value
+        self._spec = None if value is None else true_spec(value, self.task.limit)
 
     _spec: EnvSpec | None = None
 
@@ -261,6 +266,34 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.__dict__.update(state)
         self._program = program_for(self.task, absent([constants_of(self.task)]))
         self._bind()
+
+
+def true_spec(spec: EnvSpec, limit: float) -> EnvSpec:
+    """Return a copy of a spec that names the steps of an episode and can be written as JSON.
+
+    Gymnasium leaves the steps out where the environment itself ends an episode. From a spec that names them
+    it adds a `TimeLimit` of as many steps, which then agrees with the environment's own.
+
+    Parameters
+    ----------
+    spec : EnvSpec
+        What Gymnasium noted of how the environment was made.
+    limit : float
+        Steps of an episode; infinity for one without an end.
+    """
+    steps = int(limit) if math.isfinite(limit) else None
+    # `make_vec` passes the steps on as a keyword, which the spec need not say twice.
+    kwargs = {name: plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
+    return dataclasses.replace(spec, max_episode_steps=steps, kwargs=kwargs)
+
+
+def plain(value: Any) -> Any:
+    """Return arrays and NumPy's numbers as lists and numbers, an enum as its value, others as they are."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]
+    return value.value if isinstance(value, enum.Enum) else value
 
 
 def absent(constants: list[dict[str, float]]) -> frozenset[str]:

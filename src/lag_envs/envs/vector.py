@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -24,6 +25,7 @@ from lag_envs.envs.single import (
     key_of,
     observation_space,
     start_options,
+    true_spec,
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.base import is_masked, real_array, shown
@@ -91,7 +93,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.num_envs = check_count("num_envs", num_envs)
         self.render_mode = render_mode
         self.diagnostics = diagnostics
-        self._mode = check_mode(autoreset_mode)
+        #: TorchRL asks for it under this name, as Gymnasium's own vector environments have it.
+        self.autoreset_mode = check_mode(autoreset_mode)
         self._tasks = make_tasks(load_task(task), self.num_envs, options)
         self.task = self._tasks[0]
         self.scene = self.task.scene
@@ -99,7 +102,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": max(1, round(1.0 / self.task.dt)),
-            "autoreset_mode": self._mode,
+            "autoreset_mode": self.autoreset_mode,
         }
         self.single_action_space = action_space()
         self.single_observation_space = observation_space(self._tasks)
@@ -224,7 +227,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         actions = self._check_actions(actions)
         if not self._started:
             raise ResetNeeded("call reset() before step(): no episode has begun")
-        if self._over and self._mode == AutoresetMode.DISABLED:
+        if self._over and self.autoreset_mode == AutoresetMode.DISABLED:
             done = np.flatnonzero(self._read("n") < 0.0)
             raise ResetNeeded(
                 f"the episodes of environments {done.tolist()} are over: "
@@ -252,7 +255,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._over = over
         observations = observations.T
         infos = self._infos(None) if self.diagnostics else {}
-        if self._over and self._mode == AutoresetMode.SAME_STEP:
+        if self._over and self.autoreset_mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
         results = observations, rewards, terminations, truncations, infos
         if status > 0:
@@ -298,6 +301,17 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def control(self) -> NDArray[np.float64]:
         """The controls applied last, shape (num_envs,), in SI units; 0 after a reset."""
         return self._read("u")
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How the environments were made; its step limit is the one that they enforce."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = None if value is None else true_spec(value, self._constants[0]["limit"])
+
+    _spec: EnvSpec | None = None
 
     # --- the rest ------------------------------------------------------------------------------------------
 

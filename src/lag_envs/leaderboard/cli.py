@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import secrets
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish
+from lag_envs.leaderboard.log import COMMIT
 
 
 def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +31,11 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         one.set_defaults(act=run)
         return one
 
+    def source(one: argparse.ArgumentParser) -> None:
+        one.add_argument(
+            "--source", metavar="URL", default="", help="https address at which anybody finds the nonce"
+        )
+
     def spread_over(one: argparse.ArgumentParser) -> None:
         one.add_argument(
             "--jobs",
@@ -48,23 +53,41 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one = action("add", "take submissions in, and verify all that is pending and has a nonce", _add)
     one.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="a submission")
     one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after they are added")
+    source(one)
     spread_over(one)
     one = action("nonce", "publish a nonce, and verify what was added before", _nonce)
     one.add_argument(
         "value",
         metavar="VALUE",
         nargs="?",
-        help="best one that nobody can choose, such as the next output of a public beacon (default: random)",
+        help="best one that nobody can choose, such as the next pulse of a public beacon (default: the hash"
+        " of the last commit, which has to hold the board as it is)",
     )
+    source(one)
     spread_over(one)
     one = action("list", "show the ranking, and the state of all others", _list)
     one.add_argument("env", metavar="ENV", nargs="?", help="only this environment")
     one = action("show", "show all about one submission", _show)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--json", action="store_true", help="as JSON, with curves, profile and replays")
+    one.add_argument(
+        "--protocol", metavar="N", type=_positive, help="on the board of this one (default: the current)"
+    )
     one = action("withdraw", "take a submission off the board", _withdraw)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--reason", metavar="TEXT", required=True, help="shown on the page")
+    one = action("audit", "check that everything is what was noted when it came onto the board", _audit)
+    one.add_argument(
+        "--all", action="store_true", help="verify every result anew, in place of a few episodes (minutes)"
+    )
+    one.add_argument(
+        "--pin", metavar="FILE", type=Path, help="what to hold the log against (default: the release's)"
+    )
+    one = action("pin", "write the log's head into a file that a release carries", _pin)
+    one.add_argument("file", metavar="FILE", nargs="?", type=Path, help="default: that of this package")
+    one = action(
+        "open", "begin the next protocol: freeze the scale as it is now, and verify all anew under it", _open
+    )
     one = action("build", "write the page", _build)
     one.add_argument(
         "out", metavar="OUT", nargs="?", type=Path, default=Path("site"), help="folder (default: site)"
@@ -110,7 +133,7 @@ def _add(args: argparse.Namespace) -> int:
         waiting = [e for e in state.waiting() if state.nonce(e) is None]
         # Where the same command was broken off before, the nonce is published already.
         if any(not args.folders or e.id in ours for e in waiting):
-            board.publish(args.nonce)
+            _publish(board, args.nonce, args.source)
     return 1 if _finish(board, args) + failed else 0
 
 
@@ -118,10 +141,35 @@ def _nonce(args: argparse.Namespace) -> int:
     board = Board(args.board)
     if not board.read().waiting():
         raise BoardError("nothing is pending: a nonce now would be known before the next submission")
-    value = secrets.token_hex(16) if args.value is None else args.value
-    board.publish(value)
-    print(f"nonce: {value}")
+    _publish(board, args.value, args.source)
     return 1 if _finish(board, args) else 0
+
+
+def _publish(board: Board, value: str | None, source: str) -> None:
+    """Publish a nonce, a commit's hash as such."""
+    from lag_envs.leaderboard.audit import head_of
+
+    if value is None:
+        value, source = head_of(board), COMMIT
+    elif not source and len(value) in (40, 64):
+        try:
+            source = COMMIT if head_of(board) == value else ""
+        except BoardError:
+            pass
+    board.publish(value, source)
+    print(f"nonce: {value}")
+    if not source:
+        print("it names no public source (--source), so an audit will not accept it", file=sys.stderr)
+
+
+def _open(args: argparse.Namespace) -> int:
+    board = Board(args.board)
+    number = board.open()
+    waiting = len(board.read().waiting())
+    print(f"protocol {number}; to be verified under it: {waiting}")
+    if waiting:
+        print("commit and push, then `lag-envs leaderboard nonce`")
+    return 0
 
 
 def _finish(board: Board, args: argparse.Namespace) -> int:
@@ -175,13 +223,26 @@ def _list(args: argparse.Namespace) -> int:
             low, high = row["interval"]
             success = "" if row["success"] is None else f"{100.0 * row['success']['rate']:.1f} %"
             ends = f"{low:.4f} to {high:.4f}"
-            told = (row["kind"], _plain(row["name"]), row["id"])
-            lines.append((str(row["rank"]), f"{row['score']:.4f}", ends, success, *told))
+            told = (row["kind"], _plain(row["name"]), row["id"] + _remark(row))
+            rank = "-" if row["rank"] is None else str(row["rank"])
+            lines.append((rank, f"{row['score']:.4f}", ends, success, *told))
         print("\n".join("  " + line for line in _columns(lines)), end="\n" * bool(lines))
         for other in found["other"]:
             reason = f": {_plain(other['reason'])}" if other["reason"] else ""
             print(f"  {other['id']} {other['state']}{reason}")
     return 0
+
+
+def _remark(row: dict[str, Any]) -> str:
+    """Return what sets a row apart, in words."""
+    remarks = []
+    if row["alike"]:
+        remarks.append(f"acts like {row['alike']['id']}")
+    if row["looks_like"]:
+        remarks.append(f"not {_plain(row['looks_like'])}, though it looks the same")
+    if row["reference"]:
+        remarks.append("reference, measured in other episodes")
+    return f" ({'; '.join(remarks)})" if remarks else ""
 
 
 def _some(board: Board) -> State:
@@ -193,11 +254,18 @@ def _some(board: Board) -> State:
 
 
 def _show(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.audit import sound
+
     board = Board(args.board)
     state = _some(board)
-    entry = state.entry(args.id)
+    number = args.protocol or state.number
+    if number not in state.boards:
+        raise BoardError(f"there is no protocol {number}; the current one is {state.number}")
+    entry = state.boards[number].get(args.id) or state.entry(args.id)
     told: dict[str, Any] = {
-        key: value for key, value in vars(entry).items() if value and key not in ("sha256", "reason")
+        key: value
+        for key, value in vars(entry).items()
+        if value and key not in ("sha256", "reason", "line", "since", "alike")
     }
     told["state"] = f"{entry.state}: {entry.reason}" if entry.reason else entry.state
     told["authors"] = ", ".join(entry.authors)
@@ -207,24 +275,34 @@ def _show(args: argparse.Namespace) -> int:
         boards = board_data(board)["environments"]
         found = next(b for b in boards if (b["id"], b["protocol"]) == (entry.env, entry.protocol))
         row = next(r for r in found["rows"] if r["id"] == entry.id)
+    else:
+        sound(board)
     if args.json:
         print(json.dumps(told | row, indent=2))
         return 0
     for key in ("profile", "curves", "replays", "above", "id", "name", "authors", "kind", "state", "added"):
         row.pop(key, None)
+    if row.get("alike"):
+        row["alike"] = row["alike"]["id"]
     if row.get("robustness"):
         row["robustness"] = ", ".join(f"{name}: {value:.4g}" for name, value in row["robustness"].items())
     if row.get("success"):
         row["success"] = "{rate:.4g} ({low:.4g} to {high:.4g})".format(**row["success"])
     if row.get("interval"):
         row["interval"] = "{:.4g} to {:.4g}".format(*row["interval"])
-    shown = [(key.replace("_", " "), value) for key, value in (told | row).items() if value not in (None, "")]
+    shown = [
+        (key.replace("_", " "), value)
+        for key, value in (told | row).items()
+        if value not in (None, "", False)
+    ]
     print("\n".join(_columns([(key, _plain(value)) for key, value in shown])))
     return 0
 
 
 def _withdraw(args: argparse.Namespace) -> int:
-    Board(args.board).withdraw(args.id, args.reason)
+    board = Board(args.board)
+    _some(board)
+    board.withdraw(args.id, args.reason)
     print(f"{args.id}: withdrawn")
     return 0
 
@@ -240,6 +318,42 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
     return [
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
+
+
+# --- audit, pin ---------------------------------------------------------------------------------------------
+
+
+def _audit(args: argparse.Namespace) -> int:
+    """Print each finding; return 1 where something is wrong."""
+    from tqdm import tqdm
+
+    from lag_envs.leaderboard.audit import Finding, audit
+
+    board = Board(args.board)
+    if not os.path.lexists(board.log):
+        raise BoardError(f"{board.folder} has no log; there is nothing to audit")
+    with tqdm(desc="playing again", unit=" results", disable=None, leave=False, delay=1.0) as bar:
+
+        def tell(finding: Finding) -> None:
+            state = (
+                "WRONG" if finding.wrong else "not checked: " + finding.open if finding.open else finding.told
+            )
+            with tqdm.external_write_mode():
+                print(f"{finding.name:12} {_plain(state)}", flush=True)
+                for text in finding.wrong:
+                    print(f"  {_plain(text)}", flush=True)
+
+        fine = audit(board, args.pin, args.all, tell, lambda entry: bar.update())
+    return 0 if fine else 1
+
+
+def _pin(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.audit import PIN, write_pin
+
+    file = args.file or PIN
+    pin = write_pin(Board(args.board), file)
+    print(f"{file}: {pin.lines} lines, head {pin.head}")
+    return 0
 
 
 # --- build, serve -------------------------------------------------------------------------------------------

@@ -351,7 +351,7 @@ def export(
     }
     try:
         submission = write(
-            folder, env=env, name=name or "", authors=list(authors), license=license, kind="learned",
+            folder, env=env, name=name or "", authors=list(authors), license=license,
             policy=tables[0], arrays=arrays, training=training, code=code, description=description,
         )  # fmt: skip
     except (Refused, OSError) as error:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection
 from typing import Any
 
+from lag_envs.leaderboard.names import unreadable
 from lag_envs.leaderboard.protocol import Refused
 
 #: Stands for a key that must be there.
@@ -81,12 +82,14 @@ class Fields:
         return float(value)
 
     def text(self, key: str, longest: int, default: Any = NEEDED, pattern: str = "") -> str:
-        """Take one line of printable text, so without control characters and changes of direction."""
+        """Take one line of readable text: no control characters, changes of direction, invisible ones."""
         return self._text(key, self.any(key, default), longest, pattern)
 
     def _text(self, key: str, value: Any, longest: int, pattern: str = "") -> str:
-        if not isinstance(value, str) or len(value) > longest or not value.isprintable():
+        if not isinstance(value, str) or len(value) > longest:
             raise self._refuse(key, f"one line of printable text of at most {longest} characters", value)
+        if reason := unreadable(value):
+            raise self._refuse(key, f"one line of printable text ({reason})", value)
         if pattern and not re.fullmatch(pattern, value):
             raise self._refuse(key, f"of the form {pattern}", value)
         return value

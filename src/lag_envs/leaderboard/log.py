@@ -1,7 +1,13 @@
-"""The board's log: a file of events, a line of JSON for each, only ever appended to."""
+"""The board's log: a file of events, a line of JSON for each, only ever appended to.
+
+Each event holds, as ``prev``, the SHA-256 of all that stands before its line. So nothing in the log can be
+changed without changing every later line, and the log's own SHA-256 (``sha256sum board.jsonl``), its head,
+stands for all of it. The lines of protocol 1 are older than this; the first line with a hash covers them.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -11,54 +17,287 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+
+from lag_envs.leaderboard.fields import plain, shown
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.names import unreadable
 
 LOG = "board.jsonl"
+#: Bytes of a log.
+MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
-#: What an event must say besides when and what it is.
-EVENTS: dict[str, dict[str, type]] = {
-    "added": {
-        "id": str, "env": str, "protocol": int, "name": str, "authors": list, "kind": str, "digest": str,
-    },
-    "nonce": {"value": str},
-    "verified": {"id": str, "nonce": str, "sha256": str, "supersedes": list},
-    "rejected": {"id": str, "reason": str},
-    "withdrawn": {"id": str, "reason": str},
-}  # fmt: skip
-ID = re.compile(r"[A-Za-z0-9]+(-[A-Za-z0-9]+)*")
-#: All of one length and in UTC, so that they sort as text.
-TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}\+00:00")
-
-Event = dict[str, Any]
+KINDS = ("learned", "controller", "optimal")
+REMEDY = "restore it from version control"
+#: All of one length and in UTC, so that they sort as text; none that a clock could not go beyond.
+TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
 class BoardError(Exception):
     """What is asked of the board cannot be done; the text says why, and what to do."""
 
 
-# --- what the log says --------------------------------------------------------------------------------------
+# --- events -------------------------------------------------------------------------------------------------
+
+
+def _readable(text: str) -> str:
+    if reason := unreadable(text):
+        raise ValueError(reason)
+    return text
+
+
+def _moment(text: str) -> str:
+    if not re.fullmatch(TIME, text):
+        raise ValueError("a time is needed such as 2026-01-31T12:00:00.000000+00:00, before the year 2200")
+    datetime.fromisoformat(text)
+    return text
+
+
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+(-[A-Za-z0-9]+)*$", max_length=200)]
+EnvId = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+-v(0|[1-9][0-9]{0,3})$", max_length=80)]
+Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_readable)]
+Text = Annotated[str, Field(max_length=1_000), AfterValidator(_readable)]
+#: Far from where sums overflow.
+Number = Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=0.0, le=1e15, allow_inf_nan=False)]
+Moment = Annotated[str, AfterValidator(_moment)]
+#: What `nonce` names as its source where it is a commit of the repository in which the board lies.
+COMMIT = "commit"
+
+
+class Strict(BaseModel):
+    """Data of exactly these types, without anything besides."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class Event(Strict):
+    """What all events say: when (UTC), and the hash of the log before it."""
+
+    at: Moment
+    prev: Hash | None = None
+
+
+class Scale(Strict):
+    """The mean returns that are scores 0 and 1, frozen when a protocol begins."""
+
+    random: Number
+    best: Number
+    policy: Name
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if self.best - self.random < 1e-9:
+            raise ValueError("the best return must be above that of random actions")
+        return self
+
+
+class Reference(Strict):
+    """The controller that plays everybody's episodes, its mean return, and that mean's standard error."""
+
+    controller: Name
+    mean: Number
+    error: Positive
+    episodes: Annotated[int, Field(ge=1, le=10**9)]
+
+
+class Rules(Strict):
+    """What a verification is: how many episodes, how many policies of a learner, and what success means."""
+
+    episodes: Annotated[int, Field(ge=1, le=10**6)]
+    disturbed_episodes: Annotated[int, Field(ge=1, le=10**6)]
+    learned_policies: Annotated[int, Field(ge=1, le=1000)]
+    success: dict[EnvId, Text]
+
+
+class Protocol(Event):
+    """A protocol begins: what a score means from here on. All that counts is to be verified anew."""
+
+    event: Literal["protocol"]
+    number: Annotated[int, Field(ge=1, le=10**6)]
+    rules: Rules
+    scales: dict[EnvId, Scale]
+    references: dict[EnvId, Reference]
+
+
+class Added(Event):
+    """A submission was taken in, or taken in again after it was rejected or withdrawn."""
+
+    event: Literal["added"]
+    id: Id
+    env: EnvId
+    protocol: Annotated[int, Field(ge=1, le=10**6)]
+    name: Name
+    authors: Annotated[list[Name], Field(min_length=1, max_length=20)]
+    kind: Literal["learned", "controller", "optimal"]
+    digest: Hash
+
+
+class Nonce(Event):
+    """A nonce was published: `COMMIT`, an address, or nothing says where it came from."""
+
+    event: Literal["nonce"]
+    value: Annotated[str, Field(pattern=r"^[!-~]{1,200}$")]
+    source: Annotated[str, Field(pattern=r"^(commit|https://[!-~]{1,300})?$")] = ""
+
+
+class Alike(Strict):
+    """Another submission that acts alike: root mean squares of the differences, see `alike`."""
+
+    id: Id
+    actions: Positive
+    returns: Positive
+
+
+class Verified(Event):
+    """A submission was verified, and its result kept; the same authors' ones of that name step back."""
+
+    event: Literal["verified"]
+    id: Id
+    nonce: Annotated[str, Field(pattern=r"^[!-~]{1,200}$")]
+    sha256: Hash
+    supersedes: list[Id]
+    alike: list[Alike] = Field(default_factory=list)
+
+
+class Rejected(Event):
+    """Verification found a reason to turn a submission away."""
+
+    event: Literal["rejected"]
+    id: Id
+    reason: Text
+
+
+class Withdrawn(Event):
+    """A submission was taken off the board."""
+
+    event: Literal["withdrawn"]
+    id: Id
+    reason: Text
+
+
+AnyEvent = Annotated[Protocol | Added | Nonce | Verified | Rejected | Withdrawn, Field(discriminator="event")]
+_EVENTS: TypeAdapter[Any] = TypeAdapter(AnyEvent)
+
+
+def load_json(content: bytes) -> Any:
+    """Return what JSON in UTF-8 holds; keys that occur twice, NaN and infinity are refused.
+
+    Raises
+    ------
+    ValueError
+        For what is none, or nested too deep.
+    """
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            raise ValueError("a key occurs twice")
+        return found
+
+    def constant(name: str) -> Any:
+        raise ValueError(f"{name} is no number of JSON")
+
+    try:
+        return json.loads(content.decode(), object_pairs_hook=once, parse_constant=constant)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def checked(adapter: TypeAdapter[Any], value: Any) -> Any:
+    """Return a value as its schema has it; raise a ValueError of one line otherwise."""
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        place, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
+        raise ValueError(f"{plain(place)}: {what}, got {shown(first['input'])}".removeprefix(": ")) from None
+
+
+@dataclass(frozen=True)
+class Line:
+    """An event and the number of its line, from 1."""
+
+    number: int
+    event: Any
+
+
+def parse(log: bytes) -> tuple[list[Line], bytes]:
+    """Return the events of a log, and the end that was torn off by a kill.
+
+    Raises
+    ------
+    BoardError
+        Where another line than the last is no event, which no kill does, or does not hold the hash of what
+        stands before it.
+    """
+    *whole, tail = log.split(b"\n")
+    before, chained = hashlib.sha256(), False
+    lines: list[Line] = []
+    for number, line in enumerate([*whole, tail], 1):
+        last = number > len(whole)
+        if line.strip():
+            try:
+                event = checked(_EVENTS, load_json(line))
+            except ValueError as error:
+                if last:
+                    return lines, tail
+                told = shown(line[:60].decode(errors="replace"))
+                raise _damaged(number, f"is no event ({error}): {told}") from None
+            if chained and event.prev is None:
+                raise _damaged(number, "holds no hash of the lines before it")
+            if event.prev is not None and event.prev != before.hexdigest():
+                raise _damaged(number, "is not what followed the lines before it: one of these was changed")
+            chained = event.prev is not None
+            lines.append(Line(number, event))
+        before.update(line if last else line + b"\n")
+    return lines, b""
+
+
+def _damaged(number: int, what: str) -> BoardError:
+    return BoardError(f"{LOG}, line {number} {what}; {REMEDY}, or remove what a merge left there")
+
+
+# --- what follows from them ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A submission on the board.
+    """A submission on the board of a protocol.
 
     Parameters
     ----------
     id, env, name, kind, digest : str
         Its id on the board, and what its files say.
     protocol : int
-        Version of the protocol under which it was added.
+        The protocol's number.
     authors : tuple of str
         Who submitted it.
     added : str
-        When it was added, in UTC.
+        When it was added first, in UTC.
+    line : int
+        The line of the log that added it first.
+    since : int
+        The line after which a nonce counts for it: that one, or the one that began the protocol.
     state : str
         One of `STATES`.
     reason : str
         Why it was rejected, superseded or withdrawn.
     nonce, sha256 : str
-        With which nonce it was verified, and the SHA-256 of the result's file.
+        With which nonce it was verified first, and the SHA-256 of the result's file.
+    alike : tuple of Alike
+        Those of which it was found when it was verified that they act alike.
     """
 
     id: str
@@ -69,122 +308,216 @@ class Entry:
     kind: str
     digest: str
     added: str
+    line: int
+    since: int
     state: str = "pending"
     reason: str = ""
     nonce: str = ""
     sha256: str = ""
+    alike: tuple[Alike, ...] = ()
 
 
 @dataclass
 class State:
     """What follows from the log."""
 
-    entries: dict[str, Entry] = field(default_factory=dict)
-    #: When each nonce was published, and its value.
-    nonces: list[tuple[str, str]] = field(default_factory=list)
+    #: The current protocol; 0 where there is none yet.
+    number: int = 0
+    #: What each protocol fixed. Protocol 1 of an old log says it late, or not yet.
+    protocols: dict[int, Protocol] = field(default_factory=dict)
+    #: The submissions under each protocol, by id.
+    boards: dict[int, dict[str, Entry]] = field(default_factory=dict)
+    #: Line, value and source of each nonce.
+    nonces: list[tuple[int, str, str]] = field(default_factory=list)
     last: str = ""
 
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """The submissions under the current protocol, by id."""
+        return self.boards.setdefault(self.number, {})
+
+    @property
+    def all(self) -> list[Entry]:
+        """All entries, those under earlier protocols first."""
+        return [entry for number in sorted(self.boards) for entry in self.boards[number].values()]
+
     def entry(self, id: str) -> Entry:
-        """Return an entry, or raise a BoardError."""
+        """Return an entry under the current protocol, or raise a BoardError."""
         if id not in self.entries:
-            raise BoardError(f"there is no {id!r} on the board; `lag-envs leaderboard list` names all")
+            raise BoardError(f"there is no {shown(id)} on the board; `lag-envs leaderboard list` names all")
         return self.entries[id]
 
     def nonce(self, entry: Entry) -> str | None:
         """Return the first nonce that was published after a submission was added."""
-        return next((value for at, value in self.nonces if at > entry.added), None)
+        return next((value for line, value, _ in self.nonces if line > entry.since), None)
 
     def waiting(self) -> list[Entry]:
         """Return what is pending, the oldest first."""
         return [entry for entry in self.entries.values() if entry.state == "pending"]
 
+    def first(self, entry: Entry) -> Entry | None:
+        """Return the first submission that acts like this one, where it is not the first itself.
 
-def parse(log: bytes) -> tuple[list[Event], bytes]:
-    """Return the events of a log, and the end that was torn off by a kill.
-
-    Raises
-    ------
-    BoardError
-        Where another line than the last is no event: no kill does that.
-    """
-    *lines, tail = log.split(b"\n")
-    events = [_event(line, number) for number, line in enumerate(lines, 1) if line.strip()]
-    try:
-        if tail:  # a whole event of which only the line's end is missing
-            events.append(_event(tail, len(lines) + 1))
-            tail = b""
-    except BoardError:
-        pass
-    return events, tail
+        Likeness is noted with the one that was verified later; the one that was added later is linked. A link
+        leads on to what the linked one is linked to.
+        """
+        board = self.boards[entry.protocol]
+        others = {like.id for like in entry.alike}
+        others |= {other.id for other in board.values() if any(a.id == entry.id for a in other.alike)}
+        older = [board[id] for id in others if id in board and board[id].line < entry.line]
+        if not older:
+            return None
+        oldest = min(older, key=lambda other: other.line)
+        return self.first(oldest) or oldest
 
 
-def _event(line: bytes, number: int) -> Event:
-    try:
-        event = json.loads(line)
-        wanted = {"at": str} | EVENTS[event["event"]]
-        for key, kind in wanted.items():
-            if not isinstance(event[key], kind):
-                raise TypeError(f"{key} is {event[key]!r}")
-        if "id" in wanted and not ID.fullmatch(event["id"]):
-            raise ValueError(f"id is {event['id']!r}")
-        if not TIME.fullmatch(event["at"]):
-            raise ValueError(f"at is {event['at']!r}")
-        datetime.fromisoformat(event["at"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        shown = line[:60].decode(errors="replace")
-        raise BoardError(
-            f"{LOG}, line {number} is no event ({type(error).__name__}: {error}): {shown!r}; restore it from"
-            " version control, or remove what a merge left there"
-        ) from None
-    return event
-
-
-def fold(events: Sequence[Event]) -> State:
+def fold(lines: Sequence[Line]) -> State:
     """Return what follows from events.
 
-    A merge of two logs may shuffle their lines, so the times count, not the order.
-
     Raises
     ------
     BoardError
-        Where an event speaks of a submission that was never added.
+        Where an event contradicts those before it; the text names its line.
     """
     state = State()
-    for event in sorted(events, key=lambda e: (e["at"], e["event"] != "added")):
-        kind, state.last = event["event"], event["at"]
-        if kind == "nonce":
-            state.nonces.append((event["at"], event["value"]))
-            continue
-        id = event["id"]
-        known = state.entries.get(id)
-        if kind == "added":
-            # Two people may have added the same; what was turned away may be added once more.
-            if known is None or known.state in ("rejected", "withdrawn"):
-                told = {key: event[key] for key in ("env", "protocol", "name", "kind", "digest")}
-                state.entries[id] = Entry(id, **told, authors=tuple(event["authors"]), added=event["at"])
-            continue
-        if known is None:
-            raise BoardError(f"{LOG}: {id} is {kind}, and was never added; restore the line that adds it")
-        if kind == "withdrawn":
-            state.entries[id] = replace(known, state=kind, reason=event["reason"])
-        elif known.state == "pending" and kind == "rejected":
-            state.entries[id] = replace(known, state=kind, reason=event["reason"])
-        elif known.state == "pending":
-            state.entries[id] = replace(known, state=kind, nonce=event["nonce"], sha256=event["sha256"])
-            for old in event["supersedes"]:
-                if old != id and old in state.entries and state.entries[old].state == "verified":
-                    state.entries[old] = replace(state.entries[old], state="superseded", reason=f"by {id}")
+    for line in lines:
+        try:
+            _apply(state, line.event, line.number)
+        except ValueError as error:
+            raise BoardError(f"{LOG}, line {line.number}: {error}; {REMEDY}") from None
     return state
+
+
+def _apply(state: State, event: Any, line: int) -> None:
+    """Let one event follow the others; raise a ValueError where it cannot."""
+    if event.at < state.last:
+        raise ValueError(f"{event.at} is earlier than the line before it")
+    state.last = event.at
+    if isinstance(event, Protocol):
+        _begin(state, event, line)
+    elif isinstance(event, Nonce):
+        if any(event.value == value for _, value, _ in state.nonces):
+            raise ValueError(f"the nonce {shown(event.value)} was published before, so it was known")
+        state.nonces.append((line, event.value, event.source))
+    elif isinstance(event, Added):
+        _add(state, event, line)
+    else:
+        _change(state, event)
+
+
+def _begin(state: State, event: Protocol, line: int) -> None:
+    known = state.number in state.protocols
+    wanted = state.number + 1 if known or not state.number else state.number
+    if event.number != wanted:
+        raise ValueError(f"protocol {event.number} begins where {wanted} would be the next")
+    state.protocols[event.number] = event
+    if not known:  # the first of all, or one that began before its line was written
+        state.number = event.number
+        return
+    carried = {}
+    for id, entry in list(state.entries.items()):
+        if entry.env in event.scales and entry.state in ("verified", "pending"):
+            carried[id] = replace(
+                entry, protocol=event.number, since=line, state="pending", reason="", nonce="", sha256="",
+                alike=(),
+            )  # fmt: skip
+            if entry.state == "pending":
+                del state.entries[id]
+    state.number = event.number
+    state.boards[event.number] = carried
+
+
+def _add(state: State, event: Added, line: int) -> None:
+    if not state.number:  # a log from before protocols had lines
+        state.number = 1
+    if event.protocol != state.number:
+        raise ValueError(
+            f"{event.id} is added under protocol {event.protocol}, the current is {state.number}"
+        )
+    known = state.entries.get(event.id)
+    told = {key: getattr(event, key) for key in ("env", "protocol", "name", "kind", "digest")}
+    if known is None:
+        state.entries[event.id] = Entry(
+            event.id, **told, authors=tuple(event.authors), added=event.at, line=line, since=line
+        )
+        return
+    if known.state not in ("rejected", "withdrawn"):
+        raise ValueError(f"{event.id} is added, and is there already, {known.state}")
+    if any(getattr(known, key) != value for key, value in told.items()):
+        raise ValueError(f"{event.id} is added again as another than it was")
+    # Whoever comes back finds the episodes, and the result, of the first time.
+    back = replace(known, state="verified" if known.sha256 else "pending", reason="")
+    newer = [
+        other.id
+        for other in state.entries.values()
+        if other.state == "verified" and other.line > known.line and same_agent(other, known)
+    ]
+    if known.sha256 and newer:
+        back = replace(back, state="superseded", reason=f"by {newer[-1]}")
+    state.entries[event.id] = back
+
+
+def _change(state: State, event: Verified | Rejected | Withdrawn) -> None:
+    known = state.entries.get(event.id)
+    if known is None:
+        raise ValueError(f"{event.id} is {event.event}, and was never added; restore the line that adds it")
+    if isinstance(event, Withdrawn):
+        if known.state == "withdrawn":
+            raise ValueError(f"{event.id} is withdrawn, and was so before")
+        state.entries[event.id] = replace(known, state="withdrawn", reason=event.reason)
+        return
+    if known.state != "pending":
+        raise ValueError(f"{event.id} is {event.event}, but was {known.state} already")
+    if isinstance(event, Rejected):
+        state.entries[event.id] = replace(known, state="rejected", reason=event.reason)
+        return
+    if event.nonce != state.nonce(known):
+        raise ValueError(f"{event.id} is verified with the nonce {shown(event.nonce)}, which is not its own")
+    for old in [*event.supersedes, *(like.id for like in event.alike)]:
+        other = state.entries.get(old)
+        if other is None or old == event.id or not other.sha256 or other.env != known.env:
+            raise ValueError(f"{event.id} is verified beside {old}, which is no other result of its board")
+    state.entries[event.id] = replace(
+        known, state="verified", nonce=event.nonce, sha256=event.sha256, alike=tuple(event.alike)
+    )
+    for old in event.supersedes:
+        other = state.entries[old]
+        if other.state != "verified" or not same_agent(other, known):
+            raise ValueError(f"{event.id} supersedes {old}, which is not the same authors' of the same name")
+        state.entries[old] = replace(other, state="superseded", reason=f"by {event.id}")
+
+
+def same_agent(entry: Entry, other: Entry) -> bool:
+    """Tell whether two are the same authors' of the same name, on the same board."""
+    return (entry.env, entry.name, sorted(entry.authors)) == (other.env, other.name, sorted(other.authors))
 
 
 # --- files and locks ----------------------------------------------------------------------------------------
 
 
+def read_log(path: Path) -> bytes:
+    """Return a log's content; nothing where there is none.
+
+    Raises
+    ------
+    BoardError
+        Where it is no plain file.
+    """
+    try:
+        return read_plain(path, MOST)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise BoardError(f"{path} cannot be read: {error.strerror}; {REMEDY}") from None
+
+
 @contextmanager
 def locked(path: Path) -> Iterator[int]:
     """Open a file for reading and appending, and hold its lock, which ends with the process at the latest."""
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
     while True:
-        log = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o644)
+        read_log(path)  # what is no plain file is refused before it is opened for writing
+        log = os.open(path, flags, 0o644)
         try:
             lock(log)
             # Version control may have put another file there while we waited.
@@ -229,16 +562,26 @@ def read_all(file: int) -> bytes:
     return b"".join(parts)
 
 
-def write_event(log: int, event: Event) -> None:
-    """Append an event as a line, and see it to the disk; all of it or nothing."""
+def write_event(log: int, told: dict[str, Any]) -> Line:
+    """Append an event as a line, and see it to the disk; all of it or nothing.
+
+    Raises
+    ------
+    BoardError
+        For an event that could not be read again.
+    """
     content = read_all(log)
     _, torn = parse(content)
     if torn:
         os.ftruncate(log, len(content) - len(torn))
         content = content[: -len(torn)]
-    line = json.dumps(event, ensure_ascii=False).encode() + b"\n"
-    if content and not content.endswith(b"\n"):
-        line = b"\n" + line
+    line = b"\n" if content and not content.endswith(b"\n") else b""
+    told = told | {"prev": hashlib.sha256(content + line).hexdigest()}
+    try:
+        event = checked(_EVENTS, told)
+    except ValueError as error:
+        raise BoardError(f"this cannot be noted: {error}") from None
+    line += json.dumps(told, ensure_ascii=False).encode() + b"\n"
     try:
         if os.write(log, line) < len(line):
             raise OSError("the disk is full")
@@ -246,3 +589,4 @@ def write_event(log: int, event: Event) -> None:
         os.ftruncate(log, len(content))
         raise
     os.fsync(log)
+    return Line((content + line).count(b"\n"), event)

@@ -3,14 +3,18 @@
 What is drawn anew
 ------------------
 A row holds the scores of its policies in their episodes, shape (policies, episodes), without the luck of the
-episodes (`corrected`). A policy's result is its
-mean over the episodes, and the row's score is the interquartile mean (IQM) over the policies, as rliable has
-it for one task [1]_. Intervals are percentile bootstrap intervals of 95 %:
+episodes (`corrected`). A policy's result is its mean over the episodes, and the row's score is the
+interquartile mean (IQM) over the policies, as rliable has it for one task [1]_. Intervals are percentile
+bootstrap intervals of 95 %:
 
 - A row of several policies is a sample of training seeds: these are drawn anew, within the row (the stratum),
   each with its mean as it is.
 - A row of one policy, such as a deterministic controller, has no spread of training: its episodes are drawn
   anew. The interval tells how well the mean is known, and nothing about training.
+- What luck was measured with has a mean that is known only so well. Each sample therefore has another one,
+  drawn from a normal distribution: the same for all rows, since it moves all of them together, each as far as
+  it was corrected (`slope`). The reference itself is moved all the way: what is left of it is that mean, of
+  other episodes, with its standard error.
 
 Each row draws from a generator seeded by its id, so a row's numbers do not depend on which others are there.
 
@@ -24,14 +28,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, trim_mean
 
-from lag_envs.leaderboard.protocol import DISTURBED_EPISODES, REFERENCES, make_task
-from lag_envs.scores import score
+from lag_envs.leaderboard.protocol import make_task
 
 Array = NDArray[np.float64]
 
@@ -39,6 +42,30 @@ Array = NDArray[np.float64]
 RESAMPLES, LEVEL = 2000, 0.95
 #: Scores at which performance profiles are given.
 THRESHOLDS: Array = np.linspace(-0.25, 1.25, 61)
+
+
+class Scale(Protocol):
+    """The mean returns that are scores 0 and 1."""
+
+    @property
+    def random(self) -> float:
+        """Of uniformly random actions."""
+
+    @property
+    def best(self) -> float:
+        """Of the best policy known."""
+
+
+class Reference(Protocol):
+    """The mean return of the controller that plays everybody's episodes."""
+
+    @property
+    def mean(self) -> float:
+        """In other episodes."""
+
+    @property
+    def error(self) -> float:
+        """Its standard error."""
 
 
 class Chance(NamedTuple):
@@ -72,28 +99,31 @@ class Place(NamedTuple):
     above: Chance | None
 
 
-def normalised(env_id: str, returns: ArrayLike) -> Array:
+def normalised(scale: Scale, returns: ArrayLike) -> Array:
     """Return the scores of returns: 0 for the random policy's mean, 1 for that of the best policy known.
-
-    Raises
-    ------
-    ValueError
-        Where nothing is known of the environment.
 
     Examples
     --------
     >>> from lag_envs.scores import KNOWN_RETURNS
     >>> known = KNOWN_RETURNS["PivotedBarFree-v0"]
-    >>> normalised("PivotedBarFree-v0", [known.random, known.best]).tolist()
+    >>> normalised(known, [known.random, known.best]).tolist()
     [0.0, 1.0]
     """
-    found = score(env_id, cast(Any, np.asarray(returns, np.float64)))
-    if found is None:
-        raise ValueError(f"{env_id} has no scale: it needs an entry in lag_envs.scores.KNOWN_RETURNS")
-    return cast(Array, found)
+    return (np.asarray(returns, np.float64) - scale.random) / (scale.best - scale.random)
 
 
-def corrected(env_id: str, policies: Sequence[Mapping[str, Any]]) -> Array:
+def slope(policies: Sequence[Mapping[str, Any]]) -> float:
+    """Return by how much policies' returns go with the reference's in the same episodes; 0 without one."""
+    if any(p.get("reference") is None for p in policies):
+        return 0.0
+    luck = np.array([p["reference"] for p in policies], np.float64)
+    apart = luck - luck.mean(axis=1, keepdims=True)
+    spread = np.sum(apart * apart)
+    returns = np.array([p["returns"] for p in policies], np.float64)
+    return float(np.sum(apart * returns) / spread) if spread > 0.0 else 0.0
+
+
+def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Array:
     """Return the returns of verified policies without the luck of their episodes, shape (policies, episodes).
 
     Every submission has episodes of its own, and in some environments they differ more than agents do. So the
@@ -103,18 +133,51 @@ def corrected(env_id: str, policies: Sequence[Mapping[str, Any]]) -> Array:
 
     Parameters
     ----------
-    env_id : str
-        The environment.
+    reference : Reference or None
+        The environment's reference; None for one that has none.
     policies : sequence of mapping
         What was verified of each policy: ``returns`` and, where the environment has one, ``reference``.
     """
     returns = np.array([p["returns"] for p in policies], np.float64)
-    if env_id not in REFERENCES or not all("reference" in p for p in policies):
+    along = slope(policies) if reference is not None else 0.0
+    if reference is None or not along:
         return returns
-    luck = np.array([p["reference"] for p in policies], np.float64) - REFERENCES[env_id][1]
-    apart = luck - luck.mean(axis=1, keepdims=True)
-    spread = np.sum(apart * apart)
-    return returns - (np.sum(apart * returns) / spread if spread > 0.0 else 0.0) * luck
+    return returns - along * (np.array([p["reference"] for p in policies], np.float64) - reference.mean)
+
+
+class Scores(NamedTuple):
+    """What a row is ranked by.
+
+    Attributes
+    ----------
+    table : ndarray, shape (policies, episodes)
+        Scores without luck.
+    error : float
+        Standard error of the reference's mean, as far as it moves this row, as a score.
+    """
+
+    table: Array
+    error: float = 0.0
+
+    @property
+    def own(self) -> bool:
+        """Whether the row is the reference itself, or acts as it does: nothing of its episodes is left."""
+        return self.error > 0.0 and float(self.table.std()) < 1e-9
+
+
+def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Scores:
+    """Return the scores of verified policies, from what was verified of each, see `corrected`."""
+    table = normalised(scale, corrected(reference, policies))
+    if reference is None:
+        return Scores(table)
+    return Scores(table, abs(slope(policies)) * reference.error / abs(scale.best - scale.random))
+
+
+def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float:
+    """Return the standard error of a policy's mean return without luck, on the mean over the policies."""
+    table = corrected(reference, policies)
+    error = 0.0 if reference is None else slope(policies) * reference.error
+    return float(np.hypot(table.std(axis=1).mean() / np.sqrt(table.shape[1]), error))
 
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Any:
@@ -171,21 +234,23 @@ def median_time(times: Sequence[float | None]) -> float | None:
     return found if np.isfinite(found) else None
 
 
-def redrawn(id: str, scores: ArrayLike) -> Array:
+def redrawn(id: str, scores: Scores) -> Array:
     """Return bootstrap samples of the policies' means, shape (RESAMPLES, policies).
 
     Parameters
     ----------
     id : str
         The row; seeds the generator.
-    scores : array_like, shape (policies, episodes)
+    scores : Scores
         Its scores.
     """
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(id.encode()).digest()[:16], "big"))
-    table = np.asarray(scores, np.float64)
+    table = scores.table
     sample = table.mean(axis=1) if len(table) > 1 else table[0]
     drawn = sample[rng.integers(sample.size, size=(RESAMPLES, sample.size))]
-    return drawn if len(table) > 1 else drawn.mean(axis=1, keepdims=True)
+    drawn = drawn if len(table) > 1 else drawn.mean(axis=1, keepdims=True)
+    # In every row's k-th sample the reference's mean is off by the same.
+    return drawn + scores.error * np.random.default_rng(0).normal(size=(RESAMPLES, 1))
 
 
 def ends(samples: ArrayLike) -> tuple[float, float]:
@@ -211,21 +276,21 @@ def improvement(x: ArrayLike, y: ArrayLike) -> Any:
     return 0.5 * ((a > b).mean(axis=(-2, -1)) + (a >= b).mean(axis=(-2, -1)))
 
 
-def compare(x: ArrayLike, y: ArrayLike, x_drawn: Array, y_drawn: Array) -> Chance:
+def compare(x: Scores, y: Scores, x_drawn: Array, y_drawn: Array) -> Chance:
     """Return the probability that a policy of one row does better than one of another.
 
     Parameters
     ----------
-    x, y : array_like, shapes (policies, episodes)
+    x, y : Scores
         Scores of the two rows.
     x_drawn, y_drawn : ndarray, shapes (RESAMPLES, policies)
         What `redrawn` made of them.
     """
-    value = improvement(np.asarray(x).mean(axis=1), np.asarray(y).mean(axis=1))
+    value = improvement(x.table.mean(axis=1), y.table.mean(axis=1))
     return Chance(float(value), *ends(improvement(x_drawn, y_drawn)))
 
 
-def ranked(scores: Mapping[str, ArrayLike], drawn: Mapping[str, Array]) -> list[Place]:
+def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Place]:
     """Return the rows in the order of their scores, with their ranks.
 
     A row shares the rank of the row above where the interval of the probability that the one above does
@@ -234,27 +299,26 @@ def ranked(scores: Mapping[str, ArrayLike], drawn: Mapping[str, Array]) -> list[
 
     Parameters
     ----------
-    scores : mapping of str to array_like, shape (policies, episodes)
+    scores : mapping of str to Scores
         Scores of each row, by its id.
     drawn : mapping of str to ndarray, shape (RESAMPLES, policies)
         What `redrawn` made of them.
     """
-    tables = {id: np.asarray(table, np.float64) for id, table in scores.items()}
-    order = sorted(tables, key=lambda id: (-float(iqm(tables[id].mean(axis=1))), id))
+    order = sorted(scores, key=lambda id: (-float(iqm(scores[id].table.mean(axis=1))), id))
     places: list[Place] = []
     for number, id in enumerate(order, 1):
         above = None
         rank = number
         if places:
             best = places[-1].id
-            above = compare(tables[best], tables[id], drawn[best], drawn[id])
+            above = compare(scores[best], scores[id], drawn[best], drawn[id])
             rank = places[-1].rank if above.undecided else number
         places.append(Place(id, rank, above))
     return places
 
 
-def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, Any]:
-    """Return the numbers of a row that need no other row.
+def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scores: Scores) -> dict[str, Any]:
+    """Return the numbers of a row that need no other row, but for the interval of its score.
 
     Parameters
     ----------
@@ -262,22 +326,24 @@ def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, A
         The environment.
     result : mapping
         What was verified.
-    drawn : ndarray, shape (RESAMPLES, policies)
-        What `redrawn` made of its scores.
+    few : int
+        In how many episodes, the first ones, conditions were changed.
+    scale : Scale
+        The environment's.
+    scores : Scores
+        What `scored` made of it.
 
     Returns
     -------
     dict
-        ``score`` and its ``interval``, mean ``return``, optimality ``gap``, ``success`` with Wilson's
-        interval over all episodes of all policies, ``settle``: the median time [s], ``effort``: the mean,
-        ``robustness``: the score under each changed condition, ``often``: the score when acting ten times as
-        often, ``profile``: pairs of a score and the share of episodes above it. None for what was not
-        measured.
+        ``score``, mean ``return``, optimality ``gap``, ``success`` with Wilson's interval over all episodes
+        of all policies, ``settle``: the median time [s], ``effort``: the mean, ``robustness``: the score
+        under each changed condition, ``often``: the score when acting ten times as often, ``profile``: pairs
+        of a score and the share of episodes above it, luck and all. None for what was not measured.
     """
     policies = result["policies"]
-    returns = corrected(env_id, policies)
-    scores = normalised(env_id, returns)
-    means = scores.mean(axis=1)
+    bare = np.array([p["returns"] for p in policies], np.float64)
+    means = scores.table.mean(axis=1)
     settle, effort = (pooled(policies, name) for name in ("settle", "effort"))
     success = pooled(policies, "success")
     counted = None
@@ -285,22 +351,20 @@ def columns(env_id: str, result: Mapping[str, Any], drawn: Array) -> dict[str, A
         low, high = wilson(sum(success), len(success))
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
     # Disturbed are the first episodes only: what sets these apart from all is not the disturbance's doing.
-    few = [np.mean(p["returns"][:DISTURBED_EPISODES]) for p in policies]
-    moved = returns.mean(axis=1) - few
-    robustness = {
-        name: _score(env_id, each, moved) for name, each in (result.get("robustness") or {}).items()
-    }
+    moved = means - normalised(scale, bare[:, :few].mean(axis=1))
+    robustness = {name: _score(scale, each, moved) for name, each in (result.get("robustness") or {}).items()}
+    # Where there are kicks, they are others when acting often.
+    often = 0.0 * moved if make_task(env_id).draws else moved
     return {
         "score": float(iqm(means)),
-        "interval": list(ends(iqm(drawn))),
-        "return": float(returns.mean()),
+        "return": scale.random + float(means.mean()) * (scale.best - scale.random),
         "gap": optimality_gap(means),
         "success": counted,
         "settle": median_time(settle) if settle else None,
         "effort": float(np.mean(effort)) if effort else None,
         "robustness": {name: value for name, value in robustness.items() if value is not None},
-        "often": _score(env_id, result.get("often"), 0.0 * moved if make_task(env_id).draws else moved),
-        "profile": np.column_stack([THRESHOLDS, profile(scores)]).round(5).tolist(),
+        "often": _score(scale, result.get("often"), often),
+        "profile": np.column_stack([THRESHOLDS, profile(normalised(scale, bare))]).round(5).tolist(),
     }
 
 
@@ -309,8 +373,8 @@ def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
     return [value for p in policies for value in (p.get(name) or [])]
 
 
-def _score(env_id: str, returns: Sequence[float | None] | None, moved: Array) -> float | None:
+def _score(scale: Scale, returns: Sequence[float | None] | None, moved: Array) -> float | None:
     """Return the score of policies' mean returns, moved; None where one could not take part."""
     if not returns or None in returns:
         return None
-    return float(iqm(normalised(env_id, np.array(returns, np.float64) + moved)))
+    return float(iqm(normalised(scale, np.array(returns, np.float64)) + moved))

@@ -24,35 +24,38 @@ from numpy.typing import NDArray
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Fields, shown
-from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, architecture
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.names import wordless
+from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, Table, architecture
 from lag_envs.leaderboard.protocol import Refused
 
-__all__ = ["KINDS", "Refused", "Submission", "load", "write"]
+__all__ = ["About", "Refused", "Submission", "about", "load", "read_files", "write"]
 
 TOML = "submission.toml"
-KINDS = ("learned", "controller", "optimal")
 #: Training seeds lie below this.
 MOST_SEED = 10**9
 POLICY = re.compile(r"policy_(0|[1-9][0-9]{0,8})\.safetensors")
 DTYPES = {"F32": 4, "F64": 8}
 
 
-@dataclass(frozen=True)
-class Submission:
-    """A submission whose every byte has been checked.
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """What ``submission.toml`` says, checked.
 
     Parameters
     ----------
-    env, name, license, kind : str
-        As in ``submission.toml``; `kind` is "learned", "controller" or "optimal".
+    env, name, license : str
+        As it says.
+    kind : str
+        "learned", "controller" or "optimal", as follows from the architecture.
     authors : tuple of str
         Who made it.
-    policies : tuple of (int, Policy)
-        Training seed and policy, by growing seed.
     digest : str
         SHA-256 of names and contents of the folder's files.
-    folder : Path
-        Where it was read.
+    seeds : tuple of int
+        Training seeds of the policies, growing; (0,) for a built-in controller.
+    architecture : Architecture
+        What the arrays fill.
     code, description : str
         Empty where not given.
     training : mapping
@@ -65,12 +68,28 @@ class Submission:
     authors: tuple[str, ...]
     license: str
     kind: str
-    policies: tuple[tuple[int, Policy], ...]
     digest: str
-    folder: Path
+    seeds: tuple[int, ...]
+    architecture: Architecture
     code: str = ""
     description: str = ""
     training: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Submission(About):
+    """A submission whose every byte has been checked.
+
+    Parameters
+    ----------
+    policies : tuple of (int, Policy)
+        Training seed and policy, by growing seed.
+    folder : Path
+        Where it was read.
+    """
+
+    policies: tuple[tuple[int, Policy], ...]
+    folder: Path
 
 
 # --- reading ------------------------------------------------------------------------------------------------
@@ -90,28 +109,11 @@ def load(folder: Path | str) -> Submission:
         For anything that is not as it should be; the text says what.
     """
     folder = Path(folder)
-    files = _read_files(folder)
-    top = Fields("", _parse(files[TOML]))
-    top.where = TOML
-    for key, ours in (("schema", protocol.SCHEMA), ("protocol", protocol.PROTOCOL)):
-        if (value := top.any(key)) != ours or type(value) is not int:
-            raise Refused(f"{TOML}: {key} must be {ours}, the only one accepted here, got {shown(value)}")
-    env = top.choice("env", protocol.GOALS)
-    kind = top.choice("kind", KINDS)
-    about: dict[str, Any] = {
-        "name": top.text("name", 60, pattern=r".*[A-Za-z0-9].*"),
-        "authors": top.texts("authors", 1, 20, 80, r".*\S.*"),
-        "license": top.text("license", 60, pattern=r"[A-Za-z0-9][A-Za-z0-9.+() -]*"),
-        "code": top.text("code", 200, "", r"(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?"),
-        "description": top.text("description", 500, ""),
-    }
-    made = architecture(env, top.table("policy"))
-    found = sorted(int(match[1]) for name in files if (match := POLICY.fullmatch(name)))
-    training = _training(top, kind, found)
-    top.done()
-    _check_kind(kind, made, found)
+    files = read_files(folder)
+    told = about(files)
+    made = told.architecture
     policies: list[tuple[int, Policy]] = []
-    for seed in found if made.arrays else [0]:
+    for seed in told.seeds:
         name = f"policy_{seed}.safetensors"
         arrays = _arrays(name, files[name], made) if made.arrays else {}
         policy = Policy(made, arrays)
@@ -125,16 +127,67 @@ def load(folder: Path | str) -> Submission:
         raise Refused(
             f"the networks have {numbers:,} numbers together, {protocol.ALL_NUMBERS:,} are the most"
         )
-    if kind == "learned":
+    if told.kind == "learned":
         _check_different(policies)
-    return Submission(
-        env, **about, kind=kind, policies=tuple(policies), digest=_digest(files), folder=folder,
-        training=training,
+    return Submission(**vars(told), policies=tuple(policies), folder=folder)
+
+
+def about(files: Mapping[str, bytes]) -> About:
+    """Return what a submission's files say of it; the arrays are not looked at.
+
+    Parameters
+    ----------
+    files : mapping of str to bytes
+        What `read_files` returns.
+
+    Raises
+    ------
+    Refused
+        For anything in ``submission.toml`` that is not as it should be.
+    """
+    top = Fields("", _parse(files[TOML]))
+    top.where = TOML
+    if (value := top.any("schema")) != protocol.SCHEMA or type(value) is not int:
+        raise Refused(
+            f"{TOML}: schema must be {protocol.SCHEMA}, the only one accepted here, got {shown(value)}"
+        )
+    # The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
+    top.whole("protocol", 1, 10**6, 1)
+    env = top.choice("env", protocol.GOALS)
+    told: dict[str, Any] = {
+        "name": top.text("name", 60, pattern=r".*[A-Za-z0-9].*"),
+        "authors": top.texts("authors", 1, 20, 80),
+        "license": top.text("license", 60, pattern=r"[A-Za-z0-9][A-Za-z0-9.+() -]*"),
+        "code": top.text("code", 200, "", r"(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?"),
+        "description": top.text("description", 500, ""),
+    }
+    for author in told["authors"]:
+        if wordless(author):
+            raise Refused(f"{TOML}: authors must have a letter or a digit each, got {shown(author)}")
+    made = architecture(env, top.table("policy"))
+    found = sorted(int(match[1]) for name in files if (match := POLICY.fullmatch(name)))
+    training = _training(top, found)
+    kind = _kind(made, bool(training), top.any("kind", None))
+    top.done()
+    if not made.arrays and found:
+        raise Refused(f"policy_{found[0]}.safetensors: a built-in controller has no arrays; remove it")
+    least = protocol.LEARNED_POLICIES if kind == "learned" else 1
+    if made.arrays and len(found) < least:
+        raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
+    return About(
+        env=env, **told, kind=kind, digest=_digest(files), seeds=tuple(found) if made.arrays else (0,),
+        architecture=made, training=training,
     )  # fmt: skip
 
 
-def _read_files(folder: Path) -> dict[str, bytes]:
-    """Return the files' contents by name; nothing but plain files with the right names is opened."""
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the files' contents by name; nothing but plain files with the right names is opened.
+
+    Raises
+    ------
+    Refused
+        For other files, links, folders, and what is too large.
+    """
     try:
         if not stat.S_ISDIR(os.lstat(folder).st_mode):
             raise Refused(f"{shown(str(folder))} is no folder (links are not followed)")
@@ -172,12 +225,10 @@ def _read_files(folder: Path) -> dict[str, bytes]:
 
 def _read(file: Path, size: int) -> bytes:
     """Return a file's content; refuse one that has been exchanged since it was looked at."""
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
-        with os.fdopen(os.open(file, flags | getattr(os, "O_BINARY", 0)), "rb") as opened:
-            content = opened.read(size + 1) if stat.S_ISREG(os.fstat(opened.fileno()).st_mode) else b""
+        content = read_plain(file, size)
     except OSError as error:
-        raise Refused(f"{file.name} cannot be read: {error.strerror}") from error
+        raise Refused(f"{file.name} changed while it was read: {error.strerror}") from error
     if len(content) != size:
         raise Refused(f"{file.name} changed while it was read")
     return content
@@ -202,11 +253,9 @@ def _parse(content: bytes) -> dict[str, Any]:
         raise Refused(f"{TOML} is no TOML: {shown(str(error))}") from error
 
 
-def _training(top: Fields, kind: str, found: list[int]) -> dict[str, Any]:
+def _training(top: Fields, found: list[int]) -> dict[str, Any]:
     """Return the table ``[training]``; `found` are the seeds of which there are policies."""
     if "training" not in top:
-        if kind == "learned":
-            raise Refused(f"{TOML}: [training] is missing; learned policies need it")
         return {}
     table = top.table("training")
     seeds = table.wholes("seeds", 0, protocol.MOST_POLICIES, 0, MOST_SEED - 1, [])
@@ -232,17 +281,25 @@ def _training(top: Fields, kind: str, found: list[int]) -> dict[str, Any]:
     return result
 
 
-def _check_kind(kind: str, made: Architecture, found: list[int]) -> None:
-    """Refuse the wrong number of policies for a kind and an architecture."""
-    if isinstance(made, Controller) and kind != "controller":
-        raise Refused(f'a built-in controller must be submitted as kind "controller", got "{kind}"')
-    if not made.arrays:
-        if found:
-            raise Refused(f"policy_{found[0]}.safetensors: a built-in controller has no arrays; remove it")
-        return
-    least = protocol.LEARNED_POLICIES if kind == "learned" else 1
-    if len(found) < least:
-        raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
+def _kind(made: Architecture, trained: bool, stated: Any) -> str:
+    """Return the kind, which follows from the architecture; refuse another that is stated."""
+    if isinstance(made, Controller):
+        kind = "controller"
+    elif isinstance(made, Table):
+        kind = "optimal"
+    elif isinstance(made, MLP) or trained:
+        kind = "learned"
+    else:
+        kind = "controller"
+    if stated not in (None, kind):
+        # A linear feedback is either; all others have one kind.
+        raise Refused(
+            f'{TOML}: kind must be "{kind}" for this architecture {"with" if trained else "without"}'
+            f" [training], or left out, got {shown(stated)}"
+        )
+    if kind == "learned" and not trained:
+        raise Refused(f"{TOML}: [training] is missing; learned policies need it")
+    return kind
 
 
 def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
@@ -369,8 +426,8 @@ def write(
     name: str,
     authors: list[str] | tuple[str, ...],
     license: str,
-    kind: str,
     policy: Mapping[str, Any],
+    kind: str = "",
     arrays: Mapping[int, Mapping[str, NDArray[Any]]] | None = None,
     training: Mapping[str, Any] | None = None,
     code: str = "",
@@ -382,10 +439,12 @@ def write(
     ----------
     folder : Path
         Must not exist.
-    env, name, authors, license, kind, code, description
-        See `Submission`.
+    env, name, authors, license, code, description
+        See `About`.
     policy : mapping
         The table ``[policy]``.
+    kind : str, optional
+        The kind, to be refused where another follows from the policy.
     arrays : mapping of int to mapping of str to ndarray
         For each training seed the arrays, of float32 or float64; none for a built-in controller.
     training : mapping, optional
@@ -403,19 +462,20 @@ def write(
     folder, arrays = Path(folder), arrays or {}
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} is there already")
-    about: dict[str, Any] = {
-        "schema": protocol.SCHEMA, "protocol": protocol.PROTOCOL, "env": env, "name": name,
-        "authors": list(authors), "license": license, "kind": kind,
+    told: dict[str, Any] = {
+        "schema": protocol.SCHEMA, "env": env, "name": name, "authors": list(authors), "license": license,
     }  # fmt: skip
-    about |= {key: text for key, text in (("code", code), ("description", description)) if text}
+    told |= {
+        key: text for key, text in (("kind", kind), ("code", code), ("description", description)) if text
+    }
     if training:
-        about["training"] = {"seeds": sorted(arrays), **training}
-    about["policy"] = dict(policy)
+        told["training"] = {"seeds": sorted(arrays), **training}
+    told["policy"] = dict(policy)
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         part.chmod(0o755)
-        (part / TOML).write_text("\n".join(_toml(about)) + "\n", encoding="utf-8", newline="\n")
+        (part / TOML).write_text("\n".join(_toml(told)) + "\n", encoding="utf-8", newline="\n")
         for seed, content in arrays.items():
             found = {key: np.ascontiguousarray(array) for key, array in content.items()}
             (part / f"policy_{seed}.safetensors").write_bytes(save(found))

@@ -9,7 +9,7 @@ import json
 import math
 import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,11 +22,14 @@ from lag_envs import __version__
 from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import plain
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.log import load_json
+from lag_envs.leaderboard.results import UNPACKED, build, check, compare
 from lag_envs.leaderboard.submission import Refused, Submission, load
 
 Array = NDArray[np.float64]
 #: Libraries on which the bits of a trajectory depend.
-PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "safetensors")
+PACKAGES = ("gymnasium", "numpy", "numba", "llvmlite", "scipy", "safetensors")
 #: Given at each step: controls, actions, rewards, terminations, truncations, and which episodes still run.
 Watch = Callable[[Any, Array, Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]], Any]
 
@@ -54,10 +57,11 @@ def verify(
     Returns
     -------
     dict
-        Of JSON types: protocol, env, digest, nonce, episodes, policies, robustness, often, seconds, machine,
-        versions. ``policies`` has for each one its seed, the episodes' returns, successes, times [s] (None
-        where the goal was not reached) and efforts (mean of (u/U)²), a hash of all actions, rewards and ends,
-        and what the environment's ``reference`` got in the same episodes, if it has one. ``robustness`` maps
+        Of JSON types, as `results.Result` has it: env, digest, nonce, episodes, policies, robustness, often,
+        seconds, machine, versions, build. ``policies`` has for each one its seed, the episodes' returns,
+        successes, times [s] (None where the goal was not reached) and efforts (mean of (u/U)²), a hash of all
+        actions, rewards and ends, and what the environment's ``reference`` got in the same episodes, if it
+        has one. ``robustness`` maps
         disturbances to the policies' mean returns; ``often`` has those for acting ten times as often, None
         for an agent that counts steps and cannot.
 
@@ -99,26 +103,24 @@ def verify(
     for number, (seed, policy) in enumerate(submission.policies):
         order = itertools.count()
         first = protocol.first_seed(submission.digest, nonce, number)
+        seeds = range(first, first + episodes)
         record = _Record(env, episodes)
         try:
-            returns = _play(env, policy.agent(), first, episodes, watch=record, tick=tick)
+            returns = play(env, policy.agent(), seeds, watch=record, tick=tick)
             skip()
-            reference = _reference(env, first, episodes)
+            reference = _reference(env, seeds)
             for name, options in conditions.items():
-                robustness[name].append(
-                    float(_play(env, policy.agent(), first, few, tick=tick, **options).mean())
-                )
+                mean = float(play(env, policy.agent(), seeds[:few], tick=tick, **options).mean())
+                robustness[name].append(mean)
                 skip()
             agent = policy.agent()
             able = hasattr(agent, "pace") or type(agent).__name__ != "ILQR"
-            mean = _play(env, agent, first, more, tick=tick, **faster).mean() if able else None
-            often.append(None if mean is None else float(mean))
+            often.append(float(play(env, agent, seeds[:more], tick=tick, **faster).mean()) if able else None)
             skip()
         except Refused as error:
             raise Refused(f"policy of seed {seed}: {error}") from error
         policies.append({"seed": seed, "returns": returns.tolist(), **reference, **record.result()})
     return {
-        "protocol": protocol.PROTOCOL,
         "env": env,
         "digest": submission.digest,
         "nonce": nonce,
@@ -130,40 +132,45 @@ def verify(
         "machine": _machine(),
         "versions": {"python": platform.python_version(), "lag-envs": __version__}
         | {name: version(name) for name in PACKAGES},
+        "build": build(),
     }
 
 
 def _machine() -> dict[str, Any]:
+    from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+
     from lag_envs.benchmark import machine
 
-    return machine()
+    # What code is compiled for; the name of a processor does not always tell.
+    features = hashlib.sha256(get_host_cpu_features().flatten().encode()).hexdigest()[:16]
+    return machine() | {"target": f"{get_host_cpu_name()} {features}"}
 
 
-def _play(
+def play(
     env_id: str,
     agent: Any,
-    seed: int,
-    episodes: int,
+    seeds: Sequence[int],
     *,
     watch: Watch | None = None,
     tick: Callable[[int], Any] = lambda n: None,
     **options: Any,
 ) -> Array:
-    """Return an agent's returns (episodes,) in episodes with reset seeds from `seed` on, stepped together."""
+    """Return an agent's returns in episodes with these reset seeds, stepped together."""
     import gymnasium as gym
 
     # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
+    episodes = len(seeds)
     envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep", **options)
     bare: Any = envs.unwrapped
     if hasattr(agent, "pace"):
         agent.pace = bare.task.dt / bare.task.interval
-    observation, _ = envs.reset(seed=seed)
+    observation, _ = envs.reset(seed=list(seeds))  # type: ignore[arg-type]
     state, returns, running = None, np.zeros(episodes), np.ones(episodes, np.bool_)
     if watch is not None:
         watch(bare, returns[:0], returns[:0], running[:0], running[:0], running[:0])
     start = running.copy()
     while running.any():
-        action, state = _act(agent, observation, state, start)
+        action, state = act(agent, observation, state, start)
         observation, reward, terminated, truncated, _ = envs.step(action)
         returns += np.where(running, reward, 0.0)
         if watch is not None:
@@ -175,17 +182,18 @@ def _play(
     return returns
 
 
-def _reference(env_id: str, seed: int, episodes: int) -> dict[str, list[float]]:
+def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
     """Return the returns of the environment's reference in the same episodes; nothing where there is none."""
     if env_id not in protocol.REFERENCES:
         return {}
     from lag_envs.controllers import make_controller
 
-    name, _ = protocol.REFERENCES[env_id]
-    return {"reference": _play(env_id, make_controller(env_id, name), seed, episodes).tolist()}
+    agent = make_controller(env_id, protocol.REFERENCES[env_id].controller)
+    return {"reference": play(env_id, agent, seeds).tolist()}
 
 
-def _act(agent: Any, observation: Any, state: Any, start: NDArray[np.bool_]) -> tuple[Any, Any]:
+def act(agent: Any, observation: Any, state: Any, start: NDArray[np.bool_]) -> tuple[Any, Any]:
+    """Return actions and what the agent remembers; raise Refused where it fails, or acts out of bounds."""
     try:
         with np.errstate(all="ignore"):
             action, state = agent.predict(observation, state, start, deterministic=True)
@@ -245,8 +253,10 @@ class _Record:
         }
 
 
-def episode(submission: Submission, policy: int, seed: int) -> dict[str, Any]:
-    """Return a recorded episode for replay, in JSON types.
+def replay(
+    submission: Submission, result: dict[str, Any], policy: int, chosen: Sequence[int]
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Play some of the episodes of a verification again, and record them.
 
     Networks and linear feedback go through the same numbers as in the verification, bit for bit; other agents
     may differ in the last digit, as the libraries under them round differently for another number of rows.
@@ -255,72 +265,63 @@ def episode(submission: Submission, policy: int, seed: int) -> dict[str, Any]:
     ----------
     submission : Submission
         The submission.
+    result : dict
+        What `verify` returned, or its digest, nonce and number of episodes.
     policy : int
         Number of the policy, from 0.
-    seed : int
-        Reset seed; episode i of a verification has ``protocol.first_seed(digest, nonce, policy) + i``.
+    chosen : sequence of int
+        Numbers of the episodes, from 0.
 
     Returns
     -------
-    dict
-        ``seed`` (of the training), ``reset_seed``, ``return``, ``dt`` [s], ``states`` (steps + 1 of them, in
-        SI units), ``actions`` and ``rewards`` (steps), ``target`` (or None); rounded to 6 digits.
+    found : dict
+        What `verify` says of the policy, of these episodes alone.
+    episodes : list of dict
+        For each of them ``seed`` (of the training), ``reset_seed``, ``return``, ``dt`` [s], ``states`` (steps
+        + 1 of them, in SI units), ``actions`` and ``rewards`` (steps), ``target`` (or None); rounded to 6
+        digits.
     """
-    training_seed, chosen = submission.policies[policy]
-    states, actions, rewards = [], [], []
-    dt, target = 0.0, None
+    env = submission.env
+    training_seed, data = submission.policies[policy]
+    first = protocol.first_seed(result["digest"], result["nonce"], policy)
+    agent = data.agent()
+    # What draws actions draws them for all episodes together, so all have to be played.
+    rows = list(chosen) if hasattr(agent, "rng") else list(range(len(chosen)))
+    seeds = range(first, first + result["episodes"]) if hasattr(agent, "rng") else [first + i for i in chosen]
+    record = _Record(env, len(seeds))
+    tracks: list[dict[str, Any]] = [{"states": [], "actions": [], "rewards": []} for _ in rows]
+    dt, targets = 0.0, None
 
     def watch(bare: Any, action: Array, reward: Array, *ends: Any) -> None:
-        nonlocal dt, target
-        dt, target = bare.task.dt, None if bare.target is None else float(bare.target[0])
-        states.append([_rounded(x) for x in bare.state[0]])
-        if len(action):
-            actions.append(_rounded(action[0]))
-            rewards.append(_rounded(reward[0]))
+        nonlocal dt, targets
+        record(bare, action, reward, *ends)
+        running = ends[-1]
+        dt, states = bare.task.dt, bare.state
+        if len(action) == 0 and bare.target is not None:
+            targets = bare.target.copy()
+        for row, track in zip(rows, tracks, strict=True):
+            if len(action) == 0 or running[row]:
+                track["states"].append([_rounded(x) for x in states[row]])
+            if len(action) and running[row]:
+                track["actions"].append(_rounded(action[row]))
+                track["rewards"].append(_rounded(reward[row]))
 
-    total = _play(submission.env, chosen.agent(), seed, 1, watch=watch)[0]
-    return {
-        "seed": training_seed, "reset_seed": seed, "return": float(total), "dt": dt, "states": states,
-        "actions": actions, "rewards": rewards, "target": None if target is None else _rounded(target),
-    }  # fmt: skip
+    returns = play(env, agent, seeds, watch=watch)
+    reference = _reference(env, [first + i for i in chosen])
+    told = {"seed": training_seed, "returns": returns[rows].tolist(), **reference}
+    for name, values in record.result().items():
+        told[name] = [values[row] for row in rows] if isinstance(values, list) else values
+    return told, [
+        {
+            "seed": training_seed, "reset_seed": first + i, "return": float(returns[row]), "dt": dt, **track,
+            "target": None if targets is None else _rounded(targets[row]),
+        }
+        for i, row, track in zip(chosen, rows, tracks, strict=True)
+    ]  # fmt: skip
 
 
 def _rounded(x: Any) -> float:
     return float(f"{x:.6g}")
-
-
-def compare(result: dict[str, Any], other: dict[str, Any]) -> tuple[bool, float]:
-    """Compare two verifications of the same submission with the same nonce and number of episodes.
-
-    Parameters
-    ----------
-    result, other : dict
-        What `verify` returned.
-
-    Returns
-    -------
-    same : bool
-        Whether every action, reward and end was the same, to the bit, and all means under disturbances.
-    difference : float
-        The largest difference of a policy's mean return, relative to the way from random to best known; on
-        two machines `protocol.TOLERANCE` at most.
-
-    Raises
-    ------
-    ValueError
-        Where they are not of the same submission, nonce and episodes.
-    """
-    from lag_envs.scores import KNOWN_RETURNS
-
-    for name in ("protocol", "env", "digest", "nonce", "episodes"):
-        if result[name] != other[name]:
-            raise ValueError(f"the results differ in {name}: {result[name]!r} and {other[name]!r}")
-    pairs = list(zip(result["policies"], other["policies"], strict=True))
-    known = KNOWN_RETURNS[result["env"]]
-    difference = max(abs(np.mean(a["returns"]) - np.mean(b["returns"])) for a, b in pairs)
-    same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
-    same &= all(result[name] == other[name] for name in ("robustness", "often"))
-    return same, float(difference) / (known.best - known.random)
 
 
 # --- the command --------------------------------------------------------------------------------------------
@@ -384,26 +385,34 @@ def run_verify(args: argparse.Namespace) -> int:
 def _read(file: Path) -> dict[str, dict[str, Any]]:
     """Return results that were written before, by digest."""
     try:
-        return {r["digest"]: r for r in json.loads(file.read_text(encoding="utf-8")) if "digest" in r}
-    except (OSError, ValueError, TypeError) as error:
+        found = load_json(read_plain(file, UNPACKED))
+        if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
+            raise ValueError("it is no list of results")
+        told = ({key: value for key, value in r.items() if key != "folder"} for r in found)
+        return {r["digest"]: check(r) for r in told if "refused" not in r}
+    except (OSError, ValueError, KeyError) as error:
         raise UserError(f"--against: {file} cannot be read: {error}") from error
 
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> bool:
     """Tell how a result compares with an earlier one; return whether it is too far from it."""
+    from lag_envs.scores import KNOWN_RETURNS
+
     if other is None:
         print(f"  {file} has nothing about it")
         return False
+    known = KNOWN_RETURNS[result["env"]]
     try:
-        same, off = compare(result, other)
-    except (ValueError, KeyError) as error:
+        found = compare(result, other, known.best - known.random)
+    except ValueError as error:
         raise UserError(f"--against: {file}: {error}") from error
-    far = off > protocol.TOLERANCE
-    print(
-        f"  {'the same, to the bit, as' if same else f'scores differ by {off:.1e} at most from'} {file}"
-        + (f"; more than the tolerance of {protocol.TOLERANCE:g}" if far else "")
-    )
-    return far
+    if found.same:
+        print(f"  the same, to the bit, as {file}")
+    else:
+        print(f"  mean scores differ by {found.difference:.1e} at most from {file}")
+    for what in found.far:
+        print(f"  too far from it: {what}")
+    return bool(found.far)
 
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
@@ -437,7 +446,8 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> list[str]:
     """Return a result as lines of text."""
-    from lag_envs.leaderboard.ranking import corrected
+    from lag_envs.leaderboard.protocol import REFERENCES
+    from lag_envs.leaderboard.ranking import corrected, policy_error
     from lag_envs.scores import score
 
     if "refused" in result:
@@ -445,14 +455,16 @@ def table(result: dict[str, Any]) -> list[str]:
     env = result["env"]
     lines = [
         f"{plain(result['folder'])}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
-        f"  {'seed':>6}  {'return':>12}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
+        f"  {'seed':>6}  {'return':>12}  {'±':>7}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:
-        mean = float(corrected(env, [policy]).mean())
+        reference = REFERENCES.get(env)
+        mean = float(corrected(reference, [policy]).mean())
+        error = policy_error(reference, [policy])
         times = [t for t in policy["settle"] if t is not None]
         part = score(env, mean)
         lines.append(
-            f"  {policy['seed']:>6}  {mean:12.5g}  {'' if part is None else f'{part:.4f}':>7}"
+            f"  {policy['seed']:>6}  {mean:12.5g}  {error:7.2g}  {'' if part is None else f'{part:.4f}':>7}"
             f"  {np.mean(policy['success']):7.1%}  {f'{np.median(times):.2f} s' if times else '-':>7}"
             f"  {np.mean(policy['effort']):6.3f}"
         )

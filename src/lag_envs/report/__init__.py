@@ -7,8 +7,11 @@
 `page`                 HTML, Markdown, CSV and the README's tables from the measured rows
 `reference`            high precision, by methods that stepping does not use
 `steppers`             the steppers that people would otherwise use
-`peers`                other libraries' steppers, and MuJoCo
+`equations`            problems as rivals are given them: any equation, arrays of starts and parameters
+`rivals`, `peers`      ours, those steppers, and other libraries, all behind one interface
 `work_precision` ...   one module per section: its jobs, what they measure, what it shows
+`verdicts`             who is faster at which error, from the points of `work_precision`
+`diagrams`             those points as pictures
 =====================  =====================================================================
 
 None of this is used by the environments; it needs the extra ``report``.

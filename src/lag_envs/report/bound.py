@@ -197,22 +197,14 @@ def environment(id: str, n: int) -> Iterator[Row]:
     """Yield what the bound certifies of an environment, and n of its steps at random within that."""
     from types import SimpleNamespace
 
-    from lag_envs.cli import _controls
     from lag_envs.tasks import TASKS, load_task
 
     place, fixed = TASKS[id]
     task = load_task(place)(**fixed)
     scene, dt, k = task.scene, task.dt, SimpleNamespace(**task.scene.constants())
-    low, high = _controls(task)
-    angle = scene.angle
-    assert angle is not None
-
-    def bound(speed: float, u: float) -> pendulum.Bound:
-        found = scene.truncation_bound(_state(task, 0.0, speed), u, dt)
-        assert found is not None
-        return found
-
-    reach = _largest(lambda speed: max(bound(speed, u).substeps for u in (low, high)) == 1)
+    low, high = task.control_range
+    reach = task.certified_speed()
+    assert reach is not None
     rng = np.random.default_rng(1)
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
@@ -222,7 +214,8 @@ def environment(id: str, n: int) -> Iterator[Row]:
 
     for _ in range(n):
         theta, speed, u = (float(v) for v in rng.uniform([-math.pi, -reach, low], [math.pi, reach, high]))
-        known, actual = bound(speed, u), left_out(theta, speed, u)
+        known, actual = scene.truncation_bound(_state(task, theta, speed), u, dt), left_out(theta, speed, u)
+        assert known is not None
         row = {"kind": "environment", "id": id, "order": known.order, "dt": dt, "reach": reach}
         row |= {"theta_bound": known.theta, "theta": actual[0], "theta_dot_bound": known.theta_dot}
         yield row | {"theta_dot": actual[1], "speed": speed, "substeps": known.substeps}

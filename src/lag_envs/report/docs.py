@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lag_envs.benchmark import TARGETS, quartiles
+from lag_envs import benchmark
 from lag_envs.report import page
 from lag_envs.report.content import Picture, Table
 from lag_envs.report.report import FILE, content_of, write_json
@@ -62,7 +62,8 @@ def generated(project: Path) -> dict[Path, str]:
     )
     readme = (project / "README.md").read_text(encoding="utf-8")
     readme = replaced(readme, "accuracy", summary(accuracy))
-    readme = replaced(readme, "bench", speeds(speed))
+    readme = replaced(readme, "bench", benchmark.markdown(speed))
+    readme = replaced(readme, "fast", benchmark.claim(speed))
     return {project / "docs" / "accuracy.md": markdown(accuracy), project / "README.md": readme}
 
 
@@ -163,48 +164,6 @@ def summary(accuracy: dict[str, Any]) -> str:
     ]
     if broken:
         lines += ["", *(f"- {claim['text']} ({claim['evidence']})" for claim in broken)]
-    return "\n".join(lines)
-
-
-def speeds(report: dict[str, Any]) -> str:
-    """Return the README's table of speeds."""
-    rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
-    kinds = [(t.kind, t.num_envs) for t in TARGETS]
-    rival = ("gymnasium", "CartPole-v1")
-    ids = list(dict.fromkeys(row["id"] for row in report["rows"] if row["library"] == "lag_envs"))
-
-    def entry(library: str, id: str, kind: str, n: int) -> str:
-        row = rows[library, id, kind, n]
-        text = f"{page.cell(1e9 / row['steps_per_second'][1])} ns"
-        return text if (library, id) == rival else f"{text}, {row['ratio'][1]:.1f}×"
-
-    table = {
-        "columns": ["id", *("`gym.make`" if kind == "made" else f"{n:,} at once" for kind, n in kinds)],
-        "rows": [
-            [id, *(entry(library, id, *kind) for kind in kinds)]
-            for library, id in [*(("lag_envs", id) for id in ids), rival]
-        ],
-    }
-    machine = report["machine"]
-    met = [
-        f"{target.ratio:g} times for {what} by "
-        f"{sum(rows['lag_envs', id, target.kind, target.num_envs]['ratio'][1] >= target.ratio for id in ids)}"
-        f" of {len(ids)}"
-        for target, what in zip(TARGETS, ("one environment", "64 at once", "16,384 at once"), strict=True)
-    ]
-    cold = {name: quartiles(part["seconds"])[1] for name, part in report["cold_start"].items()}
-    lines = [
-        "Time of a step, and speed against Gymnasium's `CartPole-v1` of the same kind and size: medians of"
-        f" {report['settings']['rounds']} rounds on one core of {machine['processor']}"
-        f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['settings']['date']}).",
-        "",
-        *_table(table),
-        "",
-        f"Aims, and how many environments reach them: {', '.join(met)}. At 16,384 both sides are limited by"
-        " arithmetic, and a series of order 14 to 20 is a lot of it. A whole process (import, make, reset,"
-        f" first step) took {cold['empty']:.1f} s with an empty cache and {cold['filled']:.1f} s with a full"
-        " one.",
-    ]
     return "\n".join(lines)
 
 

@@ -1,255 +1,438 @@
-"""Other libraries' integrators on our scenes, one class each; all have the interface of `Peer`.
+"""Other libraries' integrators as rivals, one class each, in the fastest form that each library has.
 
-A library is imported when its class is made; where it is missing, that raises. Right-hand sides are the
-stepping's own formulas with the scene's own coefficients, run on the library's numbers. MuJoCo alone has its
-own equations; its model is made from the scene's parameters.
+A library is imported when it is first built; where it is missing, that raises. All but MuJoCo are given the
+`Equation` of the problems, written once on generic numbers; MuJoCo has equations of its own, made from the
+scene's parameters.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from abc import ABC, abstractmethod
+import os
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lag_envs.report.cases import Case
+from lag_envs.report.equations import Array, Equation, Problems
+from lag_envs.report.rivals import Rival, blocks, unblocked
+from lag_envs.report.steppers import Arithmetic
+from lag_envs.report.timing import Sample
 from lag_envs.scenes import PivotedBar
-from lag_envs.stepping import pendulum, slope
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.tracing import Trace
 
-Array = NDArray[np.float64]
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+SUBSTEPS = (1, 4, 16, 64)
 
 
-def acceleration(kind: type, p: Sequence, q: Any, v: Any, t: Any, xp: Any) -> Any:
-    """Return q'' from a flow's coefficients and, behind them in `p`, the plane's angle at t = 0."""
-    coefficients = kind(*p[:-1])
-    if kind is pendulum.Drive:
-        return pendulum.acceleration(v, xp.cos(q), xp.sin(q), coefficients) + coefficients.ramp * t
-    if kind is slope.Pull:
-        return slope.sliding(v, coefficients) + 0.0 * q
-    return slope.rolling(q, v, xp.sin(p[-1] + coefficients.rate * t), coefficients)
+class Peer(Rival):
+    """A rival from another library."""
+
+    #: What is measured: methods, each with tolerances or substeps.
+    settings: ClassVar[dict[str, Sequence[float]]]
+    #: Methods whose setting is a number of substeps per control step.
+    stepped: ClassVar[Sequence[str]] = ()
+
+    @classmethod
+    def solves(cls, scene: Scene) -> bool:
+        """Tell whether it can be given a scene."""
+        return True
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the setting is a number of substeps."""
+        return self.method in self.stepped
 
 
-class Peer(ABC):
-    """Some problems on one kind of scene, stepped by another library.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-        The problems; each control is held.
-    setting : tuple
-        One of `settings`.
-    """
-
-    #: Name of the package.
-    package: ClassVar[str]
-    #: What is measured: method, and tolerance or number of substeps.
-    settings: ClassVar[Sequence[tuple[str, float]]]
-    #: Whether many states go into one call.
-    batched: ClassVar[bool] = False
-    #: Whether the second part of a setting is a number of substeps.
-    fixed: ClassVar[bool] = False
-
-    def __init__(self, cases: Sequence[Case], setting: tuple[str, float]) -> None:
-        self.cases = cases
-        self.setting = setting
-        self.kind = cases[0].scene.flow.coefficients
-        constants = [case.scene.constants() for case in cases]
-        self._k = SimpleNamespace(**{name: np.array([k[name] for k in constants]) for name in constants[0]})
-        self._u = np.array([case.control for case in cases])
-        self.seconds = 0.0  #: spent in the library's own calls
-        self.prepare()
-
-    @abstractmethod
-    def prepare(self) -> None:
-        """Import the library and compile what can be compiled before the first call."""
-
-    @abstractmethod
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """Return (q, q') after some time; a column of `p` has the coefficients of one problem."""
-
-    def timed(self, function: Callable, *args: Any, **options: Any) -> Any:
-        """Call the library; what lies around the call, such as setting up its arguments, does not count."""
-        before = time.perf_counter()
-        result = function(*args, **options)
-        self.seconds += time.perf_counter() - before
-        return result
-
-    def move(self, states: Array, dt: float, steps: int) -> Array:
-        """Return the states, one per line, after control steps each of which is a new call."""
-        scene, u = self.cases[0].scene, self._u
-        for _ in range(steps):
-            y = scene.lift(states)
-            coefficients = scene.drive(y, u, self._k, np)
-            variables = scene.unpack(y, u, self._k)
-            angle = states[:, scene.angle] if scene.angle is not None else 0.0
-            p = np.array([np.broadcast_to(x, u.shape) for x in (*coefficients, angle)], dtype=np.float64)
-            q, v = (np.array(x, dtype=np.float64) for x in variables[:2])
-            moved = [*(np.asarray(x, dtype=np.float64) for x in self.solve(q, v, p, dt)), *variables[2:]]
-            states = np.stack(scene.pack(moved, y, u, dt, self._k)[: states.shape[1]], axis=1)
-        return states
+# --- SciPy ---
 
 
 class SciPy(Peer):
-    """`scipy.integrate.solve_ivp`, one state after the other."""
+    """SciPy's solvers with a compiled right-hand side.
 
-    package = "scipy"
-    settings = tuple((m, tol) for m in ("RK45", "DOP853", "Radau", "LSODA") for tol in TOLERANCES)
+    dopri5, dop853 and lsoda are those of `scipy.integrate.ode`, whose loops are compiled and take a tenth of
+    the time of `solve_ivp`. A batch is one system of all states, so they share their steps; its matrix, which
+    lsoda asks for, has a band. Radau is `solve_ivp`'s and has no batch.
+    """
 
-    def prepare(self) -> None:
-        """Import it."""
-        from scipy.integrate import solve_ivp
+    family = "scipy"
+    settings: ClassVar = {
+        "dopri5": TOLERANCES, "dop853": TOLERANCES, "lsoda": TOLERANCES, "Radau": TOLERANCES[::2],
+    }  # fmt: skip
 
-        self._solve_ivp = solve_ivp
+    @property
+    def batched(self) -> bool:
+        """All but Radau."""
+        return self.method != "Radau"
 
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """Call it once per state."""
-        method, tolerance = self.setting
-        ends = []
-        for q0, v0, *numbers in zip(q.tolist(), v.tolist(), *p.tolist(), strict=True):
+    @property
+    def shared(self) -> bool:
+        """A batch is one system."""
+        return True
 
-            def rate(t: float, y: Any, numbers: Sequence = numbers) -> tuple:
-                q, v = y.tolist()
-                return v, acceleration(self.kind, numbers, q, v, t, math)
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile the right-hand side."""
+        equation, count, span = problems.equation, len(problems), dt * steps
+        size = equation.size
+        start = np.ascontiguousarray(problems.y[:size].T)  # one state after the other: a matrix has a band
+        parameters = [tuple(row) for row in problems.p.T.tolist()]
+        ends = np.empty_like(start)
+        solve = self._solver(equation, count if together else 1, together)
 
-            end = self.timed(
-                self._solve_ivp, rate, (0.0, dt), (q0, v0), method, rtol=tolerance, atol=tolerance
-            )
-            ends.append(end.y[:, -1] if end.success else (np.nan, np.nan))
-        return tuple(np.array(ends).T)
+        def run() -> None:
+            if together:
+                ends[:] = solve(start.ravel(), span, problems.p).reshape(start.shape)
+            else:
+                for j, p in enumerate(parameters):
+                    ends[j] = solve(start[j], span, p)
+
+        return Sample(run, count * steps, ends=lambda: problems.states(ends.T, span))
+
+    def _solver(self, equation: Equation, count: int, together: bool) -> Callable:
+        """Return ``solve(y, span, p)``, NaN where it gives up."""
+        from scipy.integrate import ode, solve_ivp
+
+        rate = _rate_of_many(equation) if together else _rate(equation)
+        lost = np.full(count * equation.size, np.nan)
+        if self.method == "Radau":
+            tolerance = {"rtol": self.setting, "atol": self.setting}
+
+            def radau(y: Array, span: float, p: Any) -> Array:
+                end = solve_ivp(rate, (0.0, span), y, "Radau", args=(p,), **tolerance)
+                return end.y[:, -1] if end.success else lost
+
+            return radau
+        more = {"lband": equation.size - 1, "uband": equation.size - 1} if self.method == "lsoda" else {}
+        solver = ode(rate).set_integrator(
+            self.method, rtol=self.setting, atol=self.setting, nsteps=100_000_000, **more
+        )
+
+        def solve(y: Array, span: float, p: Any) -> Array:
+            solver.set_initial_value(y, 0.0).set_f_params(p)
+            end = solver.integrate(span)
+            return end if solver.successful() else lost
+
+        return solve
+
+
+def _recorded(equation: Equation) -> tuple[list[str], list]:
+    """Return the lines of the rate of y0, y1, ... with p0, p1, ... at the time t, and its values."""
+    trace = Trace()
+    names = [f"y{i}" for i in range(equation.size)], [f"p{i}" for i in range(equation.parameters)]
+    (t,), y, p = trace.inputs("t"), trace.inputs(*names[0]), trace.inputs(*names[1])
+    found = equation.rate(t, y, p, Arithmetic(trace))
+    return record_block(trace, {f"d{i}": value for i, value in enumerate(found)})
+
+
+@cache
+def _rate(equation: Equation) -> Callable:
+    """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
+    lines, values = _recorded(equation)
+    source = [
+        "def rate(t, y, p):",
+        *(f"y{i} = y[{i}]" for i in range(equation.size)),
+        *(f"p{i} = p[{i}]" for i in range(equation.parameters)),
+        *lines,
+        f"out = np.empty({equation.size})",
+        *(f"out[{i}] = {value}" for i, value in enumerate(values)),
+        "return out",
+    ]
+    return compile_function("rate", "\n    ".join(source) + "\n")
+
+
+@cache
+def _rate_of_many(equation: Equation) -> Callable:
+    """Compile ``rate(t, y, p)`` of many states, one after the other in y; p has a row for each parameter."""
+    lines, values = _recorded(equation)
+    size = equation.size
+    source = [
+        "def rate(t, y, p):",
+        "out = np.empty(y.size)",
+        "for j in range(p.shape[1]):",
+        *(f"    y{i} = y[{size} * j + {i}]" for i in range(size)),
+        *(f"    p{i} = p[{i}, j]" for i in range(equation.parameters)),
+        *(f"    {line}" for line in lines),
+        *(f"    out[{size} * j + {i}] = {value}" for i, value in enumerate(values)),
+        "return out",
+    ]
+    return compile_function("rate", "\n    ".join(source) + "\n")
+
+
+# --- heyoka ---
 
 
 class Heyoka(Peer):
-    """heyoka's adaptive Taylor series, of an order chosen from the tolerance; a block of states at once."""
+    """heyoka's adaptive Taylor series, of an order chosen from the tolerance, with fast_math.
 
-    package = "heyoka"
-    WIDTH = 64  #: of a batch: more than a vector's, so that the calls from Python weigh less
-    settings = tuple(("Taylor", tol) for tol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15))
-    batched = True
+    Its compiled step is called from a compiled loop where a control is held for one step, so that no call
+    from Python counts; over longer times it is `propagate_until`, in one call. A batch goes in blocks of
+    twice the width that heyoka recommends, the fastest of those tried.
+    """
 
-    def prepare(self) -> None:
-        """Compile the integrator."""
+    family = "heyoka"
+    settings: ClassVar = {"Taylor": (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)}
+
+    @property
+    def changing(self) -> bool:
+        """The compiled loop goes through them."""
+        return True
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile the integrator, and find its step."""
         import heyoka
 
-        q, v = heyoka.make_vars("q", "v")
-        p = [heyoka.par[i] for i in range(len(self.kind._fields) + 1)]
-        pushed = acceleration(self.kind, p, q, v, heyoka.time, heyoka)
-        system = [(q, v), (v, pushed)]
-        self._width = self.WIDTH if len(self.cases) > 1 else 1
-        if self._width == 1:
-            self._integrator = heyoka.taylor_adaptive(system, [0.0, 0.0], tol=self.setting[1])
-        else:
-            start = np.zeros((2, self._width))
-            self._integrator = heyoka.taylor_adaptive_batch(system, start, tol=self.setting[1])
+        width = 2 * heyoka.recommended_simd_size() if together else 1
+        integrator = self._integrator(problems.equation, width)
+        size, count, span = problems.equation.size, len(problems), dt * steps
+        start, p = blocks(problems.y[:size], width), blocks(problems.p, width)
+        rows = start.copy()
+        step = _stepper(integrator) if steps == 1 else None
+        if step is not None:
+            loop, work = _loop(), np.empty((3, width))
 
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """Set states and parameters, and propagate."""
-        integrator, width = self._integrator, self._width
-        if width == 1:
-            state, pars = integrator.state, integrator.pars
-            for j in range(len(q)):
-                integrator.time = 0.0
-                state[0], state[1] = q[j], v[j]
-                pars[:] = p[: len(pars), j]
-                self.timed(integrator.propagate_until, dt)
-                q[j], v[j] = state
-            return q, v
-        count = len(q)
-        full = -(-count // width) * width
-        filled = [np.concatenate([x, np.repeat(x[..., :1], full - count, -1)], -1) for x in (q, v, p)]
-        for j in range(0, full, width):
-            part = slice(j, j + width)
+            def run() -> None:
+                loop(step, rows, p, work, span, changes)
+
+        else:
+
+            def run() -> None:
+                for change in range(changes):
+                    for i, block in enumerate(rows):
+                        self._propagate(integrator, block, p[(i + change) % len(p)], span)
+
+        return Sample(
+            run,
+            count * steps * changes,
+            lambda: np.copyto(rows, start),
+            lambda: problems.states(unblocked(rows, count), span),
+        )
+
+    @staticmethod
+    def _propagate(integrator: Any, block: Array, numbers: Array, span: float) -> None:
+        if block.shape[-1] == 1:
+            integrator.time = 0.0
+            integrator.state[:], integrator.pars[: len(numbers)] = block[:, 0], numbers[:, 0]
+        else:
             integrator.set_time(0.0)
-            integrator.state[0], integrator.state[1] = filled[0][part], filled[1][part]
-            integrator.pars[:] = filled[2][: len(integrator.pars), part]
-            self.timed(integrator.propagate_until, dt)
-            filled[0][part], filled[1][part] = integrator.state
-        return filled[0][:count], filled[1][:count]
+            integrator.state[:], integrator.pars[: len(numbers)] = block, numbers
+        integrator.propagate_until(span)
+        block[:] = integrator.state.reshape(block.shape)
+
+    def _integrator(self, equation: Equation, width: int) -> Any:
+        import heyoka
+
+        names = heyoka.make_vars(*(f"y{i}" for i in range(equation.size)))
+        p = [heyoka.par[i] for i in range(equation.parameters)]
+        rates = equation.rate(heyoka.time, names, p, heyoka)
+        system = list(zip(names, (heyoka.expression(rate) for rate in rates), strict=True))
+        options = {"tol": self.setting, "fast_math": True}
+        if width == 1:
+            pars = np.zeros(equation.parameters)
+            return heyoka.taylor_adaptive(system, np.zeros(equation.size), pars=pars, **options)
+        pars = np.zeros((equation.parameters, width))
+        return heyoka.taylor_adaptive_batch(system, np.zeros((equation.size, width)), pars=pars, **options)
+
+
+#: What keeps the machine code of heyoka's steps loaded.
+_engines: list[Any] = []
+
+
+def _stepper(integrator: Any) -> int | None:
+    """Return the address of heyoka's compiled step, or None where it cannot be loaded.
+
+    It is heyoka's own object code, as its integrator runs it: ``step(state, pars, time, h, coefficients)``,
+    where `h` has the longest step allowed, and the step taken on return.
+    """
+    from importlib.metadata import files
+
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    for file in files("heyoka") or ():  # its vector functions live in libraries of its own
+        if file.name.startswith(("libsleef", "libheyoka")):
+            llvm.load_library_permanently(str(file.locate()))
+    try:
+        machine = llvm.Target.from_default_triple().create_target_machine()
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        engine.add_object_file(llvm.ObjectFileRef.from_data(integrator.llvm_state.object_code))
+        engine.finalize_object()
+        address = engine.get_function_address("step")
+    except (AttributeError, RuntimeError):
+        return None
+    _engines.append(engine)
+    return address or None
+
+
+@cache
+def _loop() -> Callable:
+    """Compile ``loop(step, rows, p, work, span, changes)``: block by block, steps until the time is up."""
+    import numba
+    from llvmlite import ir
+    from numba.extending import intrinsic
+
+    @intrinsic
+    def call(typingctx, step, state, pars, time, h):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            pointer = ir.DoubleType().as_pointer()
+            kind = ir.FunctionType(ir.VoidType(), [pointer] * 5)
+            numbers = [builder.inttoptr(arg, pointer) for arg in args[1:]]
+            builder.call(builder.inttoptr(args[0], kind.as_pointer()), [*numbers, ir.Constant(pointer, None)])
+            return context.get_dummy_value()
+
+        return numba.types.void(*[numba.types.uintp] * 5), codegen
+
+    @numba.njit
+    def loop(step, rows, p, work, span, changes):  # type: ignore[no-untyped-def]
+        time, h, left = work
+        y, pars = rows.ctypes.data, p.ctypes.data
+        for block in range(rows.shape[0]):
+            for change in range(changes):
+                line = (block + change) % p.shape[0]
+                time[:] = 0.0
+                left[:] = span
+                going = True
+                while going:
+                    h[:] = left
+                    call(
+                        step, y + block * rows.strides[0], pars + line * p.strides[0],
+                        time.ctypes.data, h.ctypes.data,
+                    )  # fmt: skip
+                    going = False
+                    for i in range(len(left)):
+                        time[i] += h[i]
+                        left[i] -= h[i]
+                        going |= left[i] != 0.0
+
+    return loop
+
+
+# --- diffrax ---
 
 
 class Diffrax(Peer):
-    """diffrax: adaptive Runge-Kutta methods, compiled by XLA, mapped over the states; each its own steps."""
+    """diffrax in one call compiled by XLA: a scan over the states alone, a map over them in a batch.
 
-    package = "diffrax"
-    settings = tuple((m, tol) for m in ("Tsit5", "Dopri8") for tol in TOLERANCES)
-    batched = True
-    _compiled: ClassVar[dict[tuple, Callable]] = {}
+    Steps are chosen by its controller, each state its own, or are all alike ("fixed").
+    """
 
-    def prepare(self) -> None:
-        """Compile; the tolerance is an argument, so that one compilation does for all."""
-        import diffrax
+    family = "diffrax"
+    settings: ClassVar = {
+        "Tsit5": TOLERANCES[::2], "Dopri8": TOLERANCES[::2], "Tsit5, fixed": (1, 4, 16),
+        "Dopri8, fixed": (1, 2, 4),
+    }  # fmt: skip
+    stepped = ("Tsit5, fixed", "Dopri8, fixed")
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile."""
+        solve = _diffrax(problems.equation, self.method.partition(",")[0], self.fixed, together)
         import jax
-        import jax.numpy as jnp
 
-        jax.config.update("jax_enable_x64", True)
-        key = (self.kind, self.setting[0])
-        if key not in self._compiled:
-            kind, method = self.kind, getattr(diffrax, self.setting[0])()
+        span, size = dt * steps, problems.equation.size
+        y, p = (jax.numpy.asarray(x) for x in (problems.y[:size].T, problems.p.T))
+        setting = span / self.substeps(steps) if self.fixed else self.setting
+        found: list[Any] = []
 
-            def rate(t: Any, y: Any, p: Any) -> Any:
-                return y[1], acceleration(kind, p, y[0], y[1], t, jnp)
+        def run() -> None:
+            found[:] = [jax.block_until_ready(solve(y, p, span, setting))]
 
-            def one(q: Any, v: Any, p: Any, time: Any, tolerance: Any) -> Any:
-                end = diffrax.diffeqsolve(
-                    diffrax.ODETerm(rate), method, 0.0, time, None, (q, v), p,
-                    stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
-                    saveat=diffrax.SaveAt(t1=True), max_steps=10_000_000, throw=False,
-                )  # fmt: skip
-                return end.ys[0][0], end.ys[1][0]
+        return Sample(run, len(problems) * steps, ends=lambda: problems.states(np.asarray(found[0]).T, span))
 
-            self._compiled[key] = jax.jit(jax.vmap(one, (0, 0, 1, None, None)))
-        self._run = self._compiled[key]
-        self._ready = jax.block_until_ready
 
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """Solve all at once."""
-        return self.timed(lambda: self._ready(self._run(q, v, p, dt, self.setting[1])))
+@cache
+def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Callable:
+    """Compile ``solve(y, p, span, setting)``; tolerance or step are arguments, so one compilation does."""
+    # Read when JAX starts: one core, as all others.
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+
+    def rate(t: Any, y: Any, p: Any) -> Any:
+        return equation.rate(t, y, p, jnp)
+
+    def one(y: Any, p: Any, span: Any, setting: Any) -> Any:
+        controller = (
+            diffrax.ConstantStepSize() if fixed else diffrax.PIDController(rtol=setting, atol=setting)
+        )
+        end = diffrax.diffeqsolve(
+            diffrax.ODETerm(rate), getattr(diffrax, method)(), 0.0, span, setting if fixed else None,
+            tuple(y[i] for i in range(equation.size)), tuple(p[i] for i in range(equation.parameters)),
+            stepsize_controller=controller, saveat=diffrax.SaveAt(t1=True), max_steps=10_000_000,
+            adjoint=diffrax.ForwardMode(), throw=False,
+        )  # fmt: skip
+        return jnp.stack([value[0] for value in end.ys])
+
+    def several(y: Any, p: Any, span: Any, setting: Any) -> Any:
+        if together:
+            return jax.vmap(one, (0, 0, None, None))(y, p, span, setting)
+        return jax.lax.map(lambda given: one(given[0], given[1], span, setting), (y, p))
+
+    return jax.jit(several)
+
+
+# --- torchdiffeq ---
 
 
 class Torchdiffeq(Peer):
-    """torchdiffeq: adaptive Runge-Kutta methods on tensors; all states of a batch share their steps."""
+    """torchdiffeq on tensors of all states, which share their steps; its loop over steps is Python."""
 
-    package = "torchdiffeq"
-    settings = tuple((m, tol) for m in ("dopri5", "dopri8") for tol in TOLERANCES)
-    batched = True
+    family = "torchdiffeq"
+    settings: ClassVar = {
+        "dopri5": TOLERANCES[::2], "dopri8": TOLERANCES[::2], "rk4, fixed": SUBSTEPS[:3],
+    }  # fmt: skip
+    stepped = ("rk4, fixed",)
 
-    def prepare(self) -> None:
+    @property
+    def shared(self) -> bool:
+        """A batch is one tensor."""
+        return True
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
         """Import it."""
         import torch
         from torchdiffeq import odeint
 
-        self._torch, self._odeint = torch, odeint
+        equation, span, count = problems.equation, dt * steps, len(problems)
+        starts = torch.from_numpy(problems.y[: equation.size].copy())
+        numbers = torch.from_numpy(problems.p)
+        times = torch.tensor([0.0, span], dtype=torch.float64)
+        options: dict[str, Any] = {"rtol": self.setting, "atol": self.setting, "method": self.method}
+        # A step has to end at the end: its interpolation is of lower order than its steps.
+        options["options"] = {"step_t": times[1:], "first_step": dt}
+        if self.fixed:
+            step = span / self.substeps(steps)
+            options = {"method": self.method.partition(",")[0], "options": {"step_size": step}}
+        groups = [slice(None)] if together else [slice(j, j + 1) for j in range(count)]
+        ends = np.empty((equation.size, count))
 
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """Solve all at once."""
-        torch = self._torch
-        method, tolerance = self.setting
-        numbers = torch.from_numpy(p)
+        def run() -> None:
+            with torch.no_grad():
+                for group in groups:
+                    p = numbers[:, group]
 
-        def rate(t: Any, y: Any) -> Any:
-            return torch.stack((y[1], acceleration(self.kind, numbers, y[0], y[1], t, torch)))
+                    def rate(t: Any, y: Any, p: Any = p) -> Any:
+                        return torch.stack(equation.rate(t, y, p, torch))
 
-        with torch.no_grad():
-            start = torch.from_numpy(np.stack((q, v)))
-            times = torch.tensor([0.0, dt], dtype=torch.float64)
-            path = self.timed(self._odeint, rate, start, times, rtol=tolerance, atol=tolerance, method=method)
-            return tuple(path[-1].numpy())
+                    ends[:, group] = odeint(rate, starts[:, group], times, **options)[-1].numpy()
+
+        return Sample(run, count * steps, ends=lambda: problems.states(ends, span))
 
 
-class MuJoCo(Peer):
-    """MuJoCo's own dynamics of a bar on a hinge, in the support's frame: its acceleration tilts gravity."""
+# --- MuJoCo ---
 
-    package = "mujoco"
-    settings = tuple((m, n) for m in ("Euler", "implicit", "RK4") for n in (1, 4, 16, 64))
-    fixed = True
-    MODEL = """
+#: Models by scene, in the frame of what is moved from outside: its acceleration tilts gravity. Contacts and
+#: constraints, of which there are none, are switched off.
+MODELS: dict[type[Scene], str] = {
+    PivotedBar: """
     <mujoco>
-      <option gravity="0 0 0" integrator="{integrator}"/>
+      <option gravity="{minus_control!r} 0 {minus_gravity!r}" integrator="{integrator}" timestep="{step!r}">
+        <flag contact="disable" constraint="disable"/>
+      </option>
       <worldbody><body>
         <joint type="hinge" axis="0 -1 0" damping="{scene.damping!r}"/>
         <inertial pos="0 0 -{scene.com_distance!r}" mass="{scene.mass!r}"
@@ -257,34 +440,61 @@ class MuJoCo(Peer):
       </body></worldbody>
     </mujoco>
     """
+}
 
-    def prepare(self) -> None:
-        """Make a model of every scene."""
-        if not all(isinstance(case.scene, PivotedBar) for case in self.cases):
-            raise ValueError("modelled in MuJoCo is PivotedBar only")
+
+class MuJoCo(Peer):
+    """MuJoCo's own dynamics in its compiled rollouts, one state after the other; it has no batch."""
+
+    family = "mujoco"
+    settings: ClassVar = {"Euler": SUBSTEPS, "implicitfast": SUBSTEPS, "RK4": SUBSTEPS}
+    stepped = ("Euler", "implicitfast", "RK4")
+
+    @classmethod
+    def solves(cls, scene: Scene) -> bool:
+        """Tell whether there is a model of the scene."""
+        return any(kind in MODELS for kind in type(scene).__mro__)
+
+    @property
+    def batched(self) -> bool:
+        """A rollout takes one state after the other."""
+        return False
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Make a model of every problem."""
+        kind = type(problems.cases[0].scene)
+        model = next((MODELS[base] for base in kind.__mro__ if base in MODELS), None)
+        if model is None:
+            raise ValueError(f"there is no MuJoCo model of {kind.__name__}")
         import mujoco
+        from mujoco.rollout import rollout
 
-        self._step = mujoco.mj_step
-        self._models = []
-        for scene, _, control in self.cases:
-            model = mujoco.MjModel.from_xml_string(self.MODEL.format(scene=scene, integrator=self.setting[0]))
-            model.opt.gravity[:] = (-control, 0.0, -scene.gravity)  # type: ignore[attr-defined]
-            self._models.append((model, mujoco.MjData(model)))
+        n = self.substeps(steps)
+        models = [
+            mujoco.MjModel.from_xml_string(
+                model.format(
+                    scene=scene, minus_control=-control, minus_gravity=-scene.gravity,  # type: ignore[attr-defined]
+                    integrator=self.method, step=dt * steps / n,
+                )
+            )
+            for scene, _, control in problems.cases
+        ]  # fmt: skip
+        data = mujoco.MjData(models[0])
+        start = np.array([(0.0, *case.state) for case in problems.cases])
+        # Every step of a long rollout would be stored; only its end is asked for.
+        chunk = min(n, 1000)
+        path = np.empty((len(models), chunk, start.shape[1]))
+        ends = start.copy()
 
-    def solve(self, q: Array, v: Array, p: Array, dt: float) -> tuple[Any, Any]:
-        """MuJoCo has its own equations, so `move` does without."""
-        raise NotImplementedError
+        def run() -> None:
+            ends[:] = start
+            for begin in range(0, n, chunk):
+                count = min(chunk, n - begin)
+                out = path[:, :count] if count == chunk else np.empty((len(models), count, start.shape[1]))
+                rollout(models, data, ends, nstep=count, state=out, skip_checks=False)
+                ends[:] = out[:, -1]
 
-    def move(self, states: Array, dt: float, steps: int) -> Array:
-        """Return the states after some control steps, in one call per state."""
-        n = int(self.setting[1])
-        ends = np.empty_like(states)
-        for (model, data), state, end in zip(self._models, states, ends, strict=True):
-            model.opt.timestep = dt / n
-            data.qpos[0], data.qvel[0] = state
-            self.timed(self._step, model, data, n * steps)
-            end[:] = data.qpos[0], data.qvel[0]
-        return ends
+        return Sample(run, len(models) * steps, ends=lambda: ends[:, 1:].copy())
 
 
-PEERS: dict[str, type[Peer]] = {peer.package: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)}
+PEERS: dict[str, type[Peer]] = {peer.family: peer for peer in (SciPy, Heyoka, Diffrax, Torchdiffeq, MuJoCo)}

@@ -4,6 +4,10 @@ Each is written once, on generic numbers, for q'' = a(q, v, t), and compiled by 
 ours, so that times compare methods and not compilers. A comparison stepper takes one step per control step;
 `n` substeps are `n` control steps of a length n times smaller.
 
+Cosine and sine are computed at every stage, or *carried*: an explicit Runge-Kutta method has them as two more
+unknowns, c' = -s q' and s' = c q', and calls no function at all; the others turn the pair that the step began
+with by two short polynomials. Carried is faster and errs a little differently, so the report has both.
+
 Examples
 --------
 >>> from lag_envs.scenes import PivotedBar
@@ -24,7 +28,7 @@ from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import compile_function, compile_traced
 from lag_envs.stepping.flows import Flow, pendulum_flow
-from lag_envs.stepping.tracing import polynomial
+from lag_envs.stepping.tracing import polynomial, sum_of_products
 
 S = TypeVar("S", bound=Scene)
 
@@ -50,51 +54,107 @@ def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
     return xp.where((back > 0.5) & (back < 2.5), -c, c), xp.where(back > 1.5, -s, s)
 
 
+class Arithmetic:
+    """A namespace whose cosine and sine are those of `cosine_sine`; the rest is another's."""
+
+    def __init__(self, xp: Any) -> None:
+        self._xp = xp
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._xp, name)
+
+    def cos(self, angle: Any) -> Any:
+        """Return the cosine."""
+        return cosine_sine(angle, self._xp)[0]
+
+    def sin(self, angle: Any) -> Any:
+        """Return the sine."""
+        return cosine_sine(angle, self._xp)[1]
+
+
+def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> tuple:
+    """Return (q', v') of a flow's equation, and (c', s') where cosine and sine are among the unknowns.
+
+    Parameters
+    ----------
+    coefficients : pendulum.Drive, slope.Pull or slope.Turn
+        Of the flow, at t = 0.
+    t : number
+        The time [s].
+    y : sequence
+        q, v, and where they are unknowns the flow's cosine and sine.
+    xp : namespace
+        Where cosine and sine are taken from if they are no unknowns.
+    angle : number
+        The turning plane's angle at t = 0, if its cosine and sine are no unknowns [rad].
+    """
+    q, v, *pair = y
+    if isinstance(coefficients, slope.Pull):
+        return v, slope.sliding(v, coefficients) + 0.0 * q
+    if isinstance(coefficients, slope.Turn):
+        turn = coefficients.rate
+        if pair:
+            return v, slope.rolling(q, v, pair[1], coefficients), -(turn * pair[1]), turn * pair[0]
+        return v, slope.rolling(q, v, xp.sin(angle + turn * t), coefficients)
+    c, s = pair or (xp.cos(q), xp.sin(q))
+    push = pendulum.acceleration(v, c, s, coefficients) + coefficients.ramp * t
+    return (v, push, -(v * s), v * c) if pair else (v, push)
+
+
 class Problem(NamedTuple):
     """One step's equation of motion, q'' = force(q, t) - drag q'."""
 
     force: Callable[[Any, Any], Any]
     gradient: Callable[[Any, Any], Any]  # of the force by q
     drag: Any
+    linear: bool  # whether the gradient is the same everywhere, so that Newton's method needs one iteration
 
     def acceleration(self, q: Any, v: Any, t: Any) -> Any:
         """Return q''."""
         return self.force(q, t) - self.drag * v
 
 
-def problem(coefficients: Any, variables: Sequence, xp: Any) -> Problem:
-    """Return the equation of motion of a flow with these coefficients, from its variables at the start."""
+def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = False) -> Problem:
+    """Return the equation of motion of a flow with these coefficients, from its variables at the start.
+
+    If carried, cosines and sines are turned from those at the start: exact to rounding up to 0.6 rad.
+    """
     if isinstance(coefficients, pendulum.Drive):
         push = coefficients._replace(gamma=0.0)
         turn = pendulum.Drive(coefficients.alpha, coefficients.beta)
+        start, *pair = variables[0], *variables[2:]
+
+        def cos_sin(q: Any) -> Sequence:
+            if q is start:
+                return pair
+            return pendulum.rotate(pair[0], pair[1], q - start) if carried else cosine_sine(q, xp)
 
         def force(q: Any, t: Any) -> Any:
-            c, s = variables[2:] if q is variables[0] else cosine_sine(q, xp)
+            c, s = cos_sin(q)
             return pendulum.acceleration(0.0, c, s, push) + coefficients.ramp * t
 
         def gradient(q: Any, t: Any) -> Any:
-            c, s = cosine_sine(q, xp)
+            c, s = cos_sin(q)
             return pendulum.acceleration(0.0, -s, c, turn)
 
-        return Problem(force, gradient, coefficients.gamma)
+        return Problem(force, gradient, coefficients.gamma, False)
     if isinstance(coefficients, slope.Pull):
         pull = coefficients.pull
-        return Problem(lambda q, t: pull, lambda q, t: 0.0 * q, coefficients.drag)
+        return Problem(lambda q, t: pull, lambda q, t: 0.0, coefficients.drag, True)
     plane = coefficients._replace(drag=0.0)
 
-    def carried(q: Any, t: Any) -> Any:
-        c, s = cosine_sine(plane.rate * t, xp)
-        return slope.rolling(q, 0.0, variables[3] * c + variables[2] * s, plane)
+    def rolling(q: Any, t: Any) -> Any:
+        if carried:
+            s = slope.rotate(variables[2], variables[3], plane.rate * t)[1]
+        else:
+            c, s = cosine_sine(plane.rate * t, xp)
+            s = variables[3] * c + variables[2] * s
+        return slope.rolling(q, 0.0, s, plane)
 
-    return Problem(carried, lambda q, t: plane.rolling * plane.rate * plane.rate, coefficients.drag)
+    return Problem(rolling, lambda q, t: plane.rolling * plane.rate * plane.rate, coefficients.drag, True)
 
 
 # --- methods: (q, v) after one step of length h ---
-
-
-def euler(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
-    """Explicit Euler, as in Gymnasium's CartPole."""
-    return q + h * v, v + h * p.acceleration(q, v, 0.0)
 
 
 def semi_implicit_euler(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
@@ -110,25 +170,11 @@ def verlet(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     return q, (half + 0.5 * h * p.force(q, h)) / (1.0 + 0.5 * h * p.drag)
 
 
-def rk4(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
-    """Runge and Kutta's classical method of order 4, as in Gymnasium's Acrobot."""
-    half = 0.5 * h
-    a1 = p.acceleration(q, v, 0.0)
-    v2 = v + half * a1
-    a2 = p.acceleration(q + half * v, v2, half)
-    v3 = v + half * a2
-    a3 = p.acceleration(q + half * v2, v3, half)
-    v4 = v + h * a3
-    a4 = p.acceleration(q + h * v3, v4, h)
-    sixth = h * (1.0 / 6.0)
-    return q + sixth * (v + 2.0 * (v2 + v3) + v4), v + sixth * (a1 + 2.0 * (a2 + a3) + a4)
-
-
 def implicit_midpoint(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     """Implicit midpoint rule, symplectic and A-stable, with four iterations of Newton's method."""
     half = 0.5 * h
     middle = v
-    for _ in range(4):
+    for _ in range(1 if p.linear else 4):
         place = q + half * middle
         residual = middle - v - half * p.acceleration(place, middle, half)
         middle = middle - residual / (1.0 + half * p.drag - half * half * p.gradient(place, half))
@@ -178,20 +224,113 @@ def phis(z: Any, xp: Any) -> list:
     return [xp.where(z <= 2.0, near, there) for near, there in zip(phi, far, strict=True)]
 
 
-class Method(NamedTuple):
-    """A comparison stepper and its order of convergence."""
+def radau(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
+    """Radau IIA of order 5, stiffly accurate, by Newton's method on the accelerations of its three stages."""
+    root = math.sqrt(6.0)
+    a = [
+        [(88.0 - 7.0 * root) / 360.0, (296.0 - 169.0 * root) / 1800.0, (-2.0 + 3.0 * root) / 225.0],
+        [(296.0 + 169.0 * root) / 1800.0, (88.0 + 7.0 * root) / 360.0, (-2.0 - 3.0 * root) / 225.0],
+        [(16.0 - root) / 36.0, (16.0 + root) / 36.0, 1.0 / 9.0],
+    ]
+    twice = [[sum(a[i][k] * a[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    c = [sum(row) for row in a]
+    hh = h * h
+    pushed = [p.acceleration(q, v, 0.0)] * 3
 
-    step: Callable
+    def speed(row: Sequence[float]) -> Any:
+        return v + h * sum_of_products(list(zip(row, pushed, strict=True)))
+
+    def place(i: int) -> Any:
+        return q + (h * c[i]) * v + hh * sum_of_products(list(zip(twice[i], pushed, strict=True)))
+
+    for _ in range(1 if p.linear else 4):
+        places = [place(i) for i in range(3)]
+        rows = []
+        for i in range(3):
+            slope_at = p.gradient(places[i], h * c[i])
+            wrong = p.force(places[i], h * c[i]) - p.drag * speed(a[i]) - pushed[i]
+            matrix = [p.drag * (h * a[i][j]) - slope_at * (hh * twice[i][j]) for j in range(3)]
+            matrix[i] = 1.0 + matrix[i]
+            rows.append([*matrix, wrong])
+        pushed = [x + dx for x, dx in zip(pushed, _solve(rows), strict=True)]
+    return place(2), speed(a[2])
+
+
+def _solve(rows: list[list[Any]]) -> list[Any]:
+    """Solve a small linear system, right-hand side last in each row, whose matrix is close to one."""
+    n = len(rows)
+    for k in range(n):
+        inverse = 1.0 / rows[k][k]
+        rows[k] = [x * inverse for x in rows[k]]
+        for i in range(n):
+            if i != k:
+                rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k], strict=True)]
+    return [row[n] for row in rows]
+
+
+class Tableau(NamedTuple):
+    """An explicit Runge-Kutta method."""
+
+    a: Sequence[Sequence[float]]  #: of each stage, the weights of the earlier ones
+    b: Sequence[float]
+    c: Sequence[float]
+
+
+def explicit(tableau: Tableau, rate: Callable, y: Sequence, h: Any) -> list:
+    """Return the unknowns after one step; ``rate(t, y)`` with t from the step's start."""
+    found: list[Sequence] = []
+    for weights, at in zip(tableau.a, tableau.c, strict=True):
+        found.append(rate(at * h, _moved(y, weights, found, h)))
+    return _moved(y, tableau.b, found, h)
+
+
+def _moved(y: Sequence, weights: Sequence[float], rates: Sequence[Sequence], h: Any) -> list:
+    terms = [(w, k) for w, k in zip(weights, rates, strict=False) if w != 0.0]
+    if not terms:
+        return list(y)
+    return [x + h * sum_of_products([(w, k[i]) for w, k in terms]) for i, x in enumerate(y)]
+
+
+def euler() -> Tableau:
+    """Explicit Euler, as in Gymnasium's CartPole."""
+    return Tableau([[]], [1.0], [0.0])
+
+
+def rk4() -> Tableau:
+    """Runge and Kutta's classical method of order 4, as in Gymnasium's Acrobot."""
+    return Tableau(
+        [[], [0.5], [0.0, 0.5], [0.0, 0.0, 1.0]],
+        [1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0],
+        [0.0, 0.5, 0.5, 1.0],
+    )
+
+
+@cache
+def dop853() -> Tableau:
+    """Dormand and Prince's method of order 8, twelve stages, as in SciPy."""
+    from scipy.integrate import DOP853
+
+    a = [[float(x) for x in row[:i]] for i, row in enumerate(DOP853.A)]
+    return Tableau(a, [float(x) for x in DOP853.B], [float(x) for x in DOP853.C])
+
+
+class Method(NamedTuple):
+    """A comparison stepper, and its order of convergence."""
+
+    step: Callable | None  #: of a `Problem`, or None where the tableau is all there is to know
     order: int
+    tableau: Callable[[], Tableau] | None = None
 
 
 METHODS = {
-    "explicit Euler": Method(euler, 1),
+    "explicit Euler": Method(None, 1, euler),
     "semi-implicit Euler": Method(semi_implicit_euler, 1),
     "Verlet": Method(verlet, 2),
     "implicit midpoint": Method(implicit_midpoint, 2),
-    "RK4": Method(rk4, 4),
+    "RK4": Method(None, 4, rk4),
     "ETD4RK": Method(etd4rk, 4),
+    "Radau IIA": Method(radau, 5),
+    "DOP853": Method(None, 8, dop853),
 }
 
 
@@ -199,20 +338,37 @@ METHODS = {
 
 
 @cache
-def comparison(name: str, flow: Flow) -> Flow:
+def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
     """Return the comparison stepper of that name for the equation of a flow."""
-    method = METHODS[name].step
+    method = METHODS[name]
 
     def fast(variables: Sequence, coefficients: Any, dt: Any, xp: Any) -> tuple:
-        p = problem(coefficients, variables, xp)
-        q, v = method(p, variables[0], variables[1], dt, xp)
+        if method.tableau and carried and not isinstance(coefficients, slope.Pull):
+            return _lifted(method.tableau(), variables, coefficients, dt)
+        p = problem(coefficients, variables, xp, carried)
+        start = variables[:2]
+        if method.tableau:
+            q, v = explicit(method.tableau(), lambda t, y: (y[1], p.acceleration(y[0], y[1], t)), start, dt)
+        else:
+            assert method.step
+            q, v = method.step(p, *start, dt, xp)
         if isinstance(coefficients, pendulum.Drive):
-            return q, v, *cosine_sine(q, xp)
+            turned = (
+                pendulum.rotate(variables[2], variables[3], q - start[0]) if carried else cosine_sine(q, xp)
+            )
+            return q, v, *turned
         if isinstance(coefficients, slope.Turn):
             return q, v, *slope.rotate(variables[2], variables[3], coefficients.rate * dt)
         return q, v
 
-    return _always(flow, fast, METHODS[name].order)
+    return _always(flow, fast, method.order)
+
+
+def _lifted(tableau: Tableau, variables: Sequence, coefficients: Any, dt: Any) -> tuple:
+    """Step a flow's variables, the pair of cosine and sine among them, and restore the pair's length."""
+    q, v, c, s = explicit(tableau, lambda t, y: rate(coefficients, t, y, None), variables, dt)
+    longer = 1.5 - 0.5 * (c * c + s * s)
+    return q, v, c * longer, s * longer
 
 
 @cache

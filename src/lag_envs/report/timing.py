@@ -154,6 +154,13 @@ class Sample(NamedTuple):
     run: Callable[[], object]
     steps: int
     prepare: Callable[[], object] = lambda: None
+    ends: Callable[[], Array] = lambda: np.empty(0)  #: the states after `run`, one per line
+
+    def end(self) -> Array:
+        """Run once and return the states."""
+        self.prepare()
+        self.run()
+        return self.ends()
 
 
 def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: float) -> Sample:
@@ -171,9 +178,9 @@ def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: flo
         Control step [s].
     """
     several, arguments = kernels.several, kernels.arguments(cases[0].scene, dt)
-    paths = np.empty((len(cases), controls.shape[1] + 1, len(cases[0].state)))
+    paths = np.full((len(cases), controls.shape[1] + 1, len(cases[0].state)), np.nan)
     paths[:, 0] = [case.state for case in cases]
-    return Sample(lambda: several(paths, controls, *arguments), controls.size)
+    return Sample(lambda: several(paths, controls, *arguments), controls.size, ends=lambda: paths[:, -1])
 
 
 def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> Sample:
@@ -185,6 +192,7 @@ def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> S
         lambda: batch(rows, len(cases), steps, *arguments),
         len(cases) * steps,
         lambda: np.copyto(rows, start),
+        lambda: kernels.states(rows, len(cases)),
     )
 
 

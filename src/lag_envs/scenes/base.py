@@ -59,6 +59,7 @@ def parameter(
     above: float | None = None,
     least: float | None = None,
     below: float | None = None,
+    most: float | None = None,
     usable: tuple[float, float] = (-math.inf, math.inf),
 ) -> Any:
     """Declare a physical parameter: default, unit, and the range that it must lie in.
@@ -66,10 +67,8 @@ def parameter(
     In the narrower range `usable` an environment can be used, whatever its other parameters, see
     `Task.usable`; a scene alone may be stepped beyond it.
     """
-    return dataclasses.field(
-        default=default,
-        metadata={"unit": unit, "above": above, "least": least, "below": below, "usable": usable},
-    )
+    limits = {"above": above, "least": least, "below": below, "most": most}
+    return dataclasses.field(default=default, metadata={"unit": unit, "usable": usable} | limits)
 
 
 def shown(value: Any) -> str:
@@ -417,15 +416,27 @@ class Scene(ABC):
         """
         if self.flow.coefficients is not pendulum.Drive:
             return None
-        y, u, k = (
-            self.lift(self.check_state(state)),
-            check_number("control", control),
-            SimpleNamespace(**self.constants()),
-        )
-        coefficients = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
-        return pendulum.truncation_bound(
-            float(self.unpack(y, u, k)[1]), coefficients, check_step(dt), self.order
-        )
+        omega, drive = self._pendulum(state, control)
+        return pendulum.truncation_bound(omega, drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def certified_speed(self, state: ArrayLike, control: float, dt: float) -> float | None:
+        """Return the |θ'| up to which one series per step is certified, if the rest is as given [rad/s].
+
+        Up to it, and not beyond, `truncation_bound` reports one substep, which leaves out at most 1e-12
+        rad/s. It is below 0 where drive, drag or field are too strong for one series at any speed, and None
+        for a scene that is not stepped by one.
+        """
+        if self.flow.coefficients is not pendulum.Drive:
+            return None
+        _, drive = self._pendulum(state, control)
+        return pendulum.certified_speed(drive, check_step(dt), self.order, self.flow.tolerance)
+
+    def _pendulum(self, state: ArrayLike, control: float) -> tuple[float, pendulum.Drive]:
+        """Return θ' and the coefficients of the normal form."""
+        y, u = self.lift(self.check_state(state)), check_number("control", control)
+        k = SimpleNamespace(**self.constants())
+        drive = pendulum.Drive(*map(float, self.drive(y, u, k, math)))
+        return float(self.unpack(y, u, k)[1]), drive
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
@@ -437,11 +448,12 @@ class Scene(ABC):
 def _check_range(field: dataclasses.Field, value: Any) -> float:
     unit = field.metadata["unit"]
     number = check_number(field.name, value, unit)
-    above, least, below = (field.metadata[key] for key in ("above", "least", "below"))
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
     for rule, limit, broken in (
         ("above", above, above is not None and not number > above),
         ("at least", least, least is not None and not number >= least),
         ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
         ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
         ("at most", 1.0 / SMALLEST, number > 1.0 / SMALLEST),
     ):
@@ -460,8 +472,12 @@ def check_step(dt: Any) -> float:
     return dt
 
 
-def friction_ratio(friction: Any, normal: Any) -> Any:
-    """Return |F|/N; infinite where the contact carries nothing or pulls."""
+#: A normal force of this share of the weight is a rounding of zero, as on a vertical plane.
+NO_LOAD = 1e-12
+
+
+def friction_ratio(friction: Any, normal: Any, weight: float) -> Any:
+    """Return |F|/N; infinite where the contact pulls, or carries nothing but a rounding of the weight."""
     friction, normal = np.broadcast_arrays(np.abs(friction), normal)
     out = np.full(normal.shape, np.inf)
-    return np.divide(friction, normal, out=out, where=normal > 0.0)[()]
+    return np.divide(friction, normal, out=out, where=normal > NO_LOAD * weight)[()]

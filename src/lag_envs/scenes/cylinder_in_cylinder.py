@@ -197,7 +197,8 @@ class CylinderInCylinder(Scene):
         friction = (
             self.inertia * (self.shell_radius * m.a.psi - self.arm * m.a.theta) / (self.radius * self.radius)
         )
-        forces = {"normal": normal, "friction": friction, "needed_friction": friction_ratio(friction, normal)}
+        needed = friction_ratio(friction, normal, self.mass * self.gravity)
+        forces = {"normal": normal, "friction": friction, "needed_friction": needed}
         if self.control == "tilt":
             forces["drive_torque"] = friction * self.shell_radius + self.damping * (m.v.psi - m.v.theta)
         return forces

@@ -53,7 +53,8 @@ class Incline(Scene):
     damping : float [N s/m]
         Coefficient c of the drag -cx' at the axis. It adds to a drag that is the control.
     tilt : float [rad], optional
-        Fixed tilt, below π/2 to either side; 0.26 by default. Only for the control "damping".
+        Fixed tilt, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
+        control "damping".
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt", "tilt_rate"}
@@ -75,7 +76,7 @@ class Incline(Scene):
     radius: float = parameter(0.05, "m", above=0.0, usable=(1e-9, 1e9))
     inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e27))
     damping: float = parameter(0.0, "N s/m", least=0.0, usable=(0.0, 1e9))
-    tilt: float = parameter(None, "rad", above=-math.pi / 2, below=math.pi / 2)
+    tilt: float = parameter(None, "rad", least=-math.pi / 2, most=math.pi / 2)
     gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e6))
     control: str = "damping"
 
@@ -203,7 +204,8 @@ class Incline(Scene):
             self.gravity * np.cos(m.q.phi) - 2.0 * m.v.x * m.v.phi - self.radius * turn - m.q.x * m.a.phi
         )
         friction = self.inertia * rolling / (self.radius * self.radius)
-        forces = {"normal": normal, "friction": friction, "needed_friction": friction_ratio(friction, normal)}
+        needed = friction_ratio(friction, normal, self.mass * self.gravity)
+        forces = {"normal": normal, "friction": friction, "needed_friction": needed}
         if self.control == "tilt_rate":
             forces["drive_torque"] = (
                 (self.mass * self.radius + self.inertia / self.radius) * rolling
@@ -246,9 +248,12 @@ class Incline(Scene):
         phi, radius = self.tilt, self.radius
         left, right = self.place(low, 0.0, phi), self.place(high, 0.0, phi)
         depth = min(left[1], right[1]) - (high - low)
+        behind = [(right[0], depth), (left[0], depth)]
+        if abs(phi) > 0.25 * math.pi:  # rather a wall than a hill
+            behind = [self.place(x, low - high, phi) for x in (high, low)]
         marks = shapes.ticks(low, high, shapes.round_length((high - low) / 15.0))
         return [
-            Polygon([left, right, (right[0], depth), (left[0], depth)], "ground"),
+            Polygon([left, right, *behind], "ground"),
             *(Line([self.place(x, 0.0, phi), self.place(x, -0.6 * radius, phi)], "ground") for x in marks),
             Line([(0.0, 0.0), (-24.0 * radius, 0.0)], "guide"),
             Line(shapes.arc((0.0, 0.0), 20.0 * radius, math.pi - phi, math.pi), "guide"),

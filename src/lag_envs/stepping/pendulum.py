@@ -17,23 +17,30 @@ called; the pair (cos, sin) is turned by the step's angle with two short polynom
 With κ = x/2 the series x/(1-κτ) and G/(1-κτ)² then satisfy the same recurrences with >= in place of =, so
 |W_k| <= xκ^k for every k. A series cut off after W_N leaves out at most xκ^(N+1)/(1-κ) of hθ', and
 at most xκ^(N+1)/((1-κ)(N+2)) of θ.
+
+Where one series is not enough the step is divided. What many substeps add up is computed with twice the
+digits (`substep`), and where damping is heavy most of them are spared by following the slow manifold.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lag_envs.stepping.compiling import compile_python, compile_traced
 from lag_envs.stepping.tracing import pairwise_sum, polynomial, sum_of_products
+from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 ORDER = 16
 TOLERANCE = 1e-12
 MAX_SUBSTEPS = 1_000_000
+#: Substeps compute the coefficients up to this one with twice the digits; what rounding takes from later ones
+#: is below 1e-20, for they shrink at least fivefold from one to the next.
+TWOFOLD = 5
 
 _SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(8)]
 _COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(9)]
@@ -91,7 +98,7 @@ def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tup
     return W, H
 
 
-def rotate(c: Any, s: Any, angle: Any) -> tuple[Any, Any]:
+def rotate(c: Any, s: Any, angle: Any, polynomial: Callable = polynomial) -> tuple[Any, Any]:
     """Turn the pair (cos, sin) by an angle of at most 0.6 rad and restore its length to rounding."""
     z = angle * angle
     sine = angle * polynomial(_SIN, z)
@@ -107,6 +114,29 @@ def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = O
     change = pairwise_sum(W[1:])
     angle = pairwise_sum([w * (1.0 / (k + 1)) for k, w in enumerate(W)])
     return angle, change, *rotate(c, s, angle)
+
+
+def substep(w: Twofold, c: Twofold, s: Twofold, drive: Drive, order: int = ORDER) -> tuple:
+    """Return hθ', cosθ and sinθ after one of many steps, and by how much θ changes, with twice the digits.
+
+    Errors of many steps add up, at best like a random walk. They change a pendulum's energy, so its rate, and
+    that its phase, more and more with time. So each step has to be more exact than a float.
+
+    Parameters
+    ----------
+    w, c, s : Twofold
+        hθ', cosθ and sinθ at the start.
+    drive : Drive
+        Scaled coefficients, each a `Twofold`.
+    order : int
+        The highest coefficient of the series.
+    """
+    large, _ = taylor_coefficients(w, c, s, drive, min(TWOFOLD, order))
+    W, _ = taylor_coefficients(w.high, c.high, s.high, Drive(*(x.high for x in drive)), order)
+    W[: len(large)] = large
+    angle = pairwise_sum([x * (1.0 / (k + 1)) for k, x in enumerate(W)])
+    c, s = rotate(c, s, angle, partial(mixed_polynomial, twofold=3))
+    return pairwise_sum(W), c, s, angle
 
 
 def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
@@ -128,7 +158,7 @@ def certified(omega: Any, drive: Drive, h: Any, x: Any, xp: Any) -> Any:
 def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
     """Return the largest x for which one step of length dt is exact to the tolerance in θ' [rad/s].
 
-    Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2.
+    Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2, and stays below by more than rounding.
 
     Examples
     --------
@@ -139,7 +169,16 @@ def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> fl
     for _ in range(60):
         x = 2.0 * (tolerance * dt * (1.0 - x / 2.0) / x) ** (1.0 / (order + 1))
         x = min(x, 0.5)  # the polynomials of `rotate` are exact to 0.6 rad
-    return x
+    return x * (1.0 - 1e-14)
+
+
+def certified_speed(drive: Drive, dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
+    """Return the |θ'| up to which one series is enough [rad/s]; below 0 where it never is."""
+    x = largest_x(dt, order, tolerance)
+    if not certified(0.0, drive, dt, x, np):
+        return -1.0
+    speed = x / dt
+    return speed if speed * dt <= x else math.nextafter(speed, 0.0)
 
 
 class Bound(NamedTuple):
@@ -151,19 +190,25 @@ class Bound(NamedTuple):
     theta_dot: float  # the same for θ' [rad/s]
 
 
-def truncation_bound(omega: float, drive: Drive, dt: float, order: int = ORDER) -> Bound:
+def truncation_bound(
+    omega: float, drive: Drive, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
+) -> Bound:
     """Return the number of substeps of a step and the proved bound on what they leave out.
+
+    One series is taken only where it is proved to leave out at most the tolerance of θ' [rad/s]. Where it is
+    not, the step is divided, and all of its substeps together leave out at most the tolerance times the size
+    of θ', max(1, |θ'|, (alpha² + beta²)^¼).
 
     Each substep's bound is proved; they are added up without the amplification, by the system itself, of what
     earlier substeps left out. Where `flow` jumps along the slow manifold (heavy damping) the count is that
     of plain substeps, which the jump replaces.
     """
-    largest = largest_x(dt, order)
+    largest = largest_x(dt, order, tolerance)
     one = certified(omega, drive, dt, largest, np)
-    n = 1 if one else min(_substeps(omega, *drive, dt, order), 1e15)
+    n = 1.0 if one else min(float(_substeps(omega, *drive, dt, order, tolerance)), 1e15)
     h = dt / n
     # One step needs the bound at its start only, several need it all the way.
-    x = _rate(omega, *drive, dt if n > 1 else 0.0) * h
+    x = _rate(omega, *drive, 0.0 if one else dt) * h
     if one:
         x = min(x, largest)
     tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
@@ -185,54 +230,79 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
     return max(speed, root)
 
 
-def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order):  # type: ignore[no-untyped-def]
-    """Return the number of substeps for TOLERANCE, as a float that may be huge.
+def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order, tolerance):  # type: ignore[no-untyped-def]
+    """Return the number of substeps where one is not enough, as a float that may be huge.
 
-    From n · xκ^(N+1)/(1-κ)/h <= TOLERANCE · scale with x = rate h, κ = x/2 <= 0.2, h = dt/n.
+    From n · xκ^(N+1)/(1-κ)/h <= tolerance · size with x = rate h, κ = x/2 <= 0.2, h = dt/n.
     """
     rate = _rate(omega, alpha, beta, gamma, delta, ramp, dt)
-    scale = max(1.0, max(abs(omega), (alpha * alpha + beta * beta) ** 0.25))
+    size = max(1.0, max(abs(omega), (alpha * alpha + beta * beta) ** 0.25))
     half = 0.5 * rate * dt
-    n = (rate / (0.8 * TOLERANCE * scale)) ** (1.0 / order) * half ** (1.0 + 1.0 / order)
-    return np.ceil(max(1.0, max(n, 5.0 * half)))
+    n = (rate / (0.8 * tolerance * size)) ** (1.0 / order) * half ** (1.0 + 1.0 / order)
+    return np.ceil(max(2.0, max(n, 5.0 * half)))
 
 
-def _slow_substep(theta, c, s, alpha, beta, gamma, delta, ramp, h):  # type: ignore[no-untyped-def]
-    """Advance along the slow manifold; return (θ, θ', cos, sin) at the end.
+def _divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, n):  # type: ignore[no-untyped-def]
+    """Advance by dt in n equal substeps; return θ, θ', cosθ, sinθ."""
+    h = dt / n
+    h_low = fma(-h, n, dt) / n
+    scaled = scale(omega, alpha, beta, gamma, delta, ramp, h, h_low)
+    w, w_low = scaled[0], scaled[1]
+    c_low = s_low = turned = turned_low = 0.0
+    for i in range(int(n)):
+        w, w_low, c, c_low, s, s_low, turned, turned_low = substep(
+            w, w_low, c, c_low, s, s_low, turned, turned_low, *scaled[2:], float(i)
+        )
+    omega = w / h
+    return theta + turned, omega + (fma(-omega, h, w) + (w_low - omega * h_low)) / h, c, s
 
-    There W = -(P - D - R tau + W')/Γ holds with a series of its own. Solved by sweeps,
-    each of which gains a factor of about (|field| + |delta|)/gamma².
+
+def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  # type: ignore[no-untyped-def]
+    """Advance by dt along the slow manifold in n equal substeps; return θ, θ', cosθ, sinθ.
+
+    There θ' is the drift that drive and drag alone lead to, known in closed form, plus a part V due to the
+    field. In a substep V = -(P + V')/Γ has a series of its own. It is found by sweeps, each of which gains a
+    factor of about |θ'|/gamma.
     """
+    h = dt / n
     a, b, g = alpha * h * h, beta * h * h, gamma * h
-    d, r = delta * h * h, ramp * h * h * h
-    W = np.zeros(order + 2)
-    P = np.zeros(order + 1)
-    Q = np.zeros(order + 1)
-    P[0] = a * s + b * c
-    Q[0] = a * c - b * s
-    for _ in range(8):
+    V, P, Q = np.zeros(order + 2), np.zeros(order + 1), np.zeros(order + 1)
+    drift = slope = w = 0.0
+    start_c, start_s = c, s
+    # What rounding takes from the sum is handed on (Kahan): equal terms would all round to one side.
+    turned = lost = 0.0
+    for i in range(int(n)):
+        # In units of the substep: the drift's rate at its start, and by how much it grows.
+        drift = (delta + ramp * (i * h) - ramp / gamma) / gamma * h
+        slope = ramp / gamma * h * h
+        P[0] = a * s + b * c
+        Q[0] = a * c - b * s
         for k in range(order + 1):
-            force = P[k] + (k + 1) * W[k + 1]
-            if k == 0:
-                force -= d
-            elif k == 1:
-                force -= r
-            W[k] = -force / g
-            if k < order:
-                p = 0.0
-                q = 0.0
-                for j in range(k + 1):
-                    p += Q[j] * W[k - j]
-                    q += P[j] * W[k - j]
-                P[k + 1] = p / (k + 1)
-                Q[k + 1] = -q / (k + 1)
-    w = 0.0
-    angle = 0.0
-    for k in range(order, -1, -1):
-        w += W[k]
-        angle += W[k] / (k + 1)
-    c1, s1 = turn(c, s, angle)
-    return theta + angle, w / h, c1, s1
+            V[k] = 0.0
+        for _ in range(8):
+            for k in range(order + 1):
+                V[k] = -(P[k] + (k + 1) * V[k + 1]) / g
+                if k < order:
+                    p = Q[k] * (drift + V[0]) + (Q[k - 1] * slope if k > 0 else 0.0)
+                    q = P[k] * (drift + V[0]) + (P[k - 1] * slope if k > 0 else 0.0)
+                    for j in range(k):
+                        p += Q[j] * V[k - j]
+                        q += P[j] * V[k - j]
+                    P[k + 1] = p / (k + 1)
+                    Q[k + 1] = -q / (k + 1)
+        w = angle = 0.0
+        for k in range(order, -1, -1):
+            w += V[k]
+            angle += V[k] / (k + 1)
+        angle = angle + (drift + 0.5 * slope) - lost
+        end = turned + angle
+        lost = (end - turned) - angle
+        turned = end
+        # From the start of all, so that nothing adds up.
+        p, q = math.cos(turned), math.sin(turned)
+        p, q = p + lost * q, q - lost * p
+        c, s = start_c * p - start_s * q, start_s * p + start_c * q
+    return theta + turned, (w + (drift + slope)) / h, c, s
 
 
 def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: ignore[no-untyped-def]
@@ -243,37 +313,33 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
     if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
         angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta, ramp, dt)
         return theta + angle, fma(change, 1.0 / dt, omega), c, s, 1
-    field = math.sqrt(alpha * alpha + beta * beta) + abs(delta) + abs(ramp) * dt
-    # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then jump along the
-    # slow manifold. Tested against 40 digits for field/gamma² up to 1e-3, with and without drive.
+    field = math.sqrt(alpha * alpha + beta * beta)
+    push = abs(delta) + abs(ramp) * dt
+    # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then follow the slow
+    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. Where the
+    # field is nothing beside the push, the drift is all there is.
+    drift = field <= 1e-18 * push
     layer = dt
-    if gamma > 0.0 and field <= 1e-3 * gamma * gamma:
-        layer = (40.0 + math.log(max(1.0, abs(omega) + field / gamma))) / gamma
+    if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or push <= 1e-2 * gamma * gamma):
+        layer = (40.0 + math.log(max(1.0, abs(omega) + (field + push) / gamma))) / gamma
     slow = layer < 0.5 * dt
     if not slow:
         layer = dt
-    n = _substeps(omega, alpha, beta, gamma, delta, ramp, layer, order)
+    n = _substeps(omega, alpha, beta, gamma, delta, ramp, layer, order, TOLERANCE)
     m = 0.0
     if slow:
-        m = np.ceil(max(1.0, 12.0 * field / gamma * (dt - layer)))
+        m = 1.0
+        if not drift:
+            m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
     # A substep along the slow manifold costs as much as 50 others.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         return theta, omega, c, s, -1
-    h = layer / n
-    # What rounding takes from the two sums is handed on (Kahan): equal terms would all round to one side.
-    turned = lost_angle = lost_speed = 0.0
-    for i in range(int(n)):
-        angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta + ramp * (i * h), ramp, h)
-        angle, speed = angle - lost_angle, change / h - lost_speed
-        turned_end, omega_end = turned + angle, omega + speed
-        lost_angle, lost_speed = (turned_end - turned) - angle, (omega_end - omega) - speed
-        turned, omega = turned_end, omega_end
-    theta += turned
+    theta, omega, c, s = divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, layer, n)
     if slow:
-        h = (dt - layer) / m
-        for i in range(int(m)):
-            push = delta + ramp * (layer + i * h)
-            theta, omega, c, s = _slow_substep(theta, c, s, alpha, beta, gamma, push, ramp, h)
+        if drift:
+            alpha = beta = 0.0
+        delta += ramp * layer
+        theta, omega, c, s = slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order)
     if not (abs(theta) < math.inf and abs(omega) < math.inf):
         return theta, omega, c, s, -2
     return theta, omega, c, s, int(n + m)
@@ -312,8 +378,33 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
         lambda xp, omega, *rest: (certified(omega, Drive(*rest[:5]), rest[5], rest[6], xp),),
         absent,
     )
-    turn = compile_traced("turn", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
-    rate = compile_python("_rate", _rate)
-    count = compile_python("_substeps", _substeps, rate, TOLERANCE=tolerance)
-    slow = compile_python("_slow_substep", _slow_substep, turn, order=order)
-    return compile_python("flow", _flow, holds, series, count, slow, order=order, MAX_SUBSTEPS=MAX_SUBSTEPS)
+    count = compile_python("_substeps", _substeps, compile_python("_rate", _rate))
+    divided, slow_motion = _compile_divided(order), compile_python("slow_motion", _slow_motion)
+    limits = {"TOLERANCE": tolerance, "MAX_SUBSTEPS": MAX_SUBSTEPS}
+    return compile_python("flow", _flow, holds, series, count, divided, slow_motion, order=order, **limits)
+
+
+@cache
+def _compile_divided(order: int) -> Callable:
+    """Compile `_divided` once for all pendulums; what is zero adds nothing."""
+    coefficients = ", ".join(Drive._fields)
+    pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Drive._fields))
+
+    def scale(xp: Any, omega: Any, *numbers: Any) -> tuple:
+        *drive, h, h_low = numbers
+        step = Twofold(h, h_low)
+        return twofold_parts(step * omega, *scaled(Drive(*map(Twofold, drive)), step))
+
+    def one(xp: Any, *numbers: Any) -> tuple:
+        *halves, i = numbers
+        w, c, s, turned, *drive = map(Twofold, halves[::2], halves[1::2])
+        a, b, gamma, d, r = drive
+        w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
+        return twofold_parts(w, c, s, turned + angle)
+
+    return compile_python(
+        "divided",
+        _divided,
+        compile_traced("scale", f"omega, {coefficients}, h, h_low", scale),
+        compile_traced("substep", f"{pairs}, i", one),
+    )

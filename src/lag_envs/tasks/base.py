@@ -6,6 +6,7 @@ import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -50,6 +51,8 @@ class Task(ABC):
     observation: ClassVar[tuple[str, ...]]
     #: Random targets lie in [-target_range, target_range]; None for a task without target.
     target_range: ClassVar[float | None] = None
+    #: The action without control; with it a person's hands are off.
+    rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
     #: Ranges of parameters in which the task can be used, where they are not those that the scene declares.
@@ -74,7 +77,11 @@ class Task(ABC):
                 "duration",
                 *(["target"] if self.target_range is not None else []),
             ]
-            raise TypeError(f"unknown keyword {unknown[0]!r}; this environment takes {', '.join(options)}")
+            # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
+            raise TypeError(
+                f"got an unexpected keyword argument {unknown[0]!r}; "
+                f"this environment takes {', '.join(options)}"
+            )
         self.scene: Scene = self.scene_type(**(self.defaults | parameters))
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
@@ -138,6 +145,30 @@ class Task(ABC):
     def largest_x(self) -> float:
         """The bound's x up to which one step is certified."""
         return self.scene.largest_x(self.dt)
+
+    @property
+    def control_range(self) -> tuple[float, float]:
+        """The controls of the actions -1 and 1 at the centre of the starts."""
+        k = SimpleNamespace(**self.constants())
+        y = self.scene.lift(self.centre)
+        low, high = (float(self.control(a, y, k, self.dt, np)) for a in (-1.0, 1.0))
+        return low, high
+
+    @property
+    def edges(self) -> Sequence[Sequence[float]]:
+        """States at the edge of what the task reaches, in all that drives the motion but θ and θ'."""
+        return [self.centre]
+
+    def certified_speed(self) -> float | None:
+        """Return the |θ'| up to which one series per step is certified, whatever the control [rad/s].
+
+        It is below 0 where one series is never enough, and None where the scene is not stepped by one. See
+        `Scene.certified_speed`.
+        """
+        found = [
+            self.scene.certified_speed(state, u, self.dt) for state in self.edges for u in self.control_range
+        ]
+        return min((speed for speed in found if speed is not None), default=None)
 
     def check_target(self, target: Any) -> float:
         """Return the target as float, or raise a ValueError."""

@@ -35,6 +35,11 @@ class _Shell(Task):
         """Near the bottom, the shell at rest."""
         return [0.1, 0.2, 0.0]
 
+    @property
+    def edges(self) -> Sequence[Sequence[float]]:
+        """The shell at its fastest, to either side."""
+        return [[0.0, 0.0, rate] for rate in (-self.fastest_shell, self.fastest_shell)]
+
     def numbers(self) -> dict[str, float]:
         """Return the limits of the shell's acceleration and rate."""
         return {"limit_control": self.limit_control, "fastest_shell": self.fastest_shell}
@@ -175,17 +180,19 @@ class Tilt(_Shell):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
+    size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 197.67 (a plan by iLQR on the exact model gets it) and about 197.7 at most (finite-horizon value
-    iteration on a grid, extrapolated: an estimate). Over 4,096 episodes (mean ± standard error), the last
-    column being the feedback action = 30.3 (θ* - θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
+    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the feedback is action = 30.3 (θ* - θ) - 3.77 θ'
+    + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
 
-    | Id | Random actions | Zero control | Feedback |
-    | -- | -------------- | ------------ | -------- |
-    | CylinderInCylinderTilt-v0 | 42.3 ± 0.4 | 61.3 ± 1.1 | 197.6 ± 0.0 |
+    | Id | Random actions | Zero control | Feedback | Best known |
+    | -- | -------------- | ------------ | -------- | ---------- |
+    | CylinderInCylinderTilt-v0 | 42.26 ± 0.36 | 61.3 ± 1.1 | 197.602 ± 0.028 | 197.6717 ± 0.0037 |
 
     ## Version History
 
@@ -312,18 +319,19 @@ class Pump(_Shell):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
+    size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 145.7 (the greedy policy of finite-horizon value iteration gets it) and about 147 at most (the
-    same on a grid without width, extrapolated: an estimate; by the order of convergence seen, 145.5). Over
-    4,096 episodes (mean ± standard error), the last column being the energy pump action = 1.78 (E* - E) θ' -
-    0.932 ψ' + 0.315 θ, clipped to ±1:
+    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the energy pump
+    is action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1:
 
-    | Id | Random actions | Zero control | Energy pump |
-    | -- | -------------- | ------------ | ----------- |
-    | CylinderInCylinderPump-v0 | 6.25 ± 0.01 | 7.22 ± 0.00 | 142.1 ± 0.0 |
+    | Id | Random actions | Zero control | Energy pump | Best known |
+    | -- | -------------- | ------------ | ----------- | ---------- |
+    | CylinderInCylinderPump-v0 | 6.2510 ± 0.0057 | 7.2179 ± 0.0010 | 142.055 ± 0.043 | 145.637 ± 0.043 |
 
     ## Version History
 
@@ -457,18 +465,19 @@ class Damping(Task):
     ## Numerical Accuracy
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound.
+    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 367.1 ± 0.2 (the greedy policy of finite-horizon value iteration gets it) and about 367.6 at most
-    (extrapolated to a grid without width: an estimate). Full damping all the time gets 305. Over 4,096
-    episodes (mean ± standard error), the last column being full brake away from the bottom, and action = 14.6
-    (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
+    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the switching
+    line is full brake away from the bottom, and action = 14.6 (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
 
-    | Id | Random actions | Zero control | Switching line |
-    | -- | -------------- | ------------ | -------------- |
-    | CylinderInCylinderDamping-v0 | 294.3 ± 1.0 | 13.2 ± 0.4 | 363.8 ± 0.7 |
+    | Id | Random actions | Zero control | Switching line | Best known |
+    | -- | -------------- | ------------ | -------------- | ---------- |
+    | CylinderInCylinderDamping-v0 | 294.34 ± 0.99 | 13.19 ± 0.37 | 363.77 ± 0.73 | 367.050 ± 0.063 |
 
     Zero control is the action -1, no brake.
 
@@ -484,6 +493,7 @@ class Damping(Task):
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
+    rest_action = -1.0
 
     def check(self) -> None:
         """Refuse the other control."""

@@ -1,4 +1,14 @@
-"""The native vector environments as Stable-Baselines3 sees vector environments."""
+"""The native vector environments as Stable-Baselines3 sees vector environments (extra ``agents``).
+
+Learners then step all environments in one compiled call:
+
+>>> from stable_baselines3 import PPO
+>>> envs = make_vec_env("PivotedBar-v0", 64)
+>>> model = PPO("MlpPolicy", envs)
+
+The hyperparameters that the agents were trained with, in the RL Zoo's form, are printed by
+``lag-envs hyperparams ppo``.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +19,19 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+try:
+    from stable_baselines3.common import vec_env
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f'{error.name} is missing: pip install "lag-envs[agents]"', name=error.name
+    ) from error
 
 import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.leaderboard.policies import bin_centres
 
 
-def make_sb3_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> SB3VecEnv:
+def make_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> VecEnv:
     """Return a native vector environment for Stable-Baselines3.
 
     Parameters
@@ -25,21 +41,21 @@ def make_sb3_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: 
     num_envs : int
         Number of environments.
     spread : int, default 0
-        See `SB3VecEnv`.
+        See `VecEnv`.
     **options
         Parameters of the environment.
 
     Examples
     --------
-    >>> env = make_sb3_vec_env("PivotedBar-v0", 3, damping=0.0)
+    >>> env = make_vec_env("PivotedBar-v0", 3, damping=0.0)
     >>> _ = env.seed(1)
     >>> env.reset().shape
     (3, 5)
     """
-    return SB3VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), spread=spread)
+    return VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), spread=spread)
 
 
-class SB3VecEnv(VecEnv):
+class VecEnv(vec_env.VecEnv):
     """A Gymnasium vector environment as Stable-Baselines3's `VecEnv`.
 
     What it returns equals `DummyVecEnv` over the single environments, bit for bit, except that the infos of
@@ -73,7 +89,8 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in every environment, with the seeds and options that were set."""
-        observations, infos = self.env.reset(seed=self._seeds, options=self._stacked_options())
+        seeds: Any = self._seeds  # Gymnasium's types know of one seed only
+        observations, infos = self.env.reset(seed=seeds, options=self._stacked_options())
         if self._spread:
             observations, infos = self._spread_starts()
         self.reset_infos = self._split(infos)
@@ -108,7 +125,7 @@ class SB3VecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return a picture of each environment, where it was made with ``render_mode="rgb_array"``."""
-        frames = self.env.render() if self.render_mode is not None else None
+        frames: Any = self.env.render() if self.render_mode is not None else None
         return [None] * self.num_envs if frames is None else list(frames)
 
     # --- attributes of the environments ---------------------------------------------------------------------
@@ -177,18 +194,18 @@ def _row(infos: dict[str, Any], i: int) -> dict[str, Any]:
     return {k: v[i] for k, v in infos.items() if not k.startswith("_") and infos[f"_{k}"][i]}
 
 
-class ScaledReward(VecEnvWrapper):
+class ScaledReward(vec_env.VecEnvWrapper):
     """Multiply the reward that a learner sees.
 
     Parameters
     ----------
-    venv : VecEnv
+    venv : stable_baselines3.common.vec_env.VecEnv
         The environments.
     factor : float
         What the rewards are multiplied by.
     """
 
-    def __init__(self, venv: VecEnv, factor: float) -> None:
+    def __init__(self, venv: vec_env.VecEnv, factor: float) -> None:
         super().__init__(venv)
         self.factor = np.float32(factor)
 
@@ -202,18 +219,18 @@ class ScaledReward(VecEnvWrapper):
         return observations, rewards * self.factor, done, infos
 
 
-class DiscreteActions(VecEnvWrapper):
+class DiscreteActions(vec_env.VecEnvWrapper):
     """Numbered actions in place of numbers in [-1, 1], as Gymnasium's ``DiscretizeAction`` has them.
 
     Parameters
     ----------
-    venv : VecEnv
+    venv : stable_baselines3.common.vec_env.VecEnv
         The environments.
     bins : int
         Number of actions.
     """
 
-    def __init__(self, venv: VecEnv, bins: int) -> None:
+    def __init__(self, venv: vec_env.VecEnv, bins: int) -> None:
         super().__init__(venv, action_space=gym.spaces.Discrete(bins))
         self._centres = bin_centres(bins).astype(np.float32)
 

@@ -1,0 +1,251 @@
+"""How agents act: when they get there, how far off they end, how fast they cross a line.
+
+``python -m agents.behaviour`` plays the episodes that `docs/agents.md` is about, with the learned policies in
+``leaderboard/submissions`` and with the quick controllers, and writes ``agents/results/behaviour.json``, from
+which ``python -m agents.results --redraw`` makes that page's tables of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.analysis import rounded
+from agents.results import ROOT, to_json
+from agents.run import FIRST_FRESH_SEED, UserError, check_env, write
+from agents.submit import AUTHORS
+from lag_envs import TASKS
+from lag_envs.controllers import CONTROLLERS
+from lag_envs.leaderboard.protocol import GOALS, make_task
+from lag_envs.leaderboard.submission import load
+from lag_envs.stepping.slope import Pull, crossing_time
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+SUBMISSIONS, OUTPUT = ROOT / "leaderboard" / "submissions", ROOT / "agents" / "results" / "behaviour.json"
+EPISODES = 1_000
+#: Controllers that are not shown: they take long, or there is nothing to see.
+LEFT_OUT = ("iLQR", "zero", "random", "full damping", "best constant")
+
+
+@dataclass(frozen=True)
+class Played:
+    """Episodes that were stepped together.
+
+    Parameters
+    ----------
+    env : str
+        Id of their environment.
+    task : Task
+        Its task.
+    states : ndarray, shape (steps + 1, episodes, n_state)
+        Where each step begins, and the last one ends; after an episode's end what its last step left.
+    actions : ndarray, shape (steps, episodes)
+        The actions.
+    targets : ndarray, shape (episodes,)
+        Targets; 0 where the task has none.
+    steps : ndarray of int, shape (episodes,)
+        Steps that each episode took.
+    rewards : ndarray, shape (steps, episodes)
+        Rewards; 0 after an episode's end.
+    """
+
+    env: str
+    task: Task
+    states: Array
+    actions: Array
+    targets: Array
+    steps: NDArray[np.int64]
+    rewards: Array
+
+    def settled(self) -> Array:
+        """Return after how many seconds the board's goal holds for good; inf where it does not at the end."""
+        goal = GOALS[self.env].inside
+        inside = np.stack([goal(self.task, states, self.targets) for states in self.states])
+        outside = ~inside & (np.arange(len(inside))[:, None] <= self.steps)
+        last = np.where(outside.any(axis=0), len(outside) - np.argmax(outside[::-1], axis=0), 0)
+        return np.where(last > self.steps, np.inf, last * self.task.dt)
+
+
+def play(env_id: str, agent: Any, episodes: int = EPISODES) -> Played:
+    """Play the first of the episodes that agents are compared in.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    agent : object
+        Anything with the `predict` of Stable-Baselines3.
+    episodes : int
+        How many.
+    """
+    # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
+    envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep")
+    bare: Any = envs.unwrapped
+    observation, _ = envs.reset(seed=FIRST_FRESH_SEED)
+    targets = np.zeros(episodes) if bare.target is None else bare.target.copy()
+    states, actions, rewards, state = [bare.state.copy()], [], [], None
+    steps = np.zeros(episodes, np.int64)
+    running = np.ones(episodes, np.bool_)
+    start = running.copy()
+    while running.any():
+        action, state = agent.predict(observation, state, start, deterministic=True)
+        observation, reward, terminated, truncated, _ = envs.step(action)
+        rewards.append(np.where(running, reward, 0.0))
+        steps += running
+        actions.append(np.clip(action[:, 0], -1.0, 1.0))
+        states.append(np.where(running[:, None], bare.state, states[-1]))
+        running &= ~(terminated | truncated)
+        start = np.zeros(episodes, np.bool_)
+    envs.close()
+    return Played(
+        env_id, bare.task, np.array(states), np.array(actions, np.float64), targets, steps, np.array(rewards)
+    )
+
+
+# --- what is measured ---------------------------------------------------------------------------------------
+
+
+def arrival(what: str, played: Played) -> dict[str, float]:
+    """Measure when the board's goal is reached for good, and what is lost by then and afterwards.
+
+    Lost is what a step's reward lacks to 1, the most that it may be. Means are over the episodes in which the
+    goal holds at the end; the others are counted.
+    """
+    seconds = played.settled()
+    well = np.isfinite(seconds)
+    before = np.arange(len(played.rewards))[:, None] * played.task.dt < seconds - 1e-9
+    lost = 1.0 - played.rewards
+    return {
+        f"{what} after [s]": float(seconds[well].mean()),
+        "lost by then": float(np.where(before, lost, 0.0).sum(axis=0)[well].mean()),
+        "lost afterwards": float(np.where(before, 0.0, lost).sum(axis=0)[well].mean()),
+        "episodes without": float((~well).sum()),
+    }
+
+
+def upright(played: Played) -> dict[str, float]:
+    """Measure how soon the bar is up."""
+    return arrival("upright", played)
+
+
+def kept_up(played: Played) -> dict[str, float]:
+    """Measure how often the bar is balanced to the end."""
+    return {"episodes that last 10 s [%]": 100.0 * float((played.steps == played.task.limit).mean())}
+
+
+def parked(unit: str, size: float) -> Callable[[Played], dict[str, float]]:
+    """Return what measures how soon a place is reached for good, and how far off an episode ends."""
+
+    def measure(played: Played) -> dict[str, float]:
+        off = size * np.abs(played.states[-1][:, 0] - played.targets)
+        return arrival("there", played) | {f"off at the end [{unit}], median": float(np.median(off))}
+
+    return measure
+
+
+def crossed(played: Played) -> dict[str, float]:
+    """Measure when and how fast the line is crossed."""
+    task: Any = played.task
+    each = np.arange(len(played.steps))
+    x, v = played.states[played.steps - 1, each].T
+    k = task.constants()
+    control = task.limit_control * (0.5 + 0.5 * played.actions[played.steps - 1, each])
+    force = Pull(k["pull"], k["drag"] + k["brake"] * control)
+    with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches that are not taken
+        time = crossing_time(x, v, force, task.dt, np)
+    speed = v + force.pull * time + force.drag * x
+    low, middle, high = np.quantile(speed, [0.05, 0.5, 0.95])
+    return {
+        "across after [s]": float(np.mean((played.steps - 1) * task.dt + time)),
+        "speed there, lowest twentieth [m/s]": float(low),
+        "median [m/s]": float(middle),
+        "highest twentieth [m/s]": float(high),
+        "price of the speed": task.price * float(np.maximum(speed - task.gentle, 0.0).mean()),
+    }
+
+
+def pumped(played: Played) -> dict[str, float]:
+    """Measure how soon the wanted energy is reached."""
+    return arrival("within 20 % of the energy", played)
+
+
+def calmed(played: Played) -> dict[str, float]:
+    """Measure how much of the time the cylinder is near rest, and nearer."""
+    theta, rate = played.states[1:, :, 0], played.states[1:, :, 1]
+    distance = np.hypot(theta, rate / np.sqrt(played.task.constants()["weight"]))
+    going_on = np.arange(len(theta))[:, None] < played.steps
+    shares = {size: 100.0 * float((distance[going_on] <= size).mean()) for size in (0.1, 0.01)}
+    return {f"time within {size:g} of rest [%]": share for size, share in shares.items()}
+
+
+MEASURES: dict[str, Callable[[Played], dict[str, float]]] = {
+    "PivotedBar-v0": upright,
+    "PivotedBarFree-v0": upright,
+    "PivotedBarBalance-v0": kept_up,
+    "InclineTilt-v0": parked("mm", 1e3),
+    "InclineBrake-v0": crossed,
+    "CylinderInCylinderTilt-v0": parked("mrad", 1e3),
+    "CylinderInCylinderPump-v0": pumped,
+    "CylinderInCylinderDamping-v0": calmed,
+}
+
+
+def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, list[Any]]]:
+    """Yield our quick agents of an environment: name, and policies, one for each training seed."""
+    task = make_task(env_id)
+    for name, make in CONTROLLERS[env_id].items():
+        if name not in LEFT_OUT:
+            yield name, [make(task)]
+    for folder in sorted(submissions.glob(f"{env_id}-*")):
+        found = load(folder)
+        if found.kind == "learned" and list(found.authors) == AUTHORS:
+            yield found.name.lower(), [policy.agent() for _, policy in found.policies]
+
+
+def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float]]]:
+    """Return what is measured of an environment's agents: by agent and measure a number for each policy."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for name, policies in agents(env_id):
+        rows = [MEASURES[env_id](play(env_id, policy, episodes)) for policy in policies]
+        found[name] = {key: [row[key] for row in rows] for key in rows[0]}
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, or 2 for a user's mistake."""
+    p = argparse.ArgumentParser(prog="python -m agents.behaviour", description=__doc__)
+    p.add_argument("env", nargs="*", metavar="ID", help="print those of some environments, and write nothing")
+    args = p.parse_args(arguments)
+    try:
+        envs = [check_env(name) for name in args.env] or list(TASKS)
+    except UserError as error:
+        print(f"agents.behaviour: error: {error}", file=sys.stderr)
+        return 2
+    found: dict[str, Any] = {}
+    for env_id in envs:
+        found[env_id] = rounded(measured(env_id))
+        for name, measures in found[env_id].items():
+            print(
+                env_id,
+                name,
+                *(f"{key}: {values}" for key, values in measures.items()),
+                sep="\n  ",
+                flush=True,
+            )
+    if not args.env:
+        write(OUTPUT, to_json({"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED, "envs": found}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

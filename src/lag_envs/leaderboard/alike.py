@@ -1,0 +1,217 @@
+"""Find policies that act alike, however their numbers differ.
+
+Both play the same episodes, which follow from the nonce. Each is also asked, at the states on the other's
+path, what it would do there. Two policies are alike if the root mean square of the differences is below
+`ACTIONS` for the clipped actions at the states on both paths, or below `RETURNS` standard errors of a mean
+return for the returns of the episodes.
+
+Noise of 1e-4 on all numbers of our networks moves their actions by up to 4e-3; the closest two of our
+policies that were made separately are 1.4e-2 apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.policies import Policy
+from lag_envs.leaderboard.submission import Refused, Submission
+from lag_envs.leaderboard.verify import act, play
+
+Array = NDArray[Any]
+
+#: Episodes that both play, and states on a path at which a policy without memory is asked.
+EPISODES, STATES = 16, 1024
+#: Below which differences two policies are alike: of actions in [-1, 1], of returns in standard errors.
+ACTIONS, RETURNS = 7e-3, 0.1
+#: Below which difference of actions two policies of one learner are the same training.
+TWINS = 1e-3
+
+
+class Distance(NamedTuple):
+    """How far apart two policies are: of actions (rms), and of returns (rms, in standard errors)."""
+
+    actions: float
+    returns: float
+
+    @property
+    def closeness(self) -> float:
+        """Below 1 for policies that are alike."""
+        return min(self.actions / ACTIONS, self.returns / RETURNS)
+
+
+#: Of one that fails, in place of infinity, which JSON does not have.
+FAR = Distance(2.0, 1e9)
+
+
+@dataclass
+class Track:
+    """Where a policy went in the common episodes, and what it did and got.
+
+    Parameters
+    ----------
+    policy : Policy
+        The policy.
+    observations : ndarray, shape (steps, episodes, n)
+        What it saw.
+    actions : ndarray, shape (steps, episodes)
+        What it did.
+    running : ndarray of bool, shape (steps, episodes)
+        Which episodes had not ended.
+    returns : ndarray, shape (episodes,)
+        What it got.
+    quick : bool
+        Whether it has no memory, so that it can be asked at many states at once.
+    """
+
+    policy: Policy
+    observations: Array
+    actions: Array
+    running: Array
+    returns: Array
+    quick: bool
+
+    def asked(self, other: Track) -> float:
+        """Return the mean square of how another's actions differ on this path, the largest where it fails."""
+        agent = other.policy.agent()
+        start = np.ones(len(self.returns), np.bool_)
+        try:
+            if other.quick:
+                return self._asked_at_once(agent)
+            action, state = act(agent, self.observations[0], None, start)
+            total = float(np.sum((action[:, 0] - self.actions[0]) ** 2))
+            for step in range(1, len(self.actions)):
+                action, state = act(agent, self.observations[step], state, np.zeros_like(start))
+                off = np.where(self.running[step], action[:, 0] - self.actions[step], 0.0)
+                total += float(np.sum(off * off))
+        except Refused:
+            return FAR.actions**2
+        return total / float(self.running.sum())
+
+    def _asked_at_once(self, agent: Any) -> float:
+        where = np.flatnonzero(self.running.ravel())
+        # Evenly over all times and episodes; which episodes these are follows from the nonce.
+        where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
+        seen = self.observations.reshape(-1, self.observations.shape[-1])[where]
+        action, _ = act(agent, seen, None, np.ones(len(seen), np.bool_))
+        off = action[:, 0].astype(np.float64) - self.actions.ravel()[where]
+        return float(np.mean(off * off))
+
+
+def track(env_id: str, policy: Policy, nonce: str) -> Track:
+    """Let a policy play the episodes that follow from a nonce; raise Refused where it fails."""
+    first = protocol.first_seed(f"alike {env_id}", nonce, 0)
+    watched = _Watched(policy.agent())
+    returns = play(env_id, watched, range(first, first + EPISODES), watch=watched.watch)
+    seen, done = np.array(watched.seen), np.array(watched.done, np.float64)
+    return Track(policy, seen, done, np.array(watched.running), returns, watched.quick)
+
+
+class _Watched:
+    """An agent, and note of what it sees and does."""
+
+    def __init__(self, agent: Any) -> None:
+        self.agent, self.quick = agent, True
+        self.seen: list[Array] = []
+        self.done: list[Array] = []
+        self.running: list[Array] = []
+
+    def predict(self, observation: Any, state: Any, start: Any, deterministic: bool) -> tuple[Any, Any]:
+        action, state = self.agent.predict(observation, state, start, deterministic=deterministic)
+        self.quick &= state is None
+        self.seen.append(np.array(observation))
+        self.done.append(action[:, 0].copy())
+        return action, state
+
+    def watch(self, bare: Any, action: Array, reward: Array, *ends: Array) -> None:
+        if len(action):
+            self.running.append(ends[-1].copy())
+
+
+def distance(a: Track, b: Track, error: float) -> Distance:
+    """Return how far apart two policies are, in actions at least so far where that is too far.
+
+    Parameters
+    ----------
+    a, b : Track
+        Their tracks in the same episodes.
+    error : float
+        Standard error of a mean return on their board.
+    """
+    off = float(np.sqrt(np.mean((a.returns - b.returns) ** 2)))
+    returns = min(off / error, FAR.returns) if error > 0.0 else FAR.returns * (off > 0.0)
+    # First the one that is asked at once: the other may be slow.
+    first, second = (a, b) if b.quick else (b, a)
+    actions = 0.5 * first.asked(second)
+    if actions < ACTIONS**2:
+        actions += 0.5 * second.asked(first)
+    return Distance(math.sqrt(actions), returns)
+
+
+class Likeness:
+    """Compares submissions to one environment in the episodes that follow from one nonce.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    nonce : str
+        The nonce.
+    """
+
+    def __init__(self, env_id: str, nonce: str) -> None:
+        self.env_id, self.nonce = env_id, nonce
+        self._tracks: dict[str, list[Track | None]] = {}
+
+    def tracks(self, submission: Submission) -> list[Track | None]:
+        """Return the tracks of a submission's policies, None for one that fails."""
+        if submission.digest not in self._tracks:
+            found: list[Track | None] = []
+            for _, policy in submission.policies:
+                try:
+                    found.append(track(self.env_id, policy, self.nonce))
+                except Refused:
+                    found.append(None)
+            self._tracks[submission.digest] = found
+        return self._tracks[submission.digest]
+
+    def __call__(self, newer: Submission, older: Submission, error: float) -> Distance:
+        """Return how far a submission is from an older one: half of its policies are so near, or nearer.
+
+        Parameters
+        ----------
+        newer, older : Submission
+            The submissions.
+        error : float
+            Standard error of a policy's mean return on their board.
+        """
+        ours, theirs = self.tracks(newer), self.tracks(older)
+        nearest = [
+            min(
+                (distance(a, b, error) if a and b else FAR for b in theirs),
+                key=lambda found: found.closeness,
+            )
+            for a in ours
+        ]
+        return sorted(nearest, key=lambda found: found.closeness)[(len(nearest) - 1) // 2]
+
+
+def check_twins(submission: Submission, nonce: str) -> None:
+    """Raise Refused where two policies of a learner act the same, so that one was made from the other."""
+    if submission.kind != "learned":
+        return
+    tracks = [track(submission.env, policy, nonce) for _, policy in submission.policies]
+    seeds = [seed for seed, _ in submission.policies]
+    for i, one in enumerate(tracks):
+        for j in range(i):
+            off = math.sqrt(0.5 * (one.asked(tracks[j]) + tracks[j].asked(one)))
+            if off < TWINS:
+                raise Refused(
+                    f"the policies of seeds {seeds[j]} and {seeds[i]} act the same: their actions differ by"
+                    f" {off:.1e}; each needs its own training"
+                )

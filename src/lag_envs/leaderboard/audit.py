@@ -1,0 +1,619 @@
+"""Hold a board against itself: all on it must be what was noted when it came to be there.
+
+What is cheap (`sound`) is checked wherever the board is shown: the log's chain, the release's pin, the log in
+earlier commits, each submission against its digest and the log, each result against its hash and what it
+says of itself. `audit` adds what takes time: each nonce against its public source, and results against the
+submissions, by playing episodes again.
+
+What cannot be found: a history that was written anew as a whole, commits and all, where nobody has an older
+copy, a release or its pin to hold against it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import re
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, TypeAdapter
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.board import Board, Neighbours, claimed, others, shown_episodes
+from lag_envs.leaderboard.fields import plain, shown
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.log import (
+    COMMIT,
+    LOG,
+    MOST,
+    REMEDY,
+    Added,
+    BoardError,
+    Entry,
+    Hash,
+    Line,
+    Protocol,
+    State,
+    Strict,
+    checked,
+    fold,
+    load_json,
+    parse,
+    read_log,
+)
+from lag_envs.leaderboard.results import apart, build, compare
+
+if TYPE_CHECKING:
+    from lag_envs.leaderboard.submission import About
+
+#: What a release knows of the repository's board.
+PIN = Path(__file__).with_name("pin.json")
+#: Episodes of each policy that `audit` plays again.
+SAMPLE = 4
+#: Episodes of each reference that it plays, and how many standard errors their mean may be off.
+REFERENCE_EPISODES, SIGMAS = 8192, 5.0
+
+Results = dict[tuple[int, str], dict[str, Any]]
+
+
+class Pin(Strict):
+    """The head of a log's chain: the hash of its first line, and of its first so many lines."""
+
+    board: Hash
+    lines: Annotated[int, Field(ge=1)]
+    head: Hash
+
+
+@dataclass
+class Finding:
+    """What a check found: what is as it should be, and what is not."""
+
+    name: str
+    told: str = ""
+    wrong: list[str] = field(default_factory=list)
+    #: Why it could not be made, and who could make it.
+    open: str = ""
+
+
+# --- what is cheap ------------------------------------------------------------------------------------------
+
+
+def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
+    """Return a board's state and all its results, by protocol and id, where all that is cheap holds.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    pin : Path, optional
+        What to hold the log against; by default the release's own, if it is of this board.
+
+    Raises
+    ------
+    BoardError
+        For the first thing that does not; the text names the line and the remedy.
+    """
+    found = cheap(board, pin)
+    wrong = [text for finding in found.findings for text in finding.wrong]
+    if wrong:
+        more = f" ({len(wrong) - 1} more: `lag-envs leaderboard audit` tells all)" if wrong[1:] else ""
+        raise BoardError(wrong[0] + more)
+    return found.state, found.results
+
+
+@dataclass
+class Cheap:
+    """What the cheap checks found, and what they read."""
+
+    findings: list[Finding]
+    log: bytes = b""
+    lines: list[Line] = field(default_factory=list)
+    state: State = field(default_factory=State)
+    results: Results = field(default_factory=dict)
+    #: What the submissions say of themselves, by id.
+    abouts: dict[str, About] = field(default_factory=dict)
+
+    def chained(self, number: int) -> bool:
+        """Tell whether a line of the log holds the hash of what is before it."""
+        return any(line.number == number and line.event.prev is not None for line in self.lines)
+
+
+def cheap(board: Board, pin: Path | None = None) -> Cheap:
+    """Make all checks that take no time."""
+    chain = Finding("log")
+    found = Cheap([chain])
+    try:
+        found.log = read_log(board.log)
+        found.lines, torn = parse(found.log)
+        found.state = fold(found.lines)
+    except BoardError as error:
+        chain.wrong.append(f"{board.folder}: {error}")
+        return found
+    whole = found.log[: len(found.log) - len(torn)]
+    chained = [line.number for line in found.lines if line.event.prev is not None]
+    chain.told = f"{len(found.lines)} events" + (f", a chain from line {chained[0]} on" if chained else "")
+    if whole:
+        chain.told += f", head {hashlib.sha256(whole).hexdigest()}"
+    if torn:
+        chain.told += "; a last line is torn off, the next to write removes it"
+    found.findings += [
+        _pinned(board, whole, pin),
+        _history(board, whole),
+        _submissions(board, found),
+    ]
+    found.findings.append(_results(board, found))
+    return found
+
+
+def pin_of(log: bytes) -> Pin:
+    """Return what a release is to know of a log."""
+    first = hashlib.sha256(log[: log.index(b"\n") + 1]).hexdigest()
+    return Pin(board=first, lines=log.count(b"\n"), head=hashlib.sha256(log).hexdigest())
+
+
+def write_pin(board: Board, file: Path) -> Pin:
+    """Write a file that pins a board's log as it is; raise a BoardError where it is not sound."""
+    sound(board)
+    log = read_log(board.log)
+    log = log[: log.rfind(b"\n") + 1]
+    if not log:
+        raise BoardError(f"{board.log} is empty; there is nothing to pin")
+    pin = pin_of(log)
+    file.write_text(json.dumps(pin.model_dump(), indent=2) + "\n", encoding="utf-8")
+    return pin
+
+
+def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
+    """Hold the log against a pin; against that of the release only if it is of the same board."""
+    found = Finding("pin")
+    path = file or PIN
+    try:
+        pin = checked(TypeAdapter(Pin), load_json(read_plain(path, MOST)))
+    except FileNotFoundError:
+        if file is not None:
+            found.wrong.append(f"{path} is missing")
+        found.open = "there is none"
+        return found
+    except (OSError, ValueError) as error:
+        found.wrong.append(f"{path} is no pin: {error}; {REMEDY}")
+        return found
+    lines = log.split(b"\n")
+    if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:
+        found.open = "this is not the board that this release knows: the log's first line is another"
+        return found
+    begun = b"\n".join(lines[: pin.lines]) + b"\n"
+    if len(lines) <= pin.lines:
+        found.wrong.append(
+            f"{board.log} has {len(lines) - 1} lines, {path} pins {pin.lines}: some were removed; {REMEDY}"
+        )
+    elif hashlib.sha256(begun).hexdigest() != pin.head:
+        found.wrong.append(
+            f"{board.log} is not what {path} pins: a line up to {pin.lines} was changed; {REMEDY}"
+        )
+    else:
+        found.told = f"the first {pin.lines} lines are those that {path.name} pins"
+    return found
+
+
+def _submissions(board: Board, found: Cheap) -> Finding:
+    """Hold each submission's files against what the log says of them."""
+    from lag_envs.leaderboard.submission import Refused, about, read_files
+
+    finding = Finding("submissions")
+    entries = {entry.id: entry for entry in found.state.all}
+    for entry in entries.values():
+        folder = board.submission(entry.id)
+        where = f"{board.log}, line {entry.line}: {folder}"
+        try:
+            told = about(read_files(folder))
+        except Refused as error:
+            finding.wrong.append(f"{where} is not what was added: {error}; {REMEDY}")
+            continue
+        if told.digest != entry.digest:
+            ours, theirs = entry.digest[:8], told.digest[:8]
+            finding.wrong.append(
+                f"{where} is not what was added: its digest is {theirs}..., not {ours}...; {REMEDY}"
+            )
+            continue
+        found.abouts[entry.id] = told
+        for name in ("env", "name", "authors", "kind"):
+            if (noted := getattr(entry, name)) != (said := getattr(told, name)):
+                finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")
+    finding.told = f"{len(entries)} are what was added"
+    return finding
+
+
+def _results(board: Board, found: Cheap) -> Finding:
+    """Hold each result against the log, the submission, and itself."""
+    finding = Finding("results")
+    for entry in found.state.all:
+        if not entry.sha256:
+            continue
+        try:
+            result = board.result(entry)
+        except BoardError as error:
+            finding.wrong.append(f"{board.log}, line {_verified_at(found, entry)}: {error}")
+            continue
+        where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
+        odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        # Of the time before there was a chain.
+        if result.get("build") is None and found.chained(_verified_at(found, entry)):
+            odd.append(f"{where} does not say with which build it was made; {REMEDY}")
+        finding.wrong += odd
+        if not odd:
+            found.results[entry.protocol, entry.id] = result
+    finding.told = f"{len(found.results)} are what was verified"
+    return finding
+
+
+def _verified_at(found: Cheap, entry: Entry) -> int:
+    """Return the line that says that an entry was verified."""
+    return next(
+        line.number
+        for line in found.lines
+        if line.event.event == "verified" and line.event.id == entry.id and line.number > entry.since
+    )
+
+
+def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what a result says that it cannot."""
+    for name in ("env", "digest", "nonce"):
+        if result[name] != getattr(entry, name):
+            yield f"is of {name} {shown(result[name])}, not {shown(getattr(entry, name))}"
+    if (told := found.state.protocols.get(entry.protocol)) is not None:
+        if result["episodes"] != told.rules.episodes:
+            yield f"has {result['episodes']} episodes, not {told.rules.episodes}"
+        wanted = entry.env in told.references
+        if any((policy.get("reference") is not None) != wanted for policy in result["policies"]):
+            yield f"{'lacks' if wanted else 'has'} the returns of a reference"
+    if (submission := found.abouts.get(entry.id)) is not None:  # otherwise that is told already
+        if tuple(policy["seed"] for policy in result["policies"]) != submission.seeds:
+            yield "has other policies than the submission"
+        if result.get("claimed") != claimed(submission):
+            yield "does not repeat what the submission says of itself"
+    middle, chosen = shown_episodes(result)
+    first = protocol.first_seed(entry.digest, entry.nonce, middle)
+    returns = result["policies"][middle]["returns"]
+    recorded = {replay["label"]: replay for replay in result["replays"]}
+    seeds = {label: replay["reset_seed"] - first for label, replay in recorded.items()}
+    if seeds != chosen or len(result["replays"]) > len(seeds):
+        yield "has recorded other episodes than the median, the best and the worst"
+    elif result.get("build") is not None:  # before, those of random actions were drawn anew
+        for label, i in chosen.items():
+            if abs(recorded[label]["return"] - returns[i]) > 1e-3 * max(1.0, abs(returns[i])):
+                yield f"has recorded another {label} episode than was verified"
+
+
+# --- the repository -----------------------------------------------------------------------------------------
+
+
+class NoHistory(Exception):
+    """There is no history to look at; the text says why."""
+
+
+def git(folder: Path, *arguments: str) -> bytes:
+    """Return what git says in a folder; raise NoHistory where it fails, or is missing."""
+    # Nothing of the caller's repository, and no replaced objects.
+    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    env |= {"GIT_NO_REPLACE_OBJECTS": "1", "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"}
+    try:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, check=True, capture_output=True, env=env, timeout=60).stdout
+    except FileNotFoundError:
+        raise NoHistory("git is not installed") from None
+    except subprocess.TimeoutExpired:
+        raise NoHistory("git takes more than a minute") from None
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip().split("\n")[0]
+        raise NoHistory(f"git says {shown(said)}") from None
+
+
+def log_at(folder: Path, commit: str) -> bytes:
+    """Return the log in a commit; nothing where it has none."""
+    name = f"{commit}:./{LOG}"
+    try:
+        return git(folder, "cat-file", "blob", name)
+    except NoHistory:
+        git(folder, "cat-file", "-e", f"{commit}^{{commit}}")  # otherwise the commit itself is missing
+        return b""
+
+
+def _history(board: Board, log: bytes) -> Finding:
+    """Hold the log against itself in earlier commits, which must have the beginning of today's."""
+    found = Finding("history")
+    folder = board.folder
+    try:
+        listed = ["log", "--full-history", "--format=%H"]
+        ours = git(folder, *listed, "HEAD", "--", f"./{LOG}").decode().split()
+        tagged = git(folder, *listed, "HEAD", "--tags", "--", f"./{LOG}").decode().split()
+        if not tagged:
+            raise NoHistory("no commit holds the board")
+        before = 0
+        for commit in tagged:
+            then = log_at(folder, commit)
+            # A release may be later than what is checked out.
+            if log.startswith(then) or (commit not in ours and then.startswith(log)):
+                continue
+            if b'"prev"' not in then:
+                before += 1  # a board that was begun again, before there was a chain
+                continue
+            odd = next(i for i, (a, b) in enumerate(_pairs(then, log), 1) if a != b)
+            found.wrong.append(
+                f"{board.log}, line {odd} is not what it was in commit {commit[:10]}: a log only"
+                f" ever grows; `git checkout {commit[:10]} -- {board.log}` restores it"
+            )
+        found.told = f"{len(tagged) - before} earlier versions are the beginning of this one"
+        if before:
+            found.told += f"; {before} are of boards that were begun again before there was a chain"
+        if git(folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
+            found.told += "; the clone is shallow, so there may be more"
+    except NoHistory as error:
+        found.open = str(error)
+    return found
+
+
+def _pairs(then: bytes, now: bytes) -> Iterator[tuple[bytes | None, bytes | None]]:
+    a, b = then.split(b"\n")[:-1], now.split(b"\n")[:-1]
+    for i in range(max(len(a), len(b))):
+        yield (a[i] if i < len(a) else None), (b[i] if i < len(b) else None)
+
+
+def head_of(board: Board) -> str:
+    """Return the commit that is checked out, which has to hold the log as it is.
+
+    Raises
+    ------
+    BoardError
+        Where it does not, or there is none.
+    """
+    try:
+        commit = git(board.folder, "rev-parse", "--verify", "HEAD^{commit}").decode().strip()
+        then = log_at(board.folder, commit)
+    except NoHistory as error:
+        raise BoardError(
+            f"no commit holds the board ({error}); name a nonce and, with --source, where anybody finds it"
+        ) from None
+    if then != read_log(board.log):
+        raise BoardError("the board has changed since the last commit; commit and push first")
+    return commit
+
+
+def _nonces(board: Board, found: Cheap) -> Finding:
+    """Hold each nonce against its source: a commit must have held all that it decides, and be in history."""
+    finding = Finding("nonces")
+    held, elsewhere = 0, []
+    for number, value, source in found.state.nonces:
+        where = f"{board.log}, line {number}: the nonce {shown(value)}"
+        if source not in ("", COMMIT):
+            elsewhere.append(f"line {number}: {value} by {source}")
+            continue
+        if not re.fullmatch(r"[0-9a-f]{40}([0-9a-f]{24})?", value):
+            finding.wrong.append(
+                f"{where} names no public source, so it may have been chosen; withdraw what was verified"
+                " with it"
+            )
+            continue
+        try:
+            if git(board.folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
+                raise NoHistory("the clone is shallow")
+        except NoHistory as error:
+            finding.open = str(error)
+            continue
+        try:
+            git(board.folder, "merge-base", "--is-ancestor", value, "HEAD")
+            then = log_at(board.folder, value)
+        except NoHistory:
+            finding.wrong.append(
+                f"{where} is no commit in the history of what is checked out; fetch the whole history, or"
+                " withdraw what was verified with it"
+            )
+            continue
+        lines = then.count(b"\n")
+        decided = [
+            line.number
+            for line in found.lines
+            if lines < line.number < number and isinstance(line.event, Added | Protocol)
+        ]
+        if lines >= number or not found.log.startswith(then):
+            finding.wrong.append(f"{where} is of a commit that held another log; {REMEDY}")
+        elif decided:
+            finding.wrong.append(
+                f"{where} is of a commit that was there before line {decided[0]}, which it decides: it"
+                " was known; withdraw what was added by then"
+            )
+        else:
+            held += 1
+    finding.told = f"{held} are commits that held all they decide"
+    if elsewhere:
+        finding.told += "; to be held against their sources: " + ", ".join(elsewhere)
+    return finding
+
+
+# --- what takes time ----------------------------------------------------------------------------------------
+
+
+def audit(
+    board: Board,
+    pin: Path | None = None,
+    everything: bool = False,
+    tell: Callable[[Finding], Any] = lambda finding: None,
+    progress: Callable[[Entry], Any] = lambda entry: None,
+) -> bool:
+    """Make all checks, and return whether nothing is wrong.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    pin : Path, optional
+        What to hold the log against; by default the release's own, if it is of this board.
+    everything : bool
+        Whether to verify every result anew, as a whole, and to compare all submissions with each other. By
+        default `SAMPLE` episodes of each policy are played again, and those that were recorded.
+    tell : callable
+        Told each finding.
+    progress : callable
+        Told each entry before its result is looked at.
+    """
+    found = cheap(board, pin)
+    findings = list(found.findings)
+    for finding in findings:
+        tell(finding)
+    if not found.findings[0].wrong:
+        scores = partial(_all if everything else _sample, board, found, progress)
+        for check in (partial(_nonces, board, found), scores):
+            finding = check()
+            findings.append(finding)
+            tell(finding)
+    return not any(finding.wrong for finding in findings)
+
+
+def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any], float, str]]:
+    """Yield what can be verified again: entry, result, way from random to best, and where messages point."""
+    for (number, id), result in found.results.items():
+        entry = found.state.boards[number][id]
+        told = found.state.protocols.get(number)
+        scale = told.scales.get(entry.env) if told else None
+        if told is None or scale is None or told.rules.model_dump() != protocol.rules():
+            continue
+        where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
+        yield entry, result, scale.best - scale.random, where
+
+
+def _load(board: Board, entry: Entry) -> Any:
+    from lag_envs.leaderboard.submission import Refused, load
+
+    try:
+        submission = load(board.submission(entry.id))
+    except Refused:
+        return None
+    return submission if submission.digest == entry.digest else None  # otherwise that is told already
+
+
+def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
+    """Play some episodes of each policy again, which nobody can foresee, and those that were recorded."""
+    from lag_envs.leaderboard.submission import Refused
+    from lag_envs.leaderboard.verify import replay
+
+    finding, draw, played, results = Finding("scores"), random.SystemRandom(), 0, 0
+    for entry, result, way, where in _playable(board, found):
+        progress(entry)
+        if (submission := _load(board, entry)) is None:
+            continue
+        middle, recorded = shown_episodes(result)
+        odd: list[str] = []
+        # On another build, one of so few may be another episode altogether.
+        tolerated = int(result.get("build") != build())
+        for number, policy in enumerate(result["policies"]):
+            chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
+            if number == middle:
+                chosen += [i for i in recorded.values() if i not in chosen]
+            try:
+                again, episodes = replay(submission, dict(result), number, chosen)
+            except Refused as error:
+                odd.append(f"a policy that {error}")
+                continue
+            played += len(chosen)
+            kept = {
+                name: [values[i] for i in chosen] if isinstance(values, list) else values
+                for name, values in policy.items()
+            }
+            odd += [
+                f"other {name} than episodes {chosen} of seed {policy['seed']} have"
+                for name, share in apart(kept, again, way).items()
+                if round(share * len(chosen)) > tolerated
+            ]
+            if number == middle and result.get("build") is not None:
+                made = {episode["reset_seed"]: episode for episode in episodes}
+                odd += [
+                    f"another recorded episode ({told['label']}) than is played"
+                    for told in result["replays"]
+                    if not _same_episode(told, made[told["reset_seed"]])
+                ][tolerated:]
+        results += 1
+        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} anew" for what in odd]
+    finding.told = f"{played} episodes of {results} results were played again"
+    return finding
+
+
+def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
+    """Tell whether a recorded episode is one that was made again, to the digits in which it was recorded."""
+    if any(len(kept[name]) != len(made[name]) for name in ("states", "actions", "rewards")):
+        return False
+    if any(kept[name] != made[name] for name in ("seed", "reset_seed", "dt", "target")):
+        return False
+    rows = [*zip(kept["states"], made["states"], strict=True)]
+    rows += [(kept[name], made[name]) for name in ("actions", "rewards")]
+    rows.append(([kept["return"]], [made["return"]]))
+    return all(abs(x - y) <= 1e-3 * max(1.0, abs(y)) for a, b in rows for x, y in zip(a, b, strict=True))
+
+
+def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
+    """Verify every result anew, compare all submissions, and play the references."""
+    from lag_envs.leaderboard.submission import Refused
+    from lag_envs.leaderboard.verify import verify
+
+    finding, same, bits = Finding("scores"), 0, 0
+    for entry, result, way, where in _playable(board, found):
+        progress(entry)
+        if (submission := _load(board, entry)) is None:
+            continue
+        try:
+            again = verify(submission, entry.nonce, result["episodes"])
+            compared = compare(result, again, way)
+        except (Refused, ValueError) as error:
+            finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
+            continue
+        finding.wrong += [f"{where} differs in {what}; verify {entry.id} anew" for what in compared.far]
+        same, bits = same + (not compared.far), bits + compared.same
+    finding.told = f"{same} results are what the submissions get, {bits} of them to the bit"
+    for what in (*_links(board, found), *_references(found)):
+        finding.wrong.append(what)
+    return finding
+
+
+def _links(board: Board, found: Cheap) -> Iterator[str]:
+    """Yield what acts alike and is not noted, or is noted and does not."""
+    neighbours = Neighbours(board)
+    for entry in found.state.entries.values():
+        if (entry.protocol, entry.id) not in found.results:
+            continue
+        # It was compared with what had been verified by then.
+        line = _verified_at(found, entry)
+        noted = {like.id: like for like in entry.alike}
+        for other in others(found.state, entry):
+            if _verified_at(found, other) > line:
+                continue
+            near = neighbours.alike(entry, found.results[entry.protocol, entry.id], other)
+            if (near is None) != (other.id not in noted):
+                how = "unlike" if near is None else "alike"
+                yield (
+                    f"{board.log}, line {line}: {entry.id} and {other.id} act {how}, which is not what is"
+                    f" noted; {REMEDY}"
+                )
+
+
+def _references(found: Cheap) -> Iterator[str]:
+    """Yield what is stated of a reference's mean and is not what it gets."""
+    from lag_envs.controllers import make_controller
+    from lag_envs.leaderboard.verify import play
+
+    told = found.state.protocols.get(found.state.number)
+    for env_id, reference in (told.references if told else {}).items():
+        first = 2**50 + random.SystemRandom().randrange(2**40)
+        returns = play(
+            env_id, make_controller(env_id, reference.controller), range(first, first + REFERENCE_EPISODES)
+        )
+        error = (returns.std() ** 2 / len(returns) + reference.error**2) ** 0.5
+        if abs(returns.mean() - reference.mean) > SIGMAS * error:
+            yield (
+                f"{LOG}: {reference.controller} gets {returns.mean():.6g} ± {error:.2g} in {env_id}, not"
+                f" {reference.mean:.6g}; `lag-envs leaderboard open` begins a protocol with the right mean"
+            )

@@ -1,0 +1,49 @@
+"""Read files that somebody else may have put there: plain ones only, and no more of them than fits."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+
+def read_plain(path: Path, most: int) -> bytes:
+    """Return a file's content.
+
+    Nothing but a plain file is read: a pipe would wait for ever, a device would never end, and a link may
+    lead anywhere.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    most : int
+        Bytes that are accepted.
+
+    Raises
+    ------
+    FileNotFoundError
+        Where there is none.
+    OSError
+        Where it is no plain file, is larger, or cannot be read.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        file = os.open(path, flags | getattr(os, "O_BINARY", 0))
+    except OSError as error:
+        # What O_NOFOLLOW says of a link, and Linux of a socket.
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise _not_plain() from None
+        raise
+    with os.fdopen(file, "rb") as opened:
+        if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
+            raise _not_plain()
+        content = opened.read(most + 1)
+    if len(content) > most:
+        raise OSError(errno.EFBIG, f"it has more than the {most:,} bytes that are accepted")
+    return content
+
+
+def _not_plain() -> OSError:
+    return OSError(errno.EINVAL, "it is no plain file; links, pipes, folders and devices are not read")

@@ -1,0 +1,272 @@
+"""What a verification found, as it is kept: its schema, and how two of them compare."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, TypeAdapter, model_validator
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.fields import plain
+from lag_envs.leaderboard.log import EnvId, Hash, Number, Strict, Text, checked, load_json
+
+#: Bytes of a result, packed and unpacked.
+PACKED, UNPACKED = 2**25, 2**28
+Count = Annotated[int, Field(ge=0, le=2**63)]
+
+
+class PolicyResult(Strict):
+    """A policy's episodes, in the order of their seeds."""
+
+    seed: Count
+    returns: list[Number]
+    success: list[bool]
+    settle: list[Number | None]
+    effort: list[Number]
+    trajectory: Hash
+    reference: list[Number] | None = None
+
+
+class Replay(Strict):
+    """A recorded episode."""
+
+    label: Literal["median", "best", "worst"]
+    seed: Count
+    reset_seed: Count
+    return_: Number = Field(alias="return")
+    dt: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    states: Annotated[list[list[Number]], Field(min_length=1, max_length=100_000)]
+    actions: list[Number]
+    rewards: list[Number]
+    target: Number | None
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if not len(self.states) - 1 == len(self.actions) == len(self.rewards):
+            raise ValueError("there must be an action and a reward for each step")
+        return self
+
+
+class Curve(Strict):
+    """A learning curve."""
+
+    seed: Count
+    steps: list[Number]
+    returns: list[Number]
+
+
+class Claimed(Strict):
+    """What a submission says of itself, which nobody verified."""
+
+    code: Text | None
+    license: Text
+    description: Text
+    env_steps: Number | None
+    seconds: Number | None
+    hardware: Text | None
+    curves: list[Curve]
+
+
+class Result(Strict):
+    """What `verify` returns; on a board with `claimed` and `replays`."""
+
+    protocol: Count | None = None  # of old results; the log has it
+    env: EnvId
+    digest: Hash
+    nonce: str
+    episodes: Annotated[int, Field(ge=1, le=10**6)]
+    policies: Annotated[list[PolicyResult], Field(min_length=1, max_length=100)]
+    robustness: dict[Text, list[Number]]
+    often: list[Number | None]
+    seconds: Number
+    machine: dict[str, str | int | None]
+    versions: dict[str, str]
+    build: Hash | None = None
+    claimed: Claimed | None = None
+    replays: list[Replay] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        for policy in self.policies:
+            lists = (policy.returns, policy.success, policy.settle, policy.effort, policy.reference)
+            if any(values is not None and len(values) != self.episodes for values in lists):
+                raise ValueError(f"each policy must have {self.episodes} episodes")
+        conditions: list[list[Any]] = [*self.robustness.values(), [*self.often]]
+        if any(len(means) != len(self.policies) for means in conditions):
+            raise ValueError("each condition must have a mean for each policy")
+        return self
+
+
+_RESULT: TypeAdapter[Result] = TypeAdapter(Result)
+
+
+def check(result: Any) -> dict[str, Any]:
+    """Return a result that is as it should be; raise a ValueError otherwise."""
+    checked(_RESULT, result)
+    return result
+
+
+def unpacked(content: bytes) -> dict[str, Any]:
+    """Return the result that a file holds; raise a ValueError for what is none."""
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(content)) as file:
+            text = file.read(UNPACKED + 1)
+    except (OSError, EOFError, ValueError) as error:
+        raise ValueError(f"it cannot be unpacked: {error}") from None
+    except Exception as error:  # zlib's own
+        raise ValueError(f"it cannot be unpacked: {type(error).__name__}: {error}") from None
+    if len(text) > UNPACKED:
+        raise ValueError(f"it unpacks to more than {UNPACKED:,} bytes")
+    return check(load_json(text))
+
+
+class Axis(Strict):
+    """An axis of a value function: a state's name, and evenly spaced nodes."""
+
+    label: Text
+    low: Number
+    high: Number
+    n: Annotated[int, Field(ge=2, le=1000)]
+
+
+class Value(Strict):
+    """A coarse value function over two entries of the state."""
+
+    axes: Annotated[list[Axis], Field(min_length=2, max_length=2)]
+    values: list[list[Number]]
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        first, second = self.axes
+        if len(self.values) != first.n or any(len(row) != second.n for row in self.values):
+            raise ValueError(f"there must be {first.n} rows of {second.n} values")
+        return self
+
+
+_VALUE: TypeAdapter[Value] = TypeAdapter(Value)
+
+
+def checked_value(content: bytes) -> dict[str, Any]:
+    """Return the value function that a file holds; raise a ValueError for what is none."""
+    value = load_json(content)
+    checked(_VALUE, value)
+    return value
+
+
+@cache
+def build() -> str:
+    """Return the SHA-256 of this package's code: of another build, bits may differ."""
+    root, total = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        total.update(f"{path.relative_to(root).as_posix()}\n{len(content)}\n".encode() + content)
+    return total.hexdigest()
+
+
+# --- two of the same ----------------------------------------------------------------------------------------
+
+
+class Comparison(NamedTuple):
+    """How two verifications of the same submission compare.
+
+    Parameters
+    ----------
+    same : bool
+        Whether every action, reward and end was the same, to the bit, and all means under disturbances.
+    build : bool
+        Whether they are of the same build on the same kind of processor, so that they have to be.
+    difference : float
+        The largest difference of a policy's mean return, relative to the way from random to best known.
+    far : list of str
+        What is further apart than it may be, in words; empty where they agree.
+    """
+
+    same: bool
+    build: bool
+    difference: float
+    far: list[str]
+
+
+def compare(result: Mapping[str, Any], other: Mapping[str, Any], way: float) -> Comparison:
+    """Compare two verifications of the same submission with the same nonce and number of episodes.
+
+    Parameters
+    ----------
+    result, other : mapping
+        What `verify` returned.
+    way : float
+        From the mean return of random actions to that of the best policy known.
+
+    Raises
+    ------
+    ValueError
+        Where they are not of the same submission, nonce and episodes.
+    """
+    for name in ("env", "digest", "nonce", "episodes"):
+        if result[name] != other[name]:
+            raise ValueError(f"the results differ in {name}: {result[name]!r} and {other[name]!r}")
+    pairs = list(zip(result["policies"], other["policies"], strict=True))
+    if any(a["seed"] != b["seed"] for a, b in pairs):
+        raise ValueError("the results differ in the policies' seeds")
+    far = []
+    difference = max(abs(np.mean(a["returns"]) - np.mean(b["returns"])) for a, b in pairs) / way
+    if difference > protocol.TOLERANCE:
+        far.append(f"mean returns by {difference:.1e} of the scale")
+    for a, b in pairs:
+        for name, share in apart(a, b, way).items():
+            if share > protocol.APART:
+                far.append(f"the {name} of {share:.1%} of the episodes of seed {a['seed']}")
+    # One episode of a hundred may be another one altogether.
+    few = protocol.TOLERANCE * max(1.0, result["episodes"] / protocol.DISTURBED_EPISODES)
+    conditions = {**result["robustness"], "acting often": result["often"]}
+    others = {**other["robustness"], "acting often": other["often"]}
+    if set(conditions) != set(others):
+        raise ValueError("the results differ in their conditions")
+    for name, means in conditions.items():
+        if not _near(means, others[name], few * way):
+            far.append(f"the means under {plain(name)}")
+    same = all(a["trajectory"] == b["trajectory"] for a, b in pairs)
+    same = same and all(result[name] == other[name] for name in ("robustness", "often"))
+    builds = [
+        (r.get("build"), r["versions"], r["machine"].get("processor"), r["machine"].get("target"))
+        for r in (result, other)
+    ]
+    of_one = result.get("build") is not None and builds[0] == builds[1]
+    if of_one and not same:
+        far.append("the bits, though both are of the same build")
+    return Comparison(same, of_one, float(difference), far)
+
+
+def apart(policy: Mapping[str, Any], other: Mapping[str, Any], way: float) -> dict[str, float]:
+    """Return the share of episodes that differ in their returns, success, times and efforts."""
+
+    def share(name: str, most: float) -> float:
+        a, b = policy.get(name), other.get(name)
+        if a is None or b is None or len(a) != len(b):
+            return float(a is not b)
+        return float(np.mean(~_close(a, b, most)))
+
+    return {
+        "returns": share("returns", protocol.TOLERANCE * way),
+        "reference's returns": share("reference", protocol.TOLERANCE * way),
+        "successes": share("success", 0.0),
+        "times": share("settle", 0.1),
+        "efforts": share("effort", protocol.TOLERANCE),
+    }
+
+
+def _close(a: Sequence[Any], b: Sequence[Any], most: float) -> Any:
+    x, y = (np.array([np.inf if v is None else v for v in values], np.float64) for values in (a, b))
+    with np.errstate(invalid="ignore"):
+        return (x == y) | (np.abs(x - y) <= most)
+
+
+def _near(a: Sequence[float | None], b: Sequence[float | None], most: float) -> bool:
+    return len(a) == len(b) and bool(_close(a, b, most).all())

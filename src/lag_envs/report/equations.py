@@ -1,0 +1,161 @@
+"""Problems as every rival is given them: y' = rate(t, y, p) on generic numbers; arrays of starts.
+
+`Problems` makes them of a scene's cases by the scene's own flow and coefficients, so that all solve the same
+equation. Any other equation will do as well: what a rival needs is an `Equation`, the arrays, and a way
+back from its unknowns to states.
+
+Examples
+--------
+>>> from lag_envs.report.cases import ensemble
+>>> problems = Problems(ensemble("PivotedBar", 3))
+>>> problems.equation.size, problems.y.shape, problems.p.shape
+(2, (4, 3), (3, 3))
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.report.cases import Case
+from lag_envs.report.steppers import METHODS, comparison, explicit, rate
+from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.flows import SLIDE, TURN, pendulum_flow
+
+Array = NDArray[np.float64]
+
+
+class Equation(ABC):
+    """A system of first order; equal ones share compiled code, so they are hashable."""
+
+    size: int  #: number of unknowns
+    lifted: int  #: the same with cosines and sines as unknowns of their own
+    parameters: int  #: numbers that a problem has of its own, held over the time
+
+    @abstractmethod
+    def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
+        """Return y'; where `y` is lifted, no function of `xp` is called."""
+
+    def stepper(self, method: str, carried: bool) -> Callable:
+        """Return ``step(y, p, t, h, xp)`` of one of `METHODS`.
+
+        It takes and returns lifted unknowns; if they are not carried, cosines and sines are left as they are.
+
+        Raises
+        ------
+        ValueError
+            For a method that needs to know more than the rate.
+        """
+        tableau = METHODS[method].tableau
+        if tableau is None:
+            raise ValueError(f"{method} needs more than the rate of {type(self).__name__}")
+
+        def step(y: Sequence, p: Sequence, t: Any, h: Any, xp: Any) -> Sequence:
+            moving = y if carried else y[: self.size]
+            moved = explicit(tableau(), lambda s, y: self.rate(t + s, y, p, xp), moving, h)
+            return [*moved, *y[len(moved) :]]
+
+        return step
+
+
+@dataclass(frozen=True)
+class NormalForm(Equation):
+    """The equation of motion of one of the three flows, with only the terms that are there.
+
+    Parameters
+    ----------
+    kind : type
+        The flow's coefficients. Behind them, `p` has the turning plane's angle at the start.
+    present : tuple of bool
+        Which of the coefficients are not zero.
+    """
+
+    kind: type
+    present: tuple[bool, ...]
+
+    size = 2
+
+    @property
+    def lifted(self) -> int:  # type: ignore[override]
+        """Number of the flow's variables."""
+        return 2 if self.kind is slope.Pull else 4
+
+    @property
+    def parameters(self) -> int:  # type: ignore[override]
+        """Number of coefficients that are there, and the angle."""
+        return sum(self.present) + (self.kind is slope.Turn)
+
+    def coefficients(self, p: Sequence) -> Any:
+        """Return the flow's coefficients; those that are not there are a literal 0.0."""
+        given = iter(p)
+        return self.kind(*(next(given) if there else 0.0 for there in self.present))
+
+    def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
+        """Return (q', v'), and where cosine and sine are among the unknowns, their rates too."""
+        return rate(self.coefficients(p), t, y, xp, p[-1])
+
+    def stepper(self, method: str, carried: bool) -> Callable:
+        """Return any of `METHODS`; all of them take the flow's variables."""
+        step = comparison(method, FLOWS[self.kind], carried).fast
+
+        def move(y: Sequence, p: Sequence, t: Any, h: Any, xp: Any) -> Sequence:
+            k = self.coefficients(p)
+            if self.kind is pendulum.Drive:
+                k = k._replace(delta=k.delta + k.ramp * t)
+            return step(y, k, h, xp)
+
+        return move
+
+
+FLOWS = {pendulum.Drive: pendulum_flow(), slope.Pull: SLIDE, slope.Turn: TURN}
+
+
+class Problems:
+    """Some cases on one kind of scene as arrays, a column for each.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        The problems; each control is held.
+    """
+
+    def __init__(self, cases: Sequence[Case]) -> None:
+        self.cases = list(cases)
+        scene = self.cases[0].scene
+        constants = [case.scene.constants() for case in self.cases]
+        self._k = SimpleNamespace(**{name: np.array([k[name] for k in constants]) for name in constants[0]})
+        self._u = np.array([case.control for case in self.cases])
+        states = np.array([case.state for case in self.cases])
+        self._lifted = scene.lift(states)
+        flow = scene.flow
+        coefficients = np.array([
+            np.broadcast_to(x, self._u.shape) for x in scene.drive(self._lifted, self._u, self._k, np)
+        ])  # fmt: skip
+        present = tuple(bool(row.any()) for row in coefficients)
+        #: What is solved.
+        self.equation: Equation = NormalForm(flow.coefficients, present)
+        rows = [row for row, there in zip(coefficients, present, strict=True) if there]
+        if flow.coefficients is slope.Turn:
+            assert scene.angle is not None
+            rows.append(states[:, scene.angle])
+        #: Parameters, shape (parameters, problems).
+        self.p: Array = np.array(rows).reshape(len(rows), len(self.cases))
+        self._variables = scene.unpack(self._lifted, self._u, self._k)
+        #: Starts, the unknowns first and then cosine and sine, shape (lifted, problems).
+        self.y: Array = np.array(self._variables, dtype=np.float64)
+
+    def __len__(self) -> int:
+        return len(self.cases)
+
+    def states(self, y: Array, span: float) -> Array:
+        """Return the scene's states, one per line, of unknowns after the control was held for some time."""
+        scene = self.cases[0].scene
+        moved = [*y[:2], *self._variables[2:]]
+        ends = scene.pack(moved, self._lifted, self._u, span, self._k)
+        return np.stack(ends[: len(scene.state_names)], axis=1)

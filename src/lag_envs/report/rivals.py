@@ -1,0 +1,280 @@
+"""What is compared: ours, and rivals of any kind behind one interface, each in the fastest form that it has.
+
+A `Rival` is built for some `Problems` and a time over which their controls are held. What it then runs, and
+what is timed, is one call for all of them over the whole time: compiled loops where there are, blocks of
+states at once where it can take them, steps of its own choice where it chooses them. Errors are those of the
+very calls that are timed.
+
+`Ours` and `Compiled` are compiled by our machinery; other libraries are in `peers`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from functools import cache
+from typing import ClassVar
+
+import numpy as np
+
+from lag_envs.report.cases import Case
+from lag_envs.report.equations import Array, Equation, Problems
+from lag_envs.report.steppers import METHODS, Arithmetic
+from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.tracing import Trace
+
+
+class Rival(ABC):
+    """A method at one setting.
+
+    Parameters
+    ----------
+    method : str
+        One of its methods.
+    setting : float
+        A tolerance, or for methods that are `fixed` the substeps per control step; 1/4 is one step for four.
+    """
+
+    #: Whose it is: a package's name, "compiled", or "ours".
+    family: ClassVar[str]
+
+    def __init__(self, method: str, setting: float) -> None:
+        self.method, self.setting = method, setting
+
+    @property
+    def fixed(self) -> bool:
+        """Whether all steps are alike, so that time goes with their number whatever the horizon."""
+        return False
+
+    @property
+    def batched(self) -> bool:
+        """Whether there is a form that takes many states at once."""
+        return True
+
+    @abstractmethod
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile what can be compiled and return the call, with the states that it ends in.
+
+        Parameters
+        ----------
+        problems : Problems
+            What to solve, in one call.
+        dt : float
+            The control step [s].
+        steps : int
+            For how many of them each control is held.
+        together : bool
+            Take the states at once; else one after the other.
+        changes : int, default 1
+            For timing single steps: how many of them follow one another in the call. Alone each problem goes
+            on with the next one's control, in a batch with its own. What it ends in is then of no use.
+
+        Raises
+        ------
+        ImportError
+            Where the library is missing.
+        ValueError
+            For an equation that it cannot solve.
+        """
+
+    @property
+    def shared(self) -> bool:
+        """Whether the states of a batch share their steps, so that each one's error depends on the others."""
+        return False
+
+    @property
+    def changing(self) -> bool:
+        """Whether one call can go through many controls."""
+        return False
+
+    def substeps(self, steps: int) -> int:
+        """Return the number of steps over some control steps, for a fixed method."""
+        return max(1, round(self.setting * steps))
+
+
+class Ours(Rival):
+    """The stepping that the package ships: a scene's own flow, and no other order or tolerance.
+
+    The setting is the number of steps per control step: whoever wants another accuracy takes another `dt`.
+    """
+
+    family = "ours"
+    METHOD = "lag_envs"  #: control step by control step, as an environment takes them
+    ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
+
+    @property
+    def fixed(self) -> bool:
+        """Over a long time as over a short one, but in one call."""
+        return self.method == self.METHOD
+
+    @property
+    def changing(self) -> bool:
+        """A trajectory has a control for each step."""
+        return True
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile the scene's own step; scenes with other parameters are batches of their own."""
+        cases = problems.cases
+        count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
+        length = dt * steps / count
+        kernels = Kernels(cases[0].scene, cases[0].scene.flow)
+        alike: dict[Scene, list[Case]] = {}
+        for case in cases:
+            alike.setdefault(case.scene, []).append(case)
+        parts = []
+        for some in alike.values():
+            if together:
+                parts.append(at_once(kernels, some, count * changes, length))
+            else:
+                given = np.array([case.control for case in some])
+                turns = np.arange(len(some))[:, None] + np.arange(changes)
+                controls = np.repeat(given[turns % len(some)], count, axis=1)
+                parts.append(one_by_one(kernels, some, controls, length))
+
+        def run() -> None:
+            if any([part.run() for part in parts]):
+                raise ArithmeticError("a step was refused")
+
+        def prepare() -> None:
+            for part in parts:
+                part.prepare()
+
+        return Sample(
+            run, len(cases) * steps * changes, prepare, lambda: np.concatenate([p.ends() for p in parts])
+        )
+
+
+class Compiled(Rival):
+    """A stepper of `METHODS`, compiled as ours is: the same recorder, compiler and vector width.
+
+    Coefficients come ready, so that nothing but the method is timed. Alone: one compiled loop over steps and
+    trajectories. In a batch: one compiled loop over blocks of states.
+    """
+
+    family = "compiled"
+    CARRIED = ", carried"  #: what a method's name ends with if cosine and sine are carried along
+
+    @property
+    def fixed(self) -> bool:
+        """All steps are alike."""
+        return True
+
+    @property
+    def changing(self) -> bool:
+        """Its loop goes through them."""
+        return True
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile the loop."""
+        name, carried = self.method.removesuffix(self.CARRIED), self.method.endswith(self.CARRIED)
+        equation, n, count = problems.equation, self.substeps(steps), len(problems)
+        h, size = dt * steps / n, problems.equation.lifted
+        if together:
+            loop = _batch(equation, name, carried)
+            start = blocks(np.concatenate([problems.y, problems.p]), BLOCK)
+            rows = start.copy()
+            flat = rows.reshape(-1)
+            return Sample(
+                lambda: loop(flat, len(rows), n * changes, h),
+                count * steps * changes,
+                lambda: np.copyto(rows, start),
+                lambda: problems.states(unblocked(rows, count)[:size], dt * steps),
+            )
+        loop = _alone(equation, name, carried)
+        begin, p = np.ascontiguousarray(problems.y.T), np.ascontiguousarray(problems.p.T)
+        y = begin.copy()
+        return Sample(
+            lambda: loop(y, p, changes, n, h),
+            count * steps * changes,
+            lambda: np.copyto(y, begin),
+            lambda: problems.states(y.T, dt * steps),
+        )
+
+    @classmethod
+    def methods(cls, equation: Equation) -> list[str]:
+        """Return the names of all methods and forms for an equation."""
+        forms = ("", cls.CARRIED) if equation.lifted > equation.size else ("",)
+        return [name + form for name in METHODS for form in forms]
+
+
+def _names(equation: Equation) -> tuple[list[str], list[str]]:
+    return [f"y{i}" for i in range(equation.lifted)], [f"p{i}" for i in range(equation.parameters)]
+
+
+@cache
+def _step(equation: Equation, method: str, carried: bool) -> list[str]:
+    """Return the lines that take the unknowns y0, y1, ... one step of length h further, from the time t."""
+    y, p = _names(equation)
+    trace = Trace()
+    given = trace.inputs(*y, *p, "t", "h")
+    formula = equation.stepper(method, carried)
+    moved = formula(given[: len(y)], given[len(y) : -2], *given[-2:], Arithmetic(trace))
+    lines, ends = record_block(trace, {f"z{i}": z for i, z in enumerate(moved)})
+    return [*lines, *(f"{name} = {z}" for name, z in zip(y, ends, strict=True))]
+
+
+@cache
+def _alone(equation: Equation, method: str, carried: bool) -> Callable:
+    """Compile ``alone(y, p, changes, n, h)``: trajectories one after the other, n steps for each control."""
+    y, p = _names(equation)
+    lines = [
+        "def alone(y, p, changes, n, h):",
+        "for j in range(y.shape[0]):",
+        *(f"    {name} = y[j, {i}]" for i, name in enumerate(y)),
+        "    for i in range(changes):",
+        "        row = (j + i) % p.shape[0]",
+        *(f"        {name} = p[row, {i}]" for i, name in enumerate(p)),
+        "        for k in range(n):",
+        "            t = k * h",
+        *(f"            {line}" for line in _step(equation, method, carried)),
+        *(f"    y[j, {i}] = {name}" for i, name in enumerate(y)),
+    ]
+    return compile_function("alone", "\n    ".join(lines) + "\n")
+
+
+@cache
+def _batch(equation: Equation, method: str, carried: bool) -> Callable:
+    """Compile ``batch(rows, count, n, h)``: block by block, n steps of all states."""
+    y, p = _names(equation)
+    numbers = [*y, *p]
+    at = {name: f"rows[base + np.uint64({BLOCK * j}) + i]" for j, name in enumerate(numbers)}
+    lines = [
+        "def batch(rows, count, n, h):",
+        "wide_vectors()",
+        "for block in range(np.uint64(count)):",
+        f"    base = block * np.uint64({BLOCK * len(numbers)})",
+        "    for k in range(n):",
+        "        t = k * h",
+        f"        for i in range(np.uint64({BLOCK})):",
+        *(f"            {name} = {at[name]}" for name in numbers),
+        *(f"            {line}" for line in _step(equation, method, carried)),
+        *(f"            {at[name]} = {name}" for name in y),
+    ]
+    return compile_function("batch", "\n    ".join(lines) + "\n")
+
+
+def blocks(columns: Array, width: int) -> Array:
+    """Return columns in blocks, shape (blocks, rows, width); the last is filled up with the first column.
+
+    Examples
+    --------
+    >>> blocks(np.array([[1.0, 2.0, 3.0]]), 2).tolist()
+    [[[1.0, 2.0]], [[3.0, 1.0]]]
+    """
+    rows, count = columns.shape
+    missing = -count % width
+    filled = np.concatenate([columns, np.repeat(columns[:, :1], missing, axis=1)], axis=1)
+    return np.ascontiguousarray(filled.reshape(rows, -1, width).transpose(1, 0, 2))
+
+
+def unblocked(found: Array, count: int) -> Array:
+    """Return the columns that `blocks` has cut.
+
+    Examples
+    --------
+    >>> unblocked(blocks(np.array([[1.0, 2.0, 3.0]]), 2), 3).tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+    return found.transpose(1, 0, 2).reshape(found.shape[1], -1)[:, :count]

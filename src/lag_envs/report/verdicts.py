@@ -1,0 +1,533 @@
+"""What the points of `work_precision` come to: who is faster at which error, in tables, claims and sentences.
+
+Ours is what the package ships. Everybody's fastest form and setting that reaches an error is compared with
+ours that reaches it; a defeat is told like a win. Sentences are made of the numbers, so none outlives them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+from lag_envs.report.cases import VARIANTS
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.diagrams import draw
+from lag_envs.report.runner import Result, Row
+
+OURS = "lag_envs"
+ROUNDING = 2.0**-53
+#: An error below this many roundings, or amplified roundings, counts as no error at all.
+ROUNDINGS = 4
+MODES = {"single": "alone", "batch": "in a batch"}
+HORIZONS = ("one step", "10 s", "1,000 s")
+#: Errors at which times are compared.
+TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+#: Those that the README shows.
+SHOWN = TARGETS[1:]
+#: At which error ours is claimed to be the fastest: what accuracy is promised of a step, and what the system
+#: leaves of it over a long time.
+CLAIMED = {"one step": 1e-12, "10 s": 1e-12, "1,000 s": 1e-9}
+
+LIBRARIES = {
+    "scipy": "SciPy",
+    "heyoka": "heyoka",
+    "diffrax": "diffrax",
+    "torchdiffeq": "torchdiffeq",
+    "mujoco": "MuJoCo",
+}
+#: Whose finest setting has to be accurate, so that what is fast is no broken form.
+ACCURATE = 1e-9
+
+
+class Point(NamedTuple):
+    """One method at one setting, in one form: its errors and its time."""
+
+    variant: str
+    horizon: str
+    mode: str
+    family: str
+    method: str
+    setting: float  #: substeps per control step, or a library's tolerance
+    error: float | None
+    median: float | None
+    errors: Sequence[float | None]
+    ns: float
+
+    @property
+    def ours(self) -> bool:
+        """Whether it is what the package ships."""
+        return self.family == "ours"
+
+    @property
+    def diverged(self) -> int:
+        """Number of members that were lost."""
+        return sum(error is None for error in self.errors)
+
+    @property
+    def worst(self) -> float:
+        """The largest error, infinite where a member is lost."""
+        return max((math.inf if error is None else error for error in self.errors), default=math.inf)
+
+    @property
+    def name(self) -> str:
+        """The method, with its library."""
+        return f"{LIBRARIES.get(self.family, '')} {self.method}".strip()
+
+    @property
+    def label(self) -> str:
+        """The method and its setting in words."""
+        if self.ours and self.setting == 1:
+            return self.method
+        if self.family in ("ours", "compiled", "mujoco") or self.method.endswith("fixed"):
+            if self.setting < 1.0:
+                return f"{self.name}, a step for {1.0 / self.setting:g}"
+            return f"{self.name}, {self.setting:g} substep{'s' if self.setting > 1 else ''}"
+        return f"{self.name}, {self.setting:g}"
+
+
+def gathered(rows: Sequence[Row]) -> list[Point]:
+    """Return the points, their times all in the same spell of the machine.
+
+    Each job has timed ours in turn with its own, as its clock. Times are multiplied by what the clock of the
+    first job, that of ours, has to theirs. A method without a batch is in the batch as it is alone.
+    """
+    measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]
+    clocks = {(r["variant"], r["horizon"], r["mode"]): r["clock"] for r in measured if r["family"] == "ours"}
+    found = []
+    for row in measured:
+        key = row["variant"], row["horizon"], row["mode"]
+        point = Point(
+            *key, row["family"], row["method"], row["setting"], row["error"], row["median"], row["errors"],
+            row["ns"] * clocks.get(key, row["clock"]) / row["clock"],
+        )  # fmt: skip
+        found.append(point)
+    alone = {(r["family"], r["method"]) for r in measured if not r["batched"]}
+    return found + [p._replace(mode="batch") for p in found if (p.family, p.method) in alone]
+
+
+def floors(rows: Sequence[Row]) -> dict[tuple, float]:
+    """Return, by variant and horizon, what the system makes of one rounding."""
+    return {
+        (r["variant"], r["horizon"]): max(r["amplified"], ROUNDING) for r in rows if r["kind"] == "rounding"
+    }
+
+
+class Comparison(NamedTuple):
+    """The fastest of ours and the fastest rival that reach an error, on one variant, horizon and mode."""
+
+    variant: str
+    horizon: str
+    mode: str
+    target: float
+    ours: Point | None
+    rival: Point | None
+
+    @property
+    def ratio(self) -> float | None:
+        """The rival's time over ours; below 1 the rival wins."""
+        return self.rival.ns / self.ours.ns if self.ours and self.rival else None
+
+    @property
+    def lost(self) -> bool:
+        """Whether a rival is faster, or gets there alone."""
+        return self.rival is not None and (self.ratio is None or self.ratio < 1.0)
+
+    @property
+    def where(self) -> str:
+        """The variant and the mode."""
+        return f"{self.variant} {MODES[self.mode]}"
+
+
+def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Comparison]:
+    """Return all comparisons, with errors up to `ROUNDINGS` amplified roundings counting as none."""
+    found = []
+    for variant in VARIANTS:
+        for horizon in HORIZONS:
+            for mode in MODES:
+                here = [p for p in points if (p.variant, p.horizon, p.mode) == (variant, horizon, mode)]
+                least = ROUNDINGS * floor.get((variant, horizon), ROUNDING)
+                for target in TARGETS if here else ():
+                    reached = [p for p in here if p.worst <= max(target, least)]
+                    found.append(
+                        Comparison(
+                            variant, horizon, mode, target,
+                            min((p for p in reached if p.ours), key=lambda p: p.ns, default=None),
+                            min((p for p in reached if not p.ours), key=lambda p: p.ns, default=None),
+                        )
+                    )  # fmt: skip
+    return found
+
+
+def content(rows: list[Row], problems: list[Result]) -> Content:
+    """Return the section."""
+    points = gathered(rows)
+    floor = floors(rows)
+    found = compared(points, floor)
+    variants = [name for name in VARIANTS if any(p.variant == name for p in points)]
+    return Content(
+        title="Error against time",
+        text=[*_text(rows), *findings(found)],
+        tables=[_targets(found), _near(points), _orders(rows), _failed(rows, problems)],
+        pictures=[
+            Picture(_file(name), _caption(name), partial(draw, name, points, floor)) for name in variants
+        ],
+        claims=claims(rows, points, found),
+        summary=_summary(points, found),
+        details=[_rivals(points), _left(rows), _all(points)],
+    )
+
+
+# --- sentences ---
+
+
+def _text(rows: Sequence[Row]) -> list[str]:
+    sizes = {r["members"] for r in rows if r["kind"] == "point" and "members" in r}
+    members = f" (from {min(sizes)} to {max(sizes)} of them)" if len(sizes) > 1 else ""
+    return [
+        f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
+        "over the entries of the state, each relative to its size as the README defines accuracy; over 10 s "
+        "and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there "
+        "is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and drive), else "
+        "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
+        "there is no control, and pendulums have no damping.",
+        "Ours is what the package ships: each scene's own order and tolerance, control step by control step, "
+        "and over 10 s and 1,000 s also with steps of half and of twice that length, and as one step that "
+        "`simulate` divides ('lag_envs, one call'). The test whether a step is certified is part of it.",
+        "Everybody is given the scene's own equation and the fastest form there is, and the errors are those "
+        "of the calls that are timed. The usual steppers are compiled by the same compiler at the same "
+        "vector width as ours, with coefficients that come ready; 'carried' ones have cosine and sine as "
+        "unknowns, or turn them by short polynomials, and call no function. Where a control is held for "
+        "long they also take one step for several control steps. heyoka runs with fast_math; single steps "
+        "are its own machine code called from a compiled loop, longer times one call of propagate_until, a "
+        "batch goes in blocks of twice the width that it recommends. SciPy's compiled dopri5, dop853 and "
+        "lsoda have a compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is "
+        "compiled as a whole, a scan over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
+        "runs in its compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no "
+        "batch, so that theirs is one state after the other. What would take longer than some seconds is not "
+        "run.",
+        "Times are those of one control step. Everything in a job is timed in turn with ours, and the median "
+        "is taken; jobs are brought to one scale by the time that ours took in each. What takes long over "
+        "10 s or 1,000 s is timed over a part of that, in one call too.",
+    ]
+
+
+def findings(found: Sequence[Comparison]) -> list[str]:
+    """Return, for every horizon, a paragraph on who is faster at which error, and by how much."""
+    paragraphs = []
+    for horizon in HORIZONS:
+        here = [d for d in found if d.horizon == horizon]
+        sentences = [f"To {t:.0e}: {_finding([d for d in here if d.target == t])}." for t in TARGETS if here]
+        if sentences:
+            paragraphs.append(f"{horizon.capitalize()}. " + " ".join(sentences))
+    return paragraphs
+
+
+def _finding(found: Sequence[Comparison]) -> str:
+    """Return who is faster at one error, as a clause; every comparison is in one of its counts."""
+    settled = sorted((d for d in found if d.ratio is not None), key=lambda d: d.ratio or 0.0)
+    lost = [d for d in settled if d.lost]
+    won = [d for d in settled if not d.lost]
+    parts = []
+    if lost:
+        named = [f"{d.ratio:.2g} ({d.where}: {d.rival.label})" for d in (lost[0], lost[-1]) if d.rival]
+        parts.append(
+            f"a rival is faster in {len(lost)} of {len(found)} comparisons and takes "
+            f"{' to '.join(dict.fromkeys(named))} of our time"
+        )
+    if won:
+        ratios = [f"{d.ratio:.2g}" for d in (won[0], won[-1])]
+        parts.append(
+            f"ours is faster in {len(won)} of {len(found)}, where the fastest rival takes "
+            f"{' to '.join(dict.fromkeys(ratios))} times as long"
+        )
+    for words, some in (
+        ("nobody else gets there", [d for d in found if d.ours and not d.rival]),
+        ("ours does not get there and a rival does", [d for d in found if d.rival and not d.ours]),
+        ("nobody gets there", [d for d in found if not d.rival and not d.ours]),
+    ):
+        if some:
+            parts.append(f"{words} in {len(some)} ({_listed(d.where for d in some)})")
+    return "; ".join(parts)
+
+
+def _listed(parts: Iterable[str]) -> str:
+    return ", ".join(parts)
+
+
+# --- tables ---
+
+
+def _targets(found: Sequence[Comparison]) -> Table:
+    return Table(
+        "work_precision_targets",
+        "The fastest of ours and the fastest of everybody else's that reach an error; below 1 the other is "
+        "faster. An empty cell: not reached.",
+        [
+            "scene", "horizon", "mode", "error", "ours", "ours: error", "ours: ns", "fastest other",
+            "other: error", "other: ns", "other / ours",
+        ],
+        [
+            [
+                d.variant, d.horizon, MODES[d.mode], d.target,
+                d.ours and d.ours.label, d.ours and d.ours.worst, d.ours and d.ours.ns,
+                d.rival and d.rival.label, d.rival and d.rival.worst, d.rival and d.rival.ns, d.ratio,
+            ]
+            for d in found
+        ],
+    )  # fmt: skip
+
+
+#: Rivals that take more than so many times our time are left to the tables in CSV.
+NEAR = 10.0
+
+
+def _near(points: Sequence[Point]) -> Table:
+    table = _rivals(points)
+    rows = [row for row in table.rows if min(x for x in row[3:-1] if x is not None) <= NEAR]
+    return Table(
+        "work_precision_near", f"{table.caption} Those within {NEAR:g} times our time.", table.columns, rows
+    )
+
+
+def _rivals(points: Sequence[Point]) -> Table:
+    """Return every rival's own shortest time to each error, on one step."""
+    rows = []
+    here = [p for p in points if p.horizon == "one step" and not p.ours]
+    for variant in VARIANTS:
+        for mode, words in MODES.items():
+            own = [p for p in here if (p.variant, p.mode) == (variant, mode)]
+            ours = _default(points, variant, mode)
+            for name in dict.fromkeys(p.name for p in own) if ours else ():
+                some = [p for p in own if p.name == name]
+                best = [min((p.ns for p in some if p.worst <= t), default=None) for t in TARGETS]
+                if ours and any(best):
+                    ratios = [ns and ns / ours.ns for ns in best]
+                    rows.append([variant, words, name, *ratios, min(p.worst for p in some)])
+    return Table(
+        "work_precision_rivals",
+        "Each rival's shortest time to an error in one control step, as a multiple of the time of lag_envs, "
+        "and its smallest error. Below 1 the rival is faster. An empty cell: not reached.",
+        ["scene", "mode", "rival", *(f"to {target:.0e}" for target in TARGETS), "smallest error"],
+        rows,
+    )
+
+
+def _default(points: Sequence[Point], variant: str, mode: str) -> Point | None:
+    key = variant, "one step", mode, OURS
+    return next((p for p in points if (p.variant, p.horizon, p.mode, p.method) == key), None)
+
+
+def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
+    rows = []
+    for name in VARIANTS:
+        for mode, words in MODES.items():
+            ours = _default(points, name, mode)
+            if ours is None:
+                continue
+            here = {d.target: d for d in found if (d.variant, d.horizon, d.mode) == (name, "one step", mode)}
+            rows.append([
+                name, words, f"{ours.worst:.0e}", round(ours.ns, 1), *(_rival(here[t]) for t in SHOWN),
+            ])  # fmt: skip
+    steps = [d for d in found if d.horizon == "one step"]
+    sentences = [f"To {t:.0e}: {_finding([d for d in steps if d.target == t])}." for t in SHOWN if steps]
+    return Table(
+        "work_precision",
+        "One control step of each scene, alone and in a batch of 1,024: largest error and time of lag_envs "
+        "as shipped, and the fastest of its rivals, each in its fastest form, that reaches an error, with "
+        "its time as a multiple of ours; below 1 the rival is faster. " + " ".join(sentences),
+        ["scene", "mode", "error", "ns", *(f"to {target:.0e}" for target in SHOWN)],
+        rows,
+    )
+
+
+def _rival(comparison: Comparison) -> str:
+    return (
+        f"{comparison.rival.label}: {comparison.ratio:.2g} ×"
+        if comparison.rival and comparison.ratio
+        else "none"
+    )
+
+
+def _orders(rows: Sequence[Row]) -> Table:
+    found = [r for r in rows if r["kind"] == "order"]
+    return Table(
+        "work_precision_orders",
+        "Order of convergence, from the slope of the error of one step over its length, less one: the "
+        "median over 24 problems on PivotedBar, with the shortest pair of steps h and 2h whose errors lie "
+        "well above rounding.",
+        ["method", "order", "measured", "difference"],
+        [
+            [r["method"], r["order"], r["slope"], r["slope"] - r["order"] if r["slope"] is not None else None]
+            for r in found
+        ],
+    )
+
+
+def _failed(rows: Sequence[Row], problems: Sequence[Result]) -> Table:
+    found = [[result.name, "", "", result.problem] for result in problems]
+    found += [
+        [row["variant"], f"{row['horizon']}, {MODES[row['mode']]}", _setting(row), row["problem"]]
+        for row in rows
+        if row.get("problem") and not row["problem"].startswith("not run")
+    ]
+    return Table(
+        "work_precision_problems",
+        "What failed.",
+        ["scene or job", "where", "method", "problem"],
+        found,
+    )
+
+
+def _left(rows: Sequence[Row]) -> Table:
+    found = []
+    for row in rows:
+        lost = row.get("diverged")
+        problem = row.get("problem") or (f"diverged, {lost} of {row['members']}" if lost else None)
+        if problem:
+            found.append([row["variant"], row["horizon"], MODES[row["mode"]], _setting(row), problem])
+    return Table(
+        "work_precision_left",
+        "What was not run, and what diverged: members that ended without a number or further away than their "
+        "own size. They are drawn at the upper edge. Finer settings of what would take too long are not run "
+        "either.",
+        ["scene", "horizon", "mode", "method", "problem"],
+        found,
+    )
+
+
+def _setting(row: Row) -> str:
+    return f"{LIBRARIES.get(row['family'], '')} {row['method']}, {row['setting']:g}".strip()
+
+
+def _all(points: Sequence[Point]) -> Table:
+    return Table(
+        "work_precision_points",
+        "All points: largest and median error, members lost, time of a control step.",
+        [
+            "scene", "horizon", "mode", "family", "method", "setting", "error", "median", "members",
+            "diverged", "ns",
+        ],
+        [[*p[:6], p.error, p.median, len(p.errors), p.diverged, p.ns] for p in points],
+    )  # fmt: skip
+
+
+# --- claims ---
+
+
+def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Comparison]) -> list[Claim]:
+    """Return what is claimed; whether it holds is measured, and what does not hold is told in the README."""
+    made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
+    steps = [p for p in points if p.ours and p.method == OURS and p.horizon == "one step"]
+    largest = max((p.worst for p in steps), default=math.nan)
+    made.append(
+        _claim(
+            "The error of one control step stays below 1e-15 on every scene",
+            steps,
+            lambda: largest < 1e-15,
+            lambda: f"largest {largest:.1e}, scenes measured: {len({p.variant for p in steps})}",
+        )
+    )
+    finest = _finest(points)
+    off = [f"{name} on {where}: {error:.1e}" for (name, where), error in finest.items() if error > ACCURATE]
+    made.append(
+        _claim(
+            "No form is fast because it is broken: at its finest setting every library, and every stepper of "
+            f"order 4 and more, errs by at most {ACCURATE:.0e} in one step",
+            finest,
+            lambda: not off,
+            lambda: _listed(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",
+        )
+    )
+    slopes = [
+        (r["method"], abs(r["slope"] - r["order"])) for r in rows if r["kind"] == "order" and r["slope"]
+    ]
+    method, worst = max(slopes, key=lambda x: x[1], default=("", 0.0))
+    made.append(
+        _claim(
+            "Every method converges with its order, within 0.2",
+            slopes,
+            lambda: worst <= 0.2,
+            lambda: f"largest difference {worst:.2f}, {method}",
+        )
+    )
+    same = _same_bits(rows)
+    made.append(
+        _claim(
+            "The batches that are timed end where single trajectories do, bit for bit, ours and the others",
+            same,
+            lambda: all(same),
+            lambda: f"{sum(same)} of {len(same)}",
+        )
+    )
+    return made
+
+
+def _claim(text: str, measured: Any, holds: Callable[[], bool], evidence: Callable[[], str]) -> Claim:
+    return Claim(text, holds(), evidence()) if measured else Claim(text, None, "not measured")
+
+
+def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
+    here = [d for d in found if d.horizon == horizon and d.target == target and (d.ours or d.rival)]
+    lost = [d for d in here if d.lost]
+
+    def evidence() -> str:
+        ratios = [d.ratio for d in here if d.ratio is not None]
+        if lost:
+            faster = "; ".join(
+                f"{d.where}: {d.rival.label}, {f'{d.ratio:.2g} ×' if d.ratio else 'ours not at all'}"
+                for d in lost
+                if d.rival
+            )
+            return f"{len(here) - len(lost)} of {len(here)}; faster: {faster}"
+        if not ratios:
+            return f"{len(here)} of {len(here)}; nobody else gets there"
+        low, high = min(ratios), max(ratios)
+        return f"{len(here)} of {len(here)}; the fastest rivals take {low:.2g} to {high:.2g} × our time"
+
+    return _claim(
+        f"{horizon.capitalize()}: nobody reaches an error of {target:.0e} in less time than lag_envs as "
+        "shipped, alone or in a batch",
+        here,
+        lambda: not lost,
+        evidence,
+    )
+
+
+#: Methods of lower order, which are not asked to be accurate.
+LOW = ("explicit Euler", "semi-implicit Euler", "Verlet", "implicit midpoint", "Euler", "implicitfast")
+
+
+def _finest(points: Sequence[Point]) -> dict[tuple[str, str], float]:
+    """Return the smallest error that each form of each rival has in one step, by method and place."""
+    found: dict[tuple[str, str], float] = {}
+    for p in points:
+        low = p.method.partition(",")[0] in LOW
+        if p.horizon == "one step" and not p.ours and not low:
+            key = p.name, f"{p.variant} {MODES[p.mode]}"
+            found[key] = min(found.get(key, math.inf), p.worst)
+    return found
+
+
+def _same_bits(rows: Sequence[Row]) -> list[bool]:
+    seen: dict[tuple, dict[str, str]] = {}
+    for r in rows:
+        if r["kind"] == "point" and r["family"] in ("ours", "compiled") and "digest" in r:
+            key = r["variant"], r["horizon"], r["method"], r["setting"]
+            seen.setdefault(key, {})[r["mode"]] = r["digest"]
+    return [len(set(digests.values())) == 1 for digests in seen.values() if len(digests) == len(MODES)]
+
+
+def _file(variant: str) -> str:
+    return "work_precision_" + variant.lower().replace(", ", "_")
+
+
+def _caption(variant: str) -> str:
+    return (
+        f"{variant}: largest error against the time of a control step. Lower left is better. Columns: one "
+        "control step, 10 s, 1,000 s; rows: alone, and in a batch (1,024 states; 128 over 10 s and 1,000 s). "
+        "Of each method the faster form is drawn. Thin bars reach down to the median error. Dotted: what the "
+        "system itself makes of one rounding of its start. Reference: 30 digits, by closed forms where there "
+        "is one, else by Taylor series."
+    )
