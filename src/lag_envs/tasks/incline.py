@@ -73,10 +73,10 @@ class Tilt(Task):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m |
-    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
-    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | radius | 0.05 | m | 1e-9 to 1e9 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e27 | moment of inertia I about the axis; None: solid, mR²/2 |
     | damping | 0.03 | N s/m | 0 to 1e9 | coefficient c of the drag -cx' at the axis |
-    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
     | control | tilt_rate | - | - | what the control is: "tilt_rate", or "tilt" |
     | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
@@ -278,11 +278,11 @@ class Brake(Task):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m |
-    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
-    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | radius | 0.05 | m | 1e-9 to 1e9 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e27 | moment of inertia I about the axis; None: solid, mR²/2 |
     | damping | 0 | N s/m | 0 to 1e9 | constant drag; adds to the brake |
     | tilt | 0.261799 | rad | 0 to 1.57 | the slope φ |
-    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
