@@ -108,7 +108,7 @@ class Drift(Task):
     interval, steps = 0.1, 20
     start = {"theta": (1.0, 0.5)}
 
-    class scene(Scene):  # noqa: N801
+    class scene(Scene):
         length: float = parameter(1.0, "m", above=0.0)
         coordinates = {"theta": "rad"}
 

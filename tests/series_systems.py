@@ -99,7 +99,11 @@ class Acrobot(Scene):
         second = q.shoulder + q.elbow
         across = 2 * half * v.shoulder * xp.cos(q.shoulder) + half * both * xp.cos(second)
         up = 2 * half * v.shoulder * xp.sin(q.shoulder) + half * both * xp.sin(second)
-        return 0.5 * (m * half**2 + inertia) * v.shoulder**2 + 0.5 * m * (across**2 + up**2) + 0.5 * inertia * both**2
+        return (
+            0.5 * (m * half**2 + inertia) * v.shoulder**2
+            + 0.5 * m * (across**2 + up**2)
+            + 0.5 * inertia * both**2
+        )
 
     def potential(self, q, xp):
         weight, half = 9.81 * self.mass, self.length / 2

@@ -272,7 +272,7 @@ def logarithm_of_nothing():
 
 @mistake("potential", "NameError", "sin")
 def function_without_xp():
-    return potential(lambda self, q, xp: sin(q.x))  # noqa: F821
+    return potential(lambda self, q, xp: sin(q.x))
 
 
 @mistake("potential", "self", "spring")

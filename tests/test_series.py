@@ -14,11 +14,11 @@ from series_systems import SYSTEMS, System, acceleration
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.machine import Layout, compile_attempt
-from lag_envs.stepping.series import Plain, Series
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(
-    number=float, **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")}
+    number=float,
+    **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")},
 )
 LANES = 8
 
@@ -51,7 +51,11 @@ def taylor(system, state, control, h, end):
     q, v = ([flint.arb_series([x]) for x in values] for values in (q0, v0))
     for known in range(1, end + 1):
         flint.ctx.cap = known
-        s = flint.arb_series([flint.arb(state[0]), h * flint.arb(state[1]), h * h * u[0] / 2]) if first else None
+        s = (
+            flint.arb_series([flint.arb(state[0]), h * flint.arb(state[1]), h * h * u[0] / 2])
+            if first
+            else None
+        )
         rates = acceleration(system, q, v, u, s, u[0] if first else None, EXACT)
         flint.ctx.cap = known + 1
         q = [(x * h).integral() + c for x, c in zip(v, q0, strict=True)]
@@ -81,11 +85,13 @@ def inputs(system, state, control):
     found, constants, code = stepper(system)
     given = constants | found.prepare(FLOATS, state, control, constants) | {"start_elapsed": 0.0}
     n = code.record.size
-    return {name: given[name] for name in code.record.inputs}, *([given[f"{x}{i}"] for i in range(n)] for x in "qv")
+    return {name: given[name] for name in code.record.inputs}, *(
+        [given[f"{x}{i}"] for i in range(n)] for x in "qv"
+    )
 
 
 def _run(rows, order, tolerance):
-    attempt(rows, 0, order, tolerance)  # noqa: F821
+    attempt(rows, 0, order, tolerance)
 
 
 @cache

@@ -45,8 +45,6 @@ def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = fro
     return _programs[key]
 
 
-
-
 _programs: dict[tuple, Program] = {}
 
 

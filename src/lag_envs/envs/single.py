@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import SLOW, constants_of, program_for
-from lag_envs.scenes.base import is_masked, shown
+from lag_envs.scenes.base import shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -54,7 +54,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
 
     # Gymnasium's own attribute; an environment replaces it and never changes it.
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 
     def __init__(
         self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any

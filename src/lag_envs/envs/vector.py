@@ -175,7 +175,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
-            target = np.array([np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes])
+            target = np.array(
+                [np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes]
+            )
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
@@ -306,7 +308,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         They are 0 after a reset.
         """
-        return single_number(np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T)
+        return single_number(
+            np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
+        )
 
     # --- the rest ------------------------------------------------------------------------------------------
 

@@ -100,7 +100,7 @@ class Expr:
         exact = value if isinstance(value, int | Fraction) else _exact(float(value))
         return Expr({(): exact} if exact else {})
 
-    # --- what it is ------------------------------------------------------------------------------------------
+    # --- what it is -----------------------------------------------------------------------------------------
 
     @property
     def text(self) -> str:
@@ -147,7 +147,7 @@ class Expr:
             found |= {atom} if atom.argument is None else atom.argument.symbols()
         return found
 
-    # --- arithmetic ------------------------------------------------------------------------------------------
+    # --- arithmetic -----------------------------------------------------------------------------------------
 
     def __add__(self, other: Any) -> Expr:
         other = Expr.of(other)
@@ -240,7 +240,7 @@ class Expr:
             return Expr({(): exact}) * Expr({tuple((a, -n) for a, n in monomial): 1})
         return Expr({((Atom("function", "sum", self), -1),): 1})
 
-    # --- what is refused -------------------------------------------------------------------------------------
+    # --- what is refused ------------------------------------------------------------------------------------
 
     def _refuse(self, what: str, remedy: str) -> NoReturn:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
@@ -448,7 +448,7 @@ class Functions:
         )
 
 
-# --- calculus ------------------------------------------------------------------------------------------------
+# --- calculus -----------------------------------------------------------------------------------------------
 
 
 def _slope(atom: Atom) -> Expr:

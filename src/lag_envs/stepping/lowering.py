@@ -133,7 +133,7 @@ class Lowering:
         self._known: dict[tuple, int] = {}
         self._atoms: dict[Atom, int] = {}
 
-    # --- scalars ---------------------------------------------------------------------------------------------
+    # --- scalars --------------------------------------------------------------------------------------------
 
     def _input(self, name: str) -> Number:
         if name not in self._inputs:
@@ -184,7 +184,7 @@ class Lowering:
             return inner
         return getattr(self._trace, atom.function)(inner)
 
-    # --- series ----------------------------------------------------------------------------------------------
+    # --- series ---------------------------------------------------------------------------------------------
 
     def _node(self, op: str, args: Sequence[int] = (), weights: Sequence[Any] = (), index: int = 0) -> int:
         key = (op, tuple(args), tuple(_key(w) for w in weights), index)
@@ -329,7 +329,7 @@ class Lowering:
         weights = [*(self.scalar(e) for _, e in items), self.scalar(constant)]
         return self._node("sum", [n for n, _ in items], weights)
 
-    # --- the whole -------------------------------------------------------------------------------------------
+    # --- the whole ------------------------------------------------------------------------------------------
 
     def parts(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr]) -> tuple[list[int], dict]:
         """Return nodes of the right-hand sides and entries of the mass matrix, see `without`.

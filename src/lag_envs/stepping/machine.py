@@ -222,7 +222,9 @@ class Machine:
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
     modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
-    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(sys.modules[__name__])
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
+        sys.modules[__name__]
+    )
     return hashlib.sha256(source.encode()).hexdigest()
 
 

@@ -310,7 +310,7 @@ class TaskFormulas:
         self.has_last = type(task).last_reward is not Task.last_reward
         self.observation = self._names()
 
-    # --- constants -------------------------------------------------------------------------------------------
+    # --- constants ------------------------------------------------------------------------------------------
 
     def constants(self) -> dict[str, float]:
         """Return every number that compiled functions take, by name."""
@@ -342,7 +342,7 @@ class TaskFormulas:
         """Return the code of a control step."""
         return self._task.scene._stepper.code(absent)
 
-    # --- formulas --------------------------------------------------------------------------------------------
+    # --- formulas -------------------------------------------------------------------------------------------
 
     def _self(self, k: Any) -> Task:
         """Return a task whose numbers are those that are recorded."""
