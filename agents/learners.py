@@ -179,7 +179,7 @@ def freeze(model: Any) -> dict[str, Any]:
         "envs": pickle.dumps([_own(layer) for layer in _layers(model.get_env())]),
         "buffer": pickle.dumps(getattr(model, "replay_buffer", None)),
         "noise": [(d.exploration_mat, d.exploration_matrices) for d in _explorers(model.policy)],
-        "random": (random.getstate(), np.random.get_state(), torch.get_rng_state()),
+        "random": (random.getstate(), np.random.get_state(), torch.get_rng_state()),  # noqa: NPY002
         "actions": model.action_space.np_random.bit_generator.state,
     }
 
@@ -214,7 +214,7 @@ def restore(model: Any, content: dict[str, Any]) -> None:
         d.exploration_mat, d.exploration_matrices = one, many
     ours, numpys, torchs = content["random"]
     random.setstate(ours)
-    np.random.set_state(numpys)
+    np.random.set_state(numpys)  # noqa: NPY002
     torch.set_rng_state(torchs)
     model.action_space.np_random.bit_generator.state = content["actions"]
 

@@ -46,7 +46,7 @@ class Oracle:
         v = self._named("v", self.coordinates)
         u = self._named("u", self.controls)
         self.symbols = [*q, *v, *u, *(sympy.Symbol("p_" + name, positive=True) for name in self.parameters)]
-        exact = lambda x: sympy.nsimplify(sympy.sympify(x), rational=True)
+        exact = lambda x: sympy.nsimplify(sympy.sympify(x), rational=True)  # noqa: E731
         self.kinetic, self.potential = exact(twin.kinetic(q, v, XP)), exact(twin.potential(q, XP))
         loss, forces = exact(twin.dissipation(q, v, u, XP)), twin.applied(q, v, u, XP)
         self.rests = {name: self._function(value) for name, value in twin.rests().items()}
@@ -73,7 +73,7 @@ class Oracle:
 
         Accelerations of free coordinates are missing.
         """
-        real = lambda: mpmath.mpf(generator.uniform(-1.5, 1.5))
+        real = lambda: mpmath.mpf(generator.uniform(-1.5, 1.5))  # noqa: E731
         p = {name: mpmath.mpf(generator.uniform(0.3, 1.5)) for name in self.parameters}
         u = {name: real() if name in self.active else mpmath.mpf(0) for name in self.controls}
         q, v, a = ({name: real() for name in self.coordinates} for _ in range(3))

@@ -593,7 +593,7 @@ def test_equations_are_solved_by_the_accelerations():
 
 @pytest.mark.parametrize("functions_of_time", [False, True])
 def test_scene_of_sympys_expressions(functions_of_time):
-    m, l, g, b, tau = sympy.symbols("m l g b tau")
+    m, l, g, b, tau = sympy.symbols("m l g b tau")  # noqa: E741
     if functions_of_time:
         x, theta = dynamicsymbols("x theta")
         x_dot, theta_dot = x.diff(), theta.diff()
@@ -776,7 +776,7 @@ def test_replaced_formula_is_looked_at_again(monkeypatch):
 
 def test_classes_can_be_forgotten():
     cls = cart(False)
-    cls().mechanics
+    cls().mechanics  # noqa: B018
     gone = weakref.ref(cls)
     del cls
     gc.collect()

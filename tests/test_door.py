@@ -272,7 +272,7 @@ def logarithm_of_nothing():
 
 @mistake("potential", "NameError", "sin")
 def function_without_xp():
-    return potential(lambda self, q, xp: sin(q.x))
+    return potential(lambda self, q, xp: sin(q.x))  # noqa: F821
 
 
 @mistake("potential", "self", "spring")

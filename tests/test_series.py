@@ -40,7 +40,7 @@ EXACT = types.SimpleNamespace(
 
 
 def taylor(system, state, control, h, end):
-    """Return exact coefficients of places and velocities up to an order, time in steps of h, by Picard's iteration.
+    """Return exact coefficients of places and velocities, time in steps of h, by Picard's iteration.
 
     Each iteration makes one more coefficient exact: nothing is shared with the recurrences under test.
     """
@@ -91,7 +91,7 @@ def inputs(system, state, control):
 
 
 def _run(rows, order, tolerance):
-    attempt(rows, 0, order, tolerance)
+    attempt(rows, 0, order, tolerance)  # noqa: F821
 
 
 @cache
@@ -100,7 +100,7 @@ def compiled(record, lanes, fused=True):
 
 
 def attempts(system, cases, order, tolerance, lanes=LANES, fused=True):
-    """Return for each case (state, control, h) the length that was certified, 0 if none, and bounds on the tails."""
+    """Return for each case (state, control, h) the certified length, 0 if none, and bounds on the tails."""
     record = stepper(system)[2].record
     layout, n = Layout(record), record.size
     run, results = compiled(record, lanes, fused), []
@@ -121,7 +121,7 @@ def attempts(system, cases, order, tolerance, lanes=LANES, fused=True):
 
 
 def excess(system, case, order, h, bounds):
-    """Return by how much the worst true tail exceeds its bound, as a ratio; NaN where the step has no length."""
+    """Return the ratio of the worst true tail to its bound; NaN where the step has no length."""
     state, control, _ = case
     q, v = taylor(system, state, control, h, order + 18)
     after = [bound * h / (order + 2) for bound in bounds]

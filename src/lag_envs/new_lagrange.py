@@ -213,7 +213,7 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     xp : namespace
         Functions for these numbers.
     """
-    of: Callable[[Any], Any] = lambda e: evaluate(e, values, xp)
+    of: Callable[[Any], Any] = lambda e: evaluate(e, values, xp)  # noqa: E731
     if expression in values:
         return values[expression]
     if expression.is_Integer:

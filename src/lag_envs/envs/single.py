@@ -54,7 +54,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """
 
     # Gymnasium's own attribute; an environment replaces it and never changes it.
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any

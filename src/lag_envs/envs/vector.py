@@ -304,7 +304,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def control(self) -> NDArray[np.float64]:
-        """The controls applied last, shape (num_envs,), or (num_envs, n) where there are several, in SI units.
+        """The controls applied last [SI], shape (num_envs,), or (num_envs, n) where there are several.
 
         They are 0 after a reset.
         """
@@ -461,8 +461,8 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     tasks = [named(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            "the environments of a batch may differ in numbers only: they must agree in structural options, in "
-            "having a finite track or a fixed target, and in zeros that a formula divides by; "
+            "the environments of a batch may differ in numbers only: they must agree in structural options, "
+            "in having a finite track or a fixed target, and in zeros that a formula divides by; "
             f"got {shown(many)}"
         )
     return tasks

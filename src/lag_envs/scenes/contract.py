@@ -949,7 +949,7 @@ def _check_bodies(scene: Scene) -> None:
                 f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
             )
     try:
-        found.full
+        found.full  # noqa: B018
     except FormulaError as error:
         raise FormulaError(f"{of}.{error}") from error
 

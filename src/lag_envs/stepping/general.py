@@ -1,8 +1,8 @@
 """One control step of any scene: from its state to the series' variables, the series, and back.
 
-Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held, velocities
-jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is converted at both
-ends of the control step.
+Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held,
+velocities jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
+converted at both ends of the control step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Prints the step of `lag_envs.stepping.series` to machine code: one lane or several at once, with the same bits."""
+"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or for several."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
+        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
         module = self._b.module
         request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
@@ -304,8 +304,8 @@ def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
     The rows are inputs, places, velocities and the step, as in `Layout`, and then the derivatives of the
-    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places, velocities
-    and the matrix are replaced by those after the step.
+    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places,
+    velocities and the matrix are replaced by those after the step.
 
     Parameters
     ----------

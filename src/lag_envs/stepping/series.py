@@ -1,28 +1,28 @@
 """One step of any equations of motion by Taylor series, with a proved bound on what the series leaves out.
 
 The algorithm stands here once, written for a `Target`: something that adds and multiplies, keeps series in
-numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out on
-Python numbers (`Plain`).
+numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out
+on Python numbers (`Plain`).
 
-**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by order
-(sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
+**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by
+order (sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
 v_{k+1} = h a_k/(k+1), and the accelerations from::
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
 with one factorisation M_0 = L D Lᵀ.
 
-**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and above.
-Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum up to E_v at
-most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after N - 1, the step is
-accepted if for some E_a > 0::
+**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
+above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
+up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after
+N - 1, the step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
-Proof: v_{k+1} = h a_k/(k+1), and a_k depends on coefficients up to order k only. So if the partial sums of the
-tails up to k obey E_v and E_a, those up to k + 1 do; they stay bounded, so the series converges on the whole
-step and is the solution. That the inequality is strict makes M invertible throughout. What is proved is the
-truncation of each substep: rounding comes on top, and what the flow makes of earlier errors.
+Proof: v_{k+1} = h a_k/(k+1), and a_k depends on coefficients up to order k only. So if the partial sums of
+the tails up to k obey E_v and E_a, those up to k + 1 do; they stay bounded, so the series converges on the
+whole step and is the solution. That the inequality is strict makes M invertible throughout. What is proved is
+the truncation of each substep: rounding comes on top, and what the flow makes of earlier errors.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ TOLERANCE = 1e-14
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
 TRIES = 8
-#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its registers.
+#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
+#: registers.
 GROUP = 8
 
 
@@ -164,7 +165,7 @@ class Series:
         return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
     def _slope(self, n: int) -> Factor:
-        """Return where D_k = k x_k of a function's argument x is: a slot, or that of its rate, of which it is h times."""
+        """Return where D_k = k x_k of a function's argument x is: a slot, or 1/h times its rate's."""
         args = self.record.nodes[n].args
         if len(args) > 2:
             return Factor(self._factor(args[2]).slot, back=1)
@@ -462,7 +463,8 @@ class Series:
     ) -> tuple[Any, Any, list, list, list]:
         """Take a certified step of length h, or of as much of h as can be certified from one expansion.
 
-        Coefficients of a shorter step are those of h times powers of their ratio: so nothing is computed anew.
+        Coefficients of a shorter step are those of h times powers of their ratio: so nothing is computed
+        anew.
 
         Parameters
         ----------
@@ -567,21 +569,21 @@ def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
 class Certificate:
     """Bounds on what a step's series leave out; see the module's docstring.
 
-    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part and Σ' without
-    order 0:
+    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part and Σ'
+    without order 0:
 
     * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
     * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
-    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
+    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R, |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
       p = |z_0| - Σ'|z|; it needs p² > R.
     * functions, z' = w x' with D_j = j x_j: k z_k = Σ_j D_j w_{k-j} leaves E_z = A + B E_w, with
-      A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is said
-      of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where w is z,
-      A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
+      A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is
+      said of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where
+      w is z, A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
 
-    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from its
-    own series what is below k only.
+    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from
+    its own series what is below k only.
     """
 
     def __init__(self, series: Series, t: Target, start: Start, h: Any, order: Any, tolerance: Any) -> None:
@@ -598,7 +600,8 @@ class Certificate:
     def check(self, part: Any = None, power: Any = None) -> tuple[Any, list]:
         """Tell whether the step, or a part of it, is certified, and return the bounds on what v leaves out.
 
-        A part f < 1 makes Σ' |x_k| at most f times as large, and overlaps, sums of orders from N on, f^N times.
+        A part f < 1 makes Σ' |x_k| at most f times as large, and overlaps, sums of orders from N on, f^N
+        times.
 
         Parameters
         ----------

@@ -185,10 +185,10 @@ class Tilt(_Shell):
 
     ## Optimal Value
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
-    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
-    standard errors, of the other policies over 4,096 episodes; the feedback is action = 30.3 (θ* - θ) - 3.77 θ'
-    + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures
+    it, in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean
+    returns ± standard errors, of the other policies over 4,096 episodes; the feedback is action = 30.3 (θ* -
+    θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
 
     | Id | Random actions | Zero control | Feedback | Best known |
     | -- | -------------- | ------------ | -------- | ---------- |
