@@ -28,7 +28,7 @@ class Actions:
         if len(values) == 1:
             self.space = gym.spaces.Discrete(values[0])
         elif values:
-            self.space = gym.spaces.MultiDiscrete(values)
+            self.space = gym.spaces.MultiDiscrete(list(values))
         else:
             self.space = gym.spaces.Box(-1.0, 1.0, (count,), np.float32)
         #: Shape of one action.

@@ -212,7 +212,7 @@ class Expr:
         if not whole or modulo is not None:
             if isinstance(exponent, numbers.Real) and float(exponent) in (0.5, -0.5):
                 root = function("sqrt", self)
-                return root if exponent > 0 else root.reciprocal()
+                return root if float(exponent) > 0 else root.reciprocal()
             raise FormulaError(
                 f"a recorded number is raised to the power {exponent!r}; only whole numbers and ±0.5 can be "
                 "powers: write xp.exp(p * xp.log(x)) for others"
@@ -265,7 +265,7 @@ class Expr:
     def _compare(self, other: Any) -> NoReturn:
         self._refuse("a comparison, min or max", "an energy must be smooth and cannot branch on its numbers")
 
-    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare  # type: ignore[assignment]
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
 
     def __abs__(self) -> Expr:
         self._refuse("abs()", "an energy must be smooth: xp.sqrt(x * x + eps * eps) rounds the corner")
@@ -278,7 +278,7 @@ class Expr:
     def __round__(self, digits: Any = None) -> Expr:
         self._refuse("round()", "a formula must be smooth")
 
-    __floor__ = __ceil__ = __trunc__ = __round__  # type: ignore[assignment]
+    __floor__ = __ceil__ = __trunc__ = __round__
 
     def __iter__(self) -> Any:
         self._refuse("a loop over the entries", "it is a single number")
@@ -545,7 +545,7 @@ def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, in
                 partner = _exchange(monomial, {a: -2, _twin(a): 2})
                 d = terms.get(partner)
                 if d is not None and (c > 0) == (d > 0):
-                    common = min(c, d, key=abs)
+                    common: Any = c if abs(Fraction(c)) < abs(Fraction(d)) else d
                     return [{monomial: -common}, {partner: -common}, {_exchange(monomial, {a: -2}): common}]
         for x, (a, _) in enumerate(waves):
             for b, _ in waves[x + 1 :]:

@@ -692,7 +692,7 @@ class Scene(metaclass=SceneType):
         code, constants = self._code(), self._constants()
         numbers = [constants[name.removeprefix("k_")] for name in code.constants]
         order = self._order(dt)
-        status, bounds = code.bounded(start, held, dt, order, numbers)
+        status, bounds = code.bounded(start.tolist(), held.tolist(), dt, order, numbers)
         if status < 0:
             raise self._refusal(start, held, dt, None, "the step")
         of = {("place", name): bounds[0][i] for i, name in enumerate(self._layout.free)}

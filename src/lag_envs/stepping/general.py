@@ -288,7 +288,7 @@ class StepCode:
         n = record.size
         self._n = n
         names = [*stepper._whole.constants, *(f"p_{name}" for name in stepper._parameters)]
-        given = {name: 0.0 if name in absent else f"k_{name}" for name in names}
+        given: dict[str, Any] = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
         self._inputs = [
             name if not name.startswith("c") or name.startswith("control_") else f"k_{name}"

@@ -414,7 +414,9 @@ class Lowering:
             nodes.append(Node(op, tuple(a for a in found if a >= 0), numbers, index))  # a rate may vanish
         mass = {}
         for place, (node, _) in entries.items():
-            weight, constant, node = 1.0, next(value), now[node]
+            weight: Weight = 1.0
+            constant: Weight = next(value)
+            node = now[node]
             if node >= 0 and nodes[node].op == "sum" and len(nodes[node].args) == 1:
                 weight, constant = nodes[node].weights
                 (node,) = nodes[node].args

@@ -147,15 +147,16 @@ class Number:
         return self.trace.record("abs", self)
 
     def __pow__(self, exponent: Any) -> Any:
-        if isinstance(exponent, bool) or not isinstance(exponent, numbers.Real) or exponent != int(exponent):
+        whole = not isinstance(exponent, bool) and isinstance(exponent, numbers.Real)
+        if not whole or float(exponent) != int(float(exponent)):
             raise TypeError(
                 f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others"
             )
         power: Any = 1.0
-        for bit in bin(abs(int(exponent)))[2:]:
+        for bit in bin(abs(int(float(exponent))))[2:]:
             power = power * power
             power = power * self if bit == "1" else power
-        return power if exponent >= 0 else 1.0 / power
+        return power if float(exponent) >= 0 else 1.0 / power
 
     def __lt__(self, other: Any) -> Any:
         return self.trace.record("<", self, other)

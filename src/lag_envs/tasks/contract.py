@@ -255,7 +255,7 @@ class Task:
 
     def readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells besides state and controls: the targets."""
-        given = [] if now.target is None else np.atleast_1d(now.target)
+        given: Any = [] if now.target is None else np.atleast_1d(now.target)
         return [
             Reading(t.name, float(value), t.unit, "target")
             for t, value in zip(self.formulas.target_boxes, given, strict=False)
