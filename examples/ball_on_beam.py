@@ -25,7 +25,9 @@ class BallOnBeam(Scene):
     def kinetic(self, q, v, xp):
         spin = v.x / self.ball_radius  # rolling, seen from the beam
         ball = 0.5 * self.ball_mass * (v.x**2 + (q.x * v.angle) ** 2)
-        return ball + 0.2 * self.ball_mass * self.ball_radius**2 * spin**2 + 0.5 * self.beam_inertia * v.angle**2
+        return (
+            ball + 0.2 * self.ball_mass * self.ball_radius**2 * spin**2 + 0.5 * self.beam_inertia * v.angle**2
+        )
 
     def potential(self, q, xp):
         return self.ball_mass * self.gravity * q.x * xp.sin(q.angle)

@@ -7,7 +7,7 @@ from lag_envs.tasks import Task
 
 
 class Crane(Scene):
-    """A load on a rope; a trolley and a winch move it. Structural: whether there is a second, swinging load."""
+    """A load on a rope; a trolley and a winch move it."""
 
     trolley_mass: float = parameter(2.0, "kg", above=0.0)
     load_mass: float = parameter(1.0, "kg", above=0.0)
@@ -108,7 +108,7 @@ class Drift(Task):
     interval, steps = 0.1, 20
     start = {"theta": (1.0, 0.5)}
 
-    class scene(Scene):  # noqa: N801
+    class scene(Scene):
         length: float = parameter(1.0, "m", above=0.0)
         coordinates = {"theta": "rad"}
 

@@ -1,7 +1,7 @@
 """Eight systems for the tests of the series: energies as a scene states them, and equations typed in by hand.
 
-The equations give mass matrix and right-hand side in plain arithmetic and a few functions, so they run on floats,
-on mpmath's numbers and on series of python-flint. Nothing of the package is used for them.
+The equations give mass matrix and right-hand side in plain arithmetic and a few functions, so they run on
+floats, on mpmath's numbers and on series of python-flint. Nothing of the package is used for them.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from lag_envs.scenes.contract import Scene, parameter
 class System(NamedTuple):
     """A scene, and what to hold it against.
 
-    ``motion(q, v, u, s, a, xp)`` returns mass matrix and right-hand side; s and a are the place and the acceleration
-    of the prescribed coordinate. ``places`` and ``speeds`` are half widths of the harsh states that are drawn
-    around ``centre``, ``push`` those of the controls.
+    ``motion(q, v, u, s, a, xp)`` returns mass matrix and right-hand side; s and a are the place and the
+    acceleration of the prescribed coordinate. ``places`` and ``speeds`` are half widths of the harsh states
+    that are drawn around ``centre``, ``push`` those of the controls.
     """
 
     scene: Scene
@@ -83,7 +83,7 @@ def cart_pole(q, v, u, s, a, xp):
 
 
 class Acrobot(Scene):
-    """Two bars in a chain, the second angle relative to the first, a torque at the elbow, smooth dry friction."""
+    """Two bars, the second angle relative to the first, a torque at the elbow, smooth dry friction."""
 
     mass: float = parameter(0.8, "kg", above=0.0)
     length: float = parameter(0.9, "m", above=0.0)
@@ -99,7 +99,11 @@ class Acrobot(Scene):
         second = q.shoulder + q.elbow
         across = 2 * half * v.shoulder * xp.cos(q.shoulder) + half * both * xp.cos(second)
         up = 2 * half * v.shoulder * xp.sin(q.shoulder) + half * both * xp.sin(second)
-        return 0.5 * (m * half**2 + inertia) * v.shoulder**2 + 0.5 * m * (across**2 + up**2) + 0.5 * inertia * both**2
+        return (
+            0.5 * (m * half**2 + inertia) * v.shoulder**2
+            + 0.5 * m * (across**2 + up**2)
+            + 0.5 * inertia * both**2
+        )
 
     def potential(self, q, xp):
         weight, half = 9.81 * self.mass, self.length / 2

@@ -66,7 +66,7 @@ def test_jacobian_is_the_derivative(case):
 
 
 def test_rows_of_a_batch():
-    scene, state, control, dt = CASES["double"]
+    scene, state, _, dt = CASES["double"]
     states = np.array([state, np.multiply(state, 0.5), np.zeros(6)])
     a, b = scene.jacobian(states, [[3.0], [1.0], [0.0]], dt)
     assert a.shape == (3, 6, 6) and b.shape == (3, 6, 1)

@@ -73,7 +73,9 @@ def test_simulate_is_step():
 def test_numbers_of_a_batch_may_differ_zero_among_them():
     drags = [0.0, 0.3, 2.0]
     native = gym.make_vec("OwnCrane-v0", num_envs=3, rope_drag=drags, load_mass=[0.5, 1.0, 2.0])
-    single = [gym.make("OwnCrane-v0", rope_drag=d, load_mass=m) for d, m in zip(drags, [0.5, 1.0, 2.0], strict=True)]
+    single = [
+        gym.make("OwnCrane-v0", rope_drag=d, load_mass=m) for d, m in zip(drags, [0.5, 1.0, 2.0], strict=True)
+    ]
     seen = [native.reset(seed=7)[0]], [np.stack([e.reset(seed=7 + i)[0] for i, e in enumerate(single)])]
     native.action_space.seed(2)
     for _ in range(8):
@@ -174,8 +176,8 @@ def test_class_that_only_a_notebook_knows():
         class Lean(Task):
             id = "OwnNotebook-v0"
             scene = own_tasks.Crane
-            action = {"push": 1.0, "pull": 1.0}  # noqa: RUF012
-            start = {"rope": (1.0, 0.0)}  # noqa: RUF012
+            action = {"push": 1.0, "pull": 1.0}
+            start = {"rope": (1.0, 0.0)}
 
             def observe(self, after, target, xp):
                 return {"x": after.x}
@@ -237,6 +239,8 @@ def test_example(monkeypatch):
     check_env(env.unwrapped, skip_render_check=not RENDERS)
     scene = env.unwrapped.scene
     before = scene.energy([0.2, 0.0, 0.3, 0.0])["total"]
-    after = scene.energy(type(scene)(friction=0.0).simulate([0.2, 0.0, 0.3, 0.0], np.zeros(50), 0.02)[-1])["total"]
+    after = scene.energy(type(scene)(friction=0.0).simulate([0.2, 0.0, 0.3, 0.0], np.zeros(50), 0.02)[-1])[
+        "total"
+    ]
     assert after == pytest.approx(before, abs=1e-14)
     del gym.registry["BallOnBeam-v0"]

@@ -45,8 +45,6 @@ def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = fro
     return _programs[key]
 
 
-
-
 _programs: dict[tuple, Program] = {}
 
 
@@ -83,8 +81,8 @@ class Program:
         self.constants = [name for name in names if f"k_{name}" in used]
         self.uniform = [name for name in self.constants if name not in varying]
         self.varying = [name for name in self.constants if name in varying]
-        #: Names of the rows that are kept from step to step, and of those that are needed within one. Those of
-        #: the series come first, one behind the other.
+        #: Names of the rows that are kept from step to step, and of those that are needed within one. Those
+        #: of the series come first, one behind the other.
         self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying)]
         self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
@@ -159,7 +157,8 @@ class Program:
     def step_one(self) -> Callable:
         """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the rows `held` written.
 
-        These are the controls of a step that the fast formula does not cover, or that was refused. The action is a number where there is one, else an array.
+        These are the controls of a step that the fast formula does not cover, or that was refused. The action
+        is a number where there is one, else an array.
         """
         at = self._at_one
         body = [

@@ -175,7 +175,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if target is not None:
             many = self.task.formulas.targets
             target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
-            target = np.array([np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes])
+            target = np.array(
+                [np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes]
+            )
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
@@ -302,11 +304,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def control(self) -> NDArray[np.float64]:
-        """The controls applied last, shape (num_envs,), or (num_envs, n) where there are several, in SI units.
+        """The controls applied last [SI], shape (num_envs,), or (num_envs, n) where there are several.
 
         They are 0 after a reset.
         """
-        return single_number(np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T)
+        return single_number(
+            np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
+        )
 
     # --- the rest ------------------------------------------------------------------------------------------
 
@@ -457,8 +461,8 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     tasks = [named(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            "the environments of a batch may differ in numbers only: they must agree in structural options, in "
-            "having a finite track or a fixed target, and in zeros that a formula divides by; "
+            "the environments of a batch may differ in numbers only: they must agree in structural options, "
+            "in having a finite track or a fixed target, and in zeros that a formula divides by; "
             f"got {shown(many)}"
         )
     return tasks

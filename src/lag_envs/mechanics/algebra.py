@@ -17,7 +17,7 @@ import math
 import numbers
 from collections.abc import Callable, Iterable, Mapping
 from fractions import Fraction
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 Monomial = tuple[tuple["Atom", int], ...]
 
@@ -26,14 +26,14 @@ LARGEST_PRODUCT = 4096
 
 
 class FormulaError(TypeError, ValueError):
-    """A scene is not written as it must be: a formula does what recorded numbers cannot follow, or a name is wrong."""
+    """A formula does what recorded numbers cannot follow, or a name is wrong."""
 
 
 class Atom:
     """A symbol, or a function of an expression. Atoms with the same text are the same object."""
 
     __slots__ = ("argument", "function", "kind", "name", "text")
-    _all: dict[str, Atom] = {}
+    _all: ClassVar[dict[str, Atom]] = {}
 
     kind: str
     name: str
@@ -100,7 +100,7 @@ class Expr:
         exact = value if isinstance(value, int | Fraction) else _exact(float(value))
         return Expr({(): exact} if exact else {})
 
-    # --- what it is ------------------------------------------------------------------------------------------
+    # --- what it is -----------------------------------------------------------------------------------------
 
     @property
     def text(self) -> str:
@@ -147,7 +147,7 @@ class Expr:
             found |= {atom} if atom.argument is None else atom.argument.symbols()
         return found
 
-    # --- arithmetic ------------------------------------------------------------------------------------------
+    # --- arithmetic -----------------------------------------------------------------------------------------
 
     def __add__(self, other: Any) -> Expr:
         other = Expr.of(other)
@@ -240,7 +240,7 @@ class Expr:
             return Expr({(): exact}) * Expr({tuple((a, -n) for a, n in monomial): 1})
         return Expr({((Atom("function", "sum", self), -1),): 1})
 
-    # --- what is refused -------------------------------------------------------------------------------------
+    # --- what is refused ------------------------------------------------------------------------------------
 
     def _refuse(self, what: str, remedy: str) -> NoReturn:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
@@ -367,8 +367,8 @@ def _check_root(argument: Expr) -> None:
         moving = any(s.kind != "parameter" for a in squares for s in Expr.of(a).symbols())
     if moving:
         raise FormulaError(
-            f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: write the number "
-            "itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+            f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: "
+            "write the number itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
         )
 
 
@@ -448,7 +448,7 @@ class Functions:
         )
 
 
-# --- calculus ------------------------------------------------------------------------------------------------
+# --- calculus -----------------------------------------------------------------------------------------------
 
 
 def _slope(atom: Atom) -> Expr:
@@ -516,7 +516,7 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
 
 
 def collect(expr: Expr) -> Expr:
-    """Apply cos² + sin² = 1, and the rules for the cosine and sine of a sum, wherever terms meet that allow it.
+    """Apply cos² + sin² = 1, and the rules for cosine and sine of a sum, wherever terms meet.
 
     Two terms meet where they agree in all but a pair of factors and have coefficients of one size. So
     energies that are written in Cartesian velocities become as short as those that are written in angles.

@@ -1,7 +1,7 @@
 """Lagrange's equations of a recorded scene.
 
-With T = ½ Σ G_bc v_b v_c + Σ b_c v_c + T₀, over the free and the prescribed coordinates together, p_i = ∂T/∂v_i
-and Rayleigh's function D, Lagrange's equation of coordinate i is::
+With T = ½ Σ G_bc v_b v_c + Σ b_c v_c + T₀, over the free and the prescribed coordinates together, p_i =
+∂T/∂v_i and Rayleigh's function D, Lagrange's equation of coordinate i is::
 
     Σ_j G_ij a_j + Σ_c ∂p_i/∂q_c v_c − ∂T/∂q_i + ∂V/∂q_i + ∂D/∂v_i − Q_i = F_i
 
@@ -116,8 +116,8 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
     for i, name in enumerate(free):
         if (i, i) not in mass:
             raise FormulaError(
-                f"kinetic does not contain the rate of {name!r} squared, so nothing determines its acceleration; "
-                f"give it a mass, or prescribe {name!r}"
+                f"kinetic does not contain the rate of {name!r} squared, so nothing determines its "
+                f"acceleration; give it a mass, or prescribe {name!r}"
             )
     linear = tuple(Expr({m: c for m, c in momentum.terms.items() if _degree(m) == 0}) for momentum in momenta)
     force = []
@@ -140,14 +140,14 @@ def _check_velocities(kinetic: Expr) -> None:
             if inside or (atom.kind == "velocity" and n < 0):
                 what = atom.text if inside else f"1/{atom.name}"
                 raise FormulaError(
-                    f"kinetic has a velocity in a function or denominator: {what:.60}; it must be a polynomial of "
-                    "degree two in the velocities"
+                    f"kinetic has a velocity in a function or denominator: {what:.60}; it must be a "
+                    "polynomial of degree two in the velocities"
                 )
         if _degree(monomial) > 2:
             text = Expr({monomial: 1}).text
             raise FormulaError(
-                f"kinetic is of degree {_degree(monomial)} in the velocities, in {text:.60}; it must be of degree "
-                "two at most"
+                f"kinetic is of degree {_degree(monomial)} in the velocities, in {text:.60}; it must be of "
+                "degree two at most"
             )
 
 
@@ -155,5 +155,6 @@ def _check_no_velocity(formula: str, expr: Expr) -> None:
     for symbol in sorted(expr.symbols(), key=lambda s: s.text):
         if symbol.kind == "velocity":
             raise FormulaError(
-                f"{formula} contains the velocity of {symbol.name!r}; only kinetic, dissipation and applied may"
+                f"{formula} contains the velocity of {symbol.name!r}; only kinetic, dissipation and "
+                "applied may"
             )

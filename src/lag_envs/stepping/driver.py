@@ -1,8 +1,9 @@
 """Whole control steps from attempts: substeps as the certificate asks for, one lane or a block of lanes.
 
-An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here it is
-repeated until the control step is over. In a block the lanes that are not done are gathered and go on together.
-Each lane goes through the same attempts as it would alone, so its bits do not depend on its neighbours.
+An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here
+it is repeated until the control step is over. In a block the lanes that are not done are gathered and go on
+together. Each lane goes through the same attempts as it would alone, so its bits do not depend on its
+neighbours.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ BLOCK, LANES = 64, 8
 def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of the lane in `rows`; return the number of attempts, negative where refused.
 
-    Inputs, places and velocities are read, places and velocities are replaced; behind the rows of the attempt the
-    sums of the substeps' bounds on places and velocities are left.
+    Inputs, places and velocities are read, places and velocities are replaced; behind the rows of the attempt
+    the sums of the substeps' bounds on places and velocities are left.
     """
     for i in range(2 * n):
         rows[size + i] = 0.0
@@ -65,9 +66,9 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
 def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
-    Row r of lane i lies at ``memory[base + r * BLOCK + i]``: inputs, places, velocities as in an attempt, and after
-    them the status: the number of attempts, negative where the lane was refused. A lane whose status is negative
-    to begin with is left alone.
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``: inputs, places, velocities as in an attempt, and
+    after them the status: the number of attempts, negative where the lane was refused. A lane whose status is
+    negative to begin with is left alone.
     """
     rows = np.empty(size * LANES)
     remaining = np.empty(BLOCK)
@@ -167,8 +168,8 @@ def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) ->
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of an attempt. `slopes` begin with inputs, places, velocities and the step, as they do, and
-    go on with the matrix of derivatives, which is that of unit vectors to begin with.
+    `rows` are those of an attempt. `slopes` begin with inputs, places, velocities and the step, as they do,
+    and go on with the matrix of derivatives, which is that of unit vectors to begin with.
     """
     remaining, h, count = dt, dt, 0
     while True:
@@ -197,10 +198,10 @@ def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
 
 
 def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
-    """Take a control step from each row of `values`, see `_advance_tangent`; return the row that was refused, or 0.
+    """Take a control step from each row of `values`; return the row that was refused, or 0.
 
-    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` becomes the
-    matrix of derivatives of places and velocities, row by row.
+    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes`
+    becomes the matrix of derivatives of places and velocities, row by row.
     """
     rows = np.zeros(size)
     moving = np.zeros(done + 2 * n * width)

@@ -1,8 +1,8 @@
 """Derivatives of a step: the same algorithm on numbers that carry derivatives along.
 
-A dual number is a value with one derivative per column; None stands for a derivative that is zero. `Dual` makes a
-target of such numbers from a target of plain ones, so that every recurrence stands once. It takes what
-`Series.expand` and `Series.advance` need, not what the certificate does: comparisons have no derivative.
+A dual number is a value with one derivative per column; None stands for a derivative that is zero. `Dual`
+makes a target of such numbers from a target of plain ones, so that every recurrence stands once. It takes
+what `Series.expand` and `Series.advance` need, not what the certificate does: comparisons have no derivative.
 """
 
 from __future__ import annotations

@@ -131,8 +131,9 @@ def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
 class Stepper:
     """One scene's control step as lines of code.
 
-    The lines take the lifted state ``y0, y1, ...``, the control ``u0``, the step ``dt``, the bound's ``x`` and
-    the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's end.
+    The lines take the lifted state ``y0, y1, ...``, the control ``u0``, the step ``dt``, the bound's ``x``
+    and the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's
+    end.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """One control step of any scene: from its state to the series' variables, the series, and back.
 
-Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held, velocities
-jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is converted at both
-ends of the control step.
+Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held,
+velocities jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
+converted at both ends of the control step.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class SeriesStepper:
                 moving[p.name] = [s + elapsed * (rate + elapsed * half), rate + elapsed * held, half]
         return moving
 
-    # --- constants -------------------------------------------------------------------------------------------
+    # --- constants ------------------------------------------------------------------------------------------
 
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
@@ -68,7 +68,7 @@ class SeriesStepper:
             f"p_{name}": float(parameters[name]) for name in self._parameters
         }
 
-    # --- from the state and back -----------------------------------------------------------------------------
+    # --- from the state and back ----------------------------------------------------------------------------
 
     def _values(self, y: Sequence, u: Sequence) -> dict[str, Any]:
         """Return entries of the state and controls by name."""
@@ -85,7 +85,9 @@ class SeriesStepper:
                 inputs[name] = given[name.removeprefix("control_")]
             elif name.startswith("start_") and name != "start_elapsed":
                 inputs[name] = given[name.removeprefix("start_")]
-        q = [given.get(name, 0.0) for name in self._layout.free]  # where one is left out, nothing depends on it
+        q = [
+            given.get(name, 0.0) for name in self._layout.free
+        ]  # where one is left out, nothing depends on it
         shift = self._shift(xp, q, {p.name: given.get(p.name) for p in self._layout.prescribed}, u, k)
         for i, name in enumerate(self._layout.free):
             inputs[f"q{i}"] = q[i]
@@ -208,7 +210,7 @@ class SeriesStepper:
         finished = self.finish(VariableFunctions(), after[:n], after[n:], y, u, dt, k)
         return np.stack([z.slopes for z in finished]).transpose(2, 0, 1), 0
 
-    # --- code ------------------------------------------------------------------------------------------------
+    # --- code -----------------------------------------------------------------------------------------------
 
     def code(self, absent: frozenset[str] = frozenset()) -> StepCode:
         """Return the step without the terms of constants that are zero."""

@@ -1,9 +1,10 @@
 """From equations of motion to a record of series: what has to be computed at each order, and nothing twice.
 
-The record is what every printer prints (`lag_envs.stepping.series`). Its nodes are series in time: coordinates,
-velocities, their functions, products and weighted sums. Weights do not change within a step: they are scalars,
-computed once from the held control and from constants. Constants are polynomials in the parameters, computed
-once per scene; one that is zero takes every term that it multiplies along (`SeriesRecord.without`).
+The record is what every printer prints (`lag_envs.stepping.series`). Its nodes are series in time:
+coordinates, velocities, their functions, products and weighted sums. Weights do not change within a step:
+they are scalars, computed once from the held control and from constants. Constants are polynomials in the
+parameters, computed once per scene; one that is zero takes every term that it multiplies along
+(`SeriesRecord.without`).
 
 Products are what costs, order² each, sums only order. So common factors are pulled out of sums, squares are
 made first, and what two equations share is computed once.
@@ -38,8 +39,8 @@ class Node:
 
     ``op`` is one of ``place``, ``velocity`` (of the free coordinate `index`), ``polynomial`` (known from the
     start: `weights` are its coefficients in powers of t), ``sum`` (`weights` times `args`, and a constant
-    `weights[-1]`), ``product``, ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These obey
-    z' = w x', and their `args` are x, w (of a cosine: -w), and x' where x is a weighted sum of places.
+    `weights[-1]`), ``product``, ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These
+    obey z' = w x', and their `args` are x, w (of a cosine: -w), and x' where x is a weighted sum of places.
     """
 
     op: str
@@ -133,7 +134,7 @@ class Lowering:
         self._known: dict[tuple, int] = {}
         self._atoms: dict[Atom, int] = {}
 
-    # --- scalars ---------------------------------------------------------------------------------------------
+    # --- scalars --------------------------------------------------------------------------------------------
 
     def _input(self, name: str) -> Number:
         if name not in self._inputs:
@@ -184,7 +185,7 @@ class Lowering:
             return inner
         return getattr(self._trace, atom.function)(inner)
 
-    # --- series ----------------------------------------------------------------------------------------------
+    # --- series ---------------------------------------------------------------------------------------------
 
     def _node(self, op: str, args: Sequence[int] = (), weights: Sequence[Any] = (), index: int = 0) -> int:
         key = (op, tuple(args), tuple(_key(w) for w in weights), index)
@@ -311,7 +312,7 @@ class Lowering:
         return result
 
     def _single(self, terms: list[tuple[int, Expr]]) -> tuple[int, Expr]:
-        """Return one node and the weight that it has: a common weight is pulled out, so that nodes are shared."""
+        """Return one node and its weight: a common weight is pulled out, so that nodes are shared."""
         first = terms[0][1]
         if all(e.same(first) or e.same(-first) for _, e in terms):
             one = Expr.of(1)
@@ -329,7 +330,7 @@ class Lowering:
         weights = [*(self.scalar(e) for _, e in items), self.scalar(constant)]
         return self._node("sum", [n for n, _ in items], weights)
 
-    # --- the whole -------------------------------------------------------------------------------------------
+    # --- the whole ------------------------------------------------------------------------------------------
 
     def parts(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr]) -> tuple[list[int], dict]:
         """Return nodes of the right-hand sides and entries of the mass matrix, see `without`.

@@ -1,4 +1,4 @@
-"""Prints the step of `lag_envs.stepping.series` to machine code: one lane or several at once, with the same bits."""
+"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or for several."""
 
 from __future__ import annotations
 
@@ -96,6 +96,9 @@ class Machine:
     def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
         return self._b.select(condition, a, b)
 
+    def either(self, a: Any, b: Any) -> ir.Value:
+        return self._b.or_(a, b)
+
     def all(self, condition: Any) -> ir.Value:
         if self._lanes == 1:
             return condition
@@ -175,7 +178,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
+        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
         module = self._b.module
         request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
@@ -195,9 +198,17 @@ class Machine:
         for phi, value in zip(phis, values, strict=True):
             phi.add_incoming(value, self._b.basic_block)
 
-    def when(self, condition: Any, body: Callable) -> None:
-        with self._b.if_then(condition):
-            body()
+    def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list:
+        b = self._b
+        start = b.basic_block
+        with b.if_then(condition):
+            values = body()
+            last = b.basic_block
+        phis = [b.phi(value.type) for value in otherwise]
+        for phi, value, other in zip(phis, values, otherwise, strict=True):
+            phi.add_incoming(value, last)
+            phi.add_incoming(other, start)
+        return phis
 
     def elementary(self, name: str, x: Any) -> ir.Value:
         operations, result = series.elementary(name, self._fused)
@@ -211,7 +222,9 @@ class Machine:
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
     modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
-    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(sys.modules[__name__])
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
+        sys.modules[__name__]
+    )
     return hashlib.sha256(source.encode()).hexdigest()
 
 
@@ -258,7 +271,7 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    t = Machine(builder, step.slots * STRIDE + 1, lanes, fused)
+    t = Machine(builder, step.slots * STRIDE, lanes, fused)
 
     def pointer(row: int) -> ir.Value:
         return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())
@@ -291,8 +304,8 @@ def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
     The rows are inputs, places, velocities and the step, as in `Layout`, and then the derivatives of the
-    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places, velocities
-    and the matrix are replaced by those after the step.
+    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places,
+    velocities and the matrix are replaced by those after the step.
 
     Parameters
     ----------
@@ -330,7 +343,7 @@ def _write_tangent(
     set.add(function.attributes, "noinline")
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    plain = Machine(builder, step.slots * (width + 1) * STRIDE + 1, 1, True)
+    plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
     t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
 
     def at(row: int) -> ir.Value:

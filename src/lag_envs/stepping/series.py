@@ -1,28 +1,28 @@
 """One step of any equations of motion by Taylor series, with a proved bound on what the series leaves out.
 
 The algorithm stands here once, written for a `Target`: something that adds and multiplies, keeps series in
-numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out on
-Python numbers (`Plain`).
+numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out
+on Python numbers (`Plain`).
 
-**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by order
-(sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
+**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by
+order (sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
 v_{k+1} = h a_k/(k+1), and the accelerations from::
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
 with one factorisation M_0 = L D Lᵀ.
 
-**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and above.
-Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum up to E_v at
-most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after N - 1, the step is
-accepted if for some E_a > 0::
+**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
+above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
+up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after
+N - 1, the step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
-Proof: v_{k+1} = h a_k/(k+1), and a_k depends on coefficients up to order k only. So if the partial sums of the
-tails up to k obey E_v and E_a, those up to k + 1 do; they stay bounded, so the series converges on the whole
-step and is the solution. That the inequality is strict makes M invertible throughout. What is proved is the
-truncation of each substep: rounding comes on top, and what the flow makes of earlier errors.
+Proof: v_{k+1} = h a_k/(k+1), and a_k depends on coefficients up to order k only. So if the partial sums of
+the tails up to k obey E_v and E_a, those up to k + 1 do; they stay bounded, so the series converges on the
+whole step and is the solution. That the inequality is strict makes M invertible throughout. What is proved is
+the truncation of each substep: rounding comes on top, and what the flow makes of earlier errors.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
-TRIES = 10
-#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its registers.
+TRIES = 8
+#: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
+#: registers.
 GROUP = 8
 
 
@@ -73,6 +74,7 @@ class Target(Protocol):
     def less(self, a: Any, b: Any) -> Any: ...
     def both(self, a: Any, b: Any) -> Any: ...
     def select(self, condition: Any, a: Any, b: Any) -> Any: ...
+    def either(self, a: Any, b: Any) -> Any: ...
     def all(self, condition: Any) -> Any: ...
     def negated(self, condition: Any) -> Any: ...
     def real(self, k: Any) -> Any: ...
@@ -86,7 +88,7 @@ class Target(Protocol):
     def store(self, slot: int, k: Any, value: Any) -> None: ...
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list: ...
     def repeat(self, times: int, carried: Sequence, body: Callable) -> list: ...
-    def when(self, condition: Any, body: Callable) -> None: ...
+    def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list: ...
     def elementary(self, name: str, x: Any) -> Any: ...
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]: ...
 
@@ -163,7 +165,7 @@ class Series:
         return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
     def _slope(self, n: int) -> Factor:
-        """Return where D_k = k x_k of a function's argument x is: a slot, or that of its rate, of which it is h times."""
+        """Return where D_k = k x_k of a function's argument x is: a slot, or 1/h times its rate's."""
         args = self.record.nodes[n].args
         if len(args) > 2:
             return Factor(self._factor(args[2]).slot, back=1)
@@ -436,25 +438,42 @@ class Series:
         after = [t.fma(h, total, x) for total, x in zip(totals[self.size :], q, strict=True)]
         return after, totals[: self.size]
 
-    def shorten(self, t: Target, factor: Any, order: Any) -> None:
-        """Turn the coefficients of a step h into those of the step factor · h."""
+    def shorten(self, t: Target, part: Any, order: Any) -> None:
+        """Turn the velocities' coefficients into those of a part of the step."""
 
         def scale(k: Any, carried: Sequence) -> list:
-            power = t.mul(carried[0], factor)
-            for slot in range(self.slots):
+            power = t.mul(carried[0], part)
+            for i in range(self.size):
+                slot = self._slots["v", i]
                 t.store(slot, k, t.mul(power, t.load(slot, k)))
             return [power]
 
-        (power,) = t.loop(t.index(1), order, [t.number(1.0)], scale)
-        power = t.mul(power, factor)
-        for i in range(self.size):
-            v = self._slots["v", i]
-            t.store(v, order, t.mul(power, t.load(v, order)))
+        t.loop(t.index(1), t.plus(order, 1), [t.number(1.0)], scale)
 
     def attempt(
-        self, t: Target, inputs: dict[str, Any], q: Sequence, v: Sequence, h: Any, order: Any, tolerance: Any
+        self,
+        t: Target,
+        inputs: dict[str, Any],
+        q: Sequence,
+        v: Sequence,
+        h: Any,
+        order: Any,
+        tolerance: Any,
+        wanted: Any = None,
     ) -> tuple[Any, Any, list, list, list]:
         """Take a certified step of length h, or of as much of h as can be certified from one expansion.
+
+        Coefficients of a shorter step are those of h times powers of their ratio: so nothing is computed
+        anew.
+
+        Parameters
+        ----------
+        t, inputs, q, v, h, order
+            See `expand`.
+        tolerance : number
+            What v may leave out, in its sizes, see `Certificate`.
+        wanted : condition, optional
+            Where a result is wanted; only there it is worth trying again.
 
         Returns
         -------
@@ -468,24 +487,30 @@ class Series:
             Bounds on what v leaves out; q leaves out at most h/(N+2) times as much.
         """
         start = self.expand(t, inputs, q, v, h, order)
-        certificate = Certificate(self, t, start, order, tolerance)
+        certificate = Certificate(self, t, start, h, order, tolerance)
         one = t.number(1.0)
-        never = t.less(one, t.number(0.0))
-        t.store(self.slots, t.index(0), one)  # one number waits in a slot of its own
 
-        def shortened(count: Any, carried: Sequence) -> tuple[Any, list]:
-            _, h, factor, *_ = carried
-            t.when(t.below(t.index(0), count), lambda: self.shorten(t, factor, order))
-            h = t.mul(h, factor)
-            passed, bounds = certificate.check(h)
-            over = t.all(passed)
-            t.when(t.negated(over), lambda: t.store(self.slots, t.index(0), certificate.part()))
-            factor = t.select(passed, one, t.load(self.slots, t.index(0)))
-            return t.negated(over), [passed, h, factor, *bounds]
+        def going(passed: Any) -> Any:
+            return t.negated(t.all(passed if wanted is None else t.either(passed, t.negated(wanted))))
 
-        none = [t.number(math.inf)] * self.size
-        done, h, _, *bounds = t.repeat(TRIES, [never, h, one, *none], shortened)
-        return done, h, *self.advance(t, q, h, order), bounds
+        def retry(count: Any, carried: Sequence) -> tuple[Any, list]:
+            passed, part, power, *_ = carried
+            part, power = certificate.shorten(passed, part, power)
+            passed, bounds = certificate.check(part, power)
+            return going(passed), [passed, part, power, *bounds]
+
+        def shorten() -> list:
+            passed, part, _, *bounds = t.repeat(TRIES, [done, one, one, *bounds_of_all], retry)
+            self.shorten(t, part, order)
+            return [passed, part, *bounds]
+
+        done, bounds_of_all = certificate.check()
+        done, part, *bounds = t.when(going(done), shorten, [done, one, *bounds_of_all])
+        h = t.mul(h, part)
+        q, v = self.advance(t, q, h, order)
+        for x in (*q, *v):  # what overflows is not done
+            done = t.both(done, t.less(t.abs(x), t.number(math.inf)))
+        return done, h, q, v, bounds
 
 
 class Inverse:
@@ -544,45 +569,59 @@ def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
 class Certificate:
     """Bounds on what a step's series leave out; see the module's docstring.
 
-    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part and Σ' without
-    order 0:
+    Rules for tails, with H(X, Y) = Σ_{j+k>=N; j,k<N} |X_j| |Y_k|, |X| the norm of the known part and Σ'
+    without order 0:
 
     * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
     * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
-    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
+    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R, |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
       p = |z_0| - Σ'|z|; it needs p² > R.
     * functions, z' = w x' with D_j = j x_j: k z_k = Σ_j D_j w_{k-j} leaves E_z = A + B E_w, with
-      A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is said
-      of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where w is z,
-      A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
+      A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is
+      said of places. For sine and cosine both rules together give s <= (A_s + B A_c)/(1 - B²); for exp, where
+      w is z, A/(1 - B); for tanh, where w is 1 - z², the smaller root of E = A + B (H(z, z) + 2|z|E + E²).
 
-    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from its
-    own series what is below k only.
+    Each holds for partial sums too, as the proof needs: the coefficient k of the left-hand side takes from
+    its own series what is below k only.
     """
 
-    def __init__(self, series: Series, t: Target, start: Start, order: Any, tolerance: Any) -> None:
+    def __init__(self, series: Series, t: Target, start: Start, h: Any, order: Any, tolerance: Any) -> None:
         self._series, self._t, self._order, self._tolerance = series, t, order, tolerance
-        self._start, self._n = start, series.size
+        self._start, self._n, self._whole = start, series.size, h
         self._inverse = [[None if x is None else t.abs(x) for x in row] for row in start.inverse.rows]
         matrix = start.inverse.matrix
         self._roots = [t.sqrt(matrix[i, i]) for i in range(self._n)]
         self._per_root = [t.div(t.number(1.0), root) for root in self._roots]
         self._per = t.reciprocal(order)
         self._per_next = t.reciprocal(t.plus(order, 1))
-
-    def check(self, h: Any) -> tuple[Any, list]:
-        """Tell whether the step of length h is certified, and return the bounds on what v leaves out."""
-        t, n = self._t, self._n
-        self._fine, self._h = self._start.inverse.definite, h
         self._measure()
+
+    def check(self, part: Any = None, power: Any = None) -> tuple[Any, list]:
+        """Tell whether the step, or a part of it, is certified, and return the bounds on what v leaves out.
+
+        A part f < 1 makes Σ' |x_k| at most f times as large, and overlaps, sums of orders from N on, f^N
+        times.
+
+        Parameters
+        ----------
+        part, power : number, optional
+            The part, and its N-th power.
+        """
+        t, n = self._t, self._n
+        self._fine, self._power = self._start.inverse.definite, power
+        self._h, self._later = self._whole, self._norms
+        if part is not None:
+            self._h = t.mul(self._whole, part)
+            self._later = {slot: t.mul(part, x) for slot, x in self._norms.items()}
+        self._all = {slot: t.add(x, self._size(slot, t.index(0))) for slot, x in self._later.items()}
         self._sizes = self._find_sizes()
         self._rest = [t.mul(self._tolerance, size) for size in self._sizes]
         self._tails: dict[int, Any] = {}
         for i in self._series._live:
             self._tails[i] = self._tail(i)
         right, change = self._balance()
-        base = [t.number(0.0) if b is None else t.mul(h, b) for b in _times(t, self._inverse, right)]
+        base = [t.number(0.0) if b is None else t.mul(self._h, b) for b in _times(t, self._inverse, right)]
         coupled = any(e is not None for row in change for e in row)
         # The fixed point of E = base + C E by a few terms of its Neumann series, a little enlarged; any E > 0
         # that passes the strict inequality is as good as another.
@@ -607,22 +646,30 @@ class Certificate:
             passed = t.both(passed, t.both(t.less(new, g), t.less(bound, rest)))
         return passed, self._bounds
 
-    def part(self) -> Any:
-        """Return a part of the step that will probably be certified, where the last check was not passed."""
-        t, series = self._t, self._series
+    def shorten(self, passed: Any, part: Any, power: Any) -> tuple[Any, Any]:
+        """Return a smaller part of the step that will probably be certified, where this one was not."""
+        t = self._t
         # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
         bounds = terms = t.number(0.0)
         for i, (bound, rest) in enumerate(zip(self._bounds, self._rest, strict=True)):
-            per = t.div(t.number(1.0), rest)
-            slot = series._slots["v", i]
-            before = t.mul(t.number(0.1), t.abs(t.load(slot, t.plus(self._order, -1))))
+            per, slot = t.div(t.number(1.0), rest), self._series._slots["v", i]
+            last = t.add(self._size(slot, self._order), t.mul(t.number(0.1), self._last_but_one(slot)))
             bounds = self._larger(bounds, t.mul(bound, per))
-            terms = self._larger(terms, t.mul(t.add(t.abs(t.load(slot, self._order)), before), per))
-        power = t.mul(self._per_next, t.elementary("log", t.select(self._fine, bounds, terms)))
+            terms = self._larger(terms, t.mul(t.mul(power, last), per))
+        root = t.mul(self._per_next, t.elementary("log", t.select(self._fine, bounds, terms)))
         safety = t.select(self._fine, t.number(0.95), t.number(0.8))
-        found = t.mul(safety, t.elementary("exp", t.neg(power)))
+        found = t.mul(safety, t.elementary("exp", t.neg(root)))
         found = t.select(t.less(found, t.number(0.5)), found, t.number(0.5))
-        return t.select(t.less(t.number(0.02), found), found, t.number(0.02))
+        found = t.select(t.less(t.number(0.02), found), found, t.number(0.02))
+        found = t.select(passed, t.number(1.0), found)
+        (raised,) = t.loop(t.index(0), self._order, [power], lambda k, carried: [t.mul(found, carried[0])])
+        return t.mul(found, part), raised
+
+    def _size(self, slot: int, k: Any) -> Any:
+        return self._t.abs(self._t.load(slot, k))
+
+    def _last_but_one(self, slot: int) -> Any:
+        return self._size(slot, self._t.plus(self._order, -1))
 
     def _larger(self, a: Any, b: Any) -> Any:
         return self._t.select(self._t.less(a, b), b, a)
@@ -636,24 +683,21 @@ class Certificate:
         return [t.mul(total, per) for per in self._per_root]
 
     def _measure(self) -> None:
-        """Find norms of all slots, with and without order 0, and the overlaps H of all pairs."""
+        """Find the norms Σ' of all slots, and the overlaps H of all pairs."""
         t, order, pairs = self._t, self._order, self._series._distinct
-        self._later: dict[int, Any] = {}
+        self._norms: dict[int, Any] = {}
         self._overlaps: dict[tuple[Factor, Factor], Any] = {}
         for first in range(0, len(pairs), GROUP):
             self._measure_pairs(pairs[first : first + GROUP])
-        alone = [slot for slot in range(self._series.slots) if slot not in self._later]
+        alone = [slot for slot in range(self._series.slots) if slot not in self._norms]
         for first in range(0, len(alone), GROUP):
             some = alone[first : first + GROUP]
 
             def accumulate(k: Any, carried: Sequence, some: Sequence = some) -> list:
-                return [
-                    t.add(total, t.abs(t.load(slot, k))) for slot, total in zip(some, carried, strict=True)
-                ]
+                return [t.add(total, self._size(slot, k)) for slot, total in zip(some, carried, strict=True)]
 
             totals = t.loop(t.index(1), order, [t.number(0.0)] * len(some), accumulate)
-            self._later |= dict(zip(some, totals, strict=True))
-        self._all = {slot: t.add(x, t.abs(t.load(slot, t.index(0)))) for slot, x in self._later.items()}
+            self._norms |= dict(zip(some, totals, strict=True))
 
     def _measure_pairs(self, pairs: Sequence[tuple[Factor, Factor]]) -> None:
         """Sum |A_j| times the sum of |B_m| over m >= N - j."""
@@ -668,11 +712,15 @@ class Certificate:
             return [*sums.values(), *(t.fma(x[a], sums[b], total) for (a, b), total in totals)]
 
         found = t.loop(t.index(1), order, [t.number(0.0)] * (len(upper) + len(pairs)), accumulate)
-        self._later |= {b.slot: s for b, s in zip(upper, found, strict=False)}
+        self._norms |= {b.slot: s for b, s in zip(upper, found, strict=False)}
         self._overlaps |= dict(zip(pairs, found[len(upper) :], strict=True))
 
     def _overlap(self, key: Any) -> Any:
-        return self._overlaps[self._series._pairs[key]]
+        return self._powered(self._overlaps[self._series._pairs[key]])
+
+    def _powered(self, x: Any) -> Any:
+        """Return what terms of order N and above, of this size together, are in the part of the step."""
+        return x if self._power is None else self._t.mul(self._power, x)
 
     def _norm(self, n: int) -> Any:
         return self._all[self._series._factor(n).slot]
@@ -697,11 +745,11 @@ class Certificate:
     def _require(self, condition: Any) -> None:
         self._fine = self._t.both(self._fine, condition)
 
-    def _integrated(self, factor: Factor, tail: Any) -> Any:
+    def _integrated(self, slot: int, tail: Any) -> Any:
         """Return h(|x_{N-1}| + E_x)/N, a bound on the tail of the series that has hx for its derivative."""
         t = self._t
-        last = t.abs(factor.load(t, t.plus(self._order, -1)))
-        return t.mul(t.mul(self._h, self._per), t.add(last, tail))
+        last = t.mul(self._powered(self._whole), self._last_but_one(slot))
+        return t.mul(self._per, t.fma(self._h, tail, last))
 
     def _tail(self, n: int) -> Any:
         """Return a bound on the coefficients of order N and above of a node."""
@@ -709,9 +757,9 @@ class Certificate:
         node = series.record.nodes[n]
         op, args = node.op, node.args
         if op in ("place", "velocity"):
-            factor = Factor(series._slots["v", node.index])
-            tail = t.add(t.abs(factor.load(t, self._order)), self._rest[node.index])
-            return tail if op == "velocity" else self._integrated(factor, tail)
+            slot = series._slots["v", node.index]
+            tail = t.add(self._powered(self._size(slot, self._order)), self._rest[node.index])
+            return tail if op == "velocity" else self._integrated(slot, tail)
         if op == "polynomial":
             return t.number(0.0)
         if op == "sum":
@@ -732,12 +780,12 @@ class Certificate:
         if op == "reciprocal":
             (x,) = args
             slot = series._factor(x).slot
-            p = t.sub(t.sub(t.abs(t.load(slot, t.index(0))), self._later[slot]), self._tails[x])
+            p = t.sub(t.sub(self._size(slot, t.index(0)), self._later[slot]), self._tails[x])
             self._require(t.less(t.number(0.0), p))
             return t.div(t.fma(self._tails[x], self._norm(n), self._overlap(n)), p)
         if op == "sqrt":
             slot = series._factor(n).slot
-            p = t.sub(t.abs(t.load(slot, t.index(0))), self._later[slot])
+            p = t.sub(self._size(slot, t.index(0)), self._later[slot])
             r = t.add(self._tails[args[0]], self._overlap(n))
             return t.div(r, self._reach(p, r))
         return self._tails[n] if n in self._tails else self._tail_of_function(n, op, args)
@@ -753,8 +801,8 @@ class Certificate:
         t, series = self._t, self._series
         slope = series._slope(n)
         if slope.back:  # D is h times the argument's rate
-            along, scale = t.mul(self._h, self._all[slope.slot]), t.mul(self._h, self._per)
-            lead = self._integrated(Factor(slope.slot), self._tails[args[2]])
+            along, scale = t.mul(self._h, self._all[slope.slot]), t.mul(self._whole, self._per)
+            lead = self._integrated(slope.slot, self._tails[args[2]])
         else:
             along, scale, lead = self._later[slope.slot], self._per, self._tails[args[0]]
         b = t.fma(along, self._per_next, lead)
@@ -787,7 +835,7 @@ class Plain:
     """
 
     def __init__(self, slots: int, number: Callable = float, xp: Any = None) -> None:
-        self._memory: list[dict[int, Any]] = [{} for _ in range(slots + 1)]
+        self._memory: list[dict[int, Any]] = [{} for _ in range(slots)]
         self.number = number
         self._functions: Any = None
         if xp is not None:
@@ -832,6 +880,9 @@ class Plain:
 
     def both(self, a: bool, b: bool) -> bool:
         return a and b
+
+    def either(self, a: bool, b: bool) -> bool:
+        return a or b
 
     def all(self, condition: bool) -> bool:
         return condition
@@ -883,9 +934,8 @@ class Plain:
                 break
         return values
 
-    def when(self, condition: bool, body: Callable) -> None:
-        if condition:
-            body()
+    def when(self, condition: bool, body: Callable, otherwise: Sequence) -> list:
+        return body() if condition else list(otherwise)
 
     def elementary(self, name: str, x: Any) -> Any:
         if self._functions is not None:

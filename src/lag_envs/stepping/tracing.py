@@ -246,9 +246,9 @@ class Trace:
     ) -> tuple[list[Operation], list[Value]]:
         """Return what computes the outputs, in order and without detours, and what the outputs are then.
 
-        Inputs named in `zeros` are known to be zero, like the numbers that `zero` returns. With ``fused=False``
-        no product is fused with a sum: all that is left rounds alike on every machine and in every language
-        (see `evaluate`).
+        Inputs named in `zeros` are known to be zero, like the numbers that `zero` returns. With
+        ``fused=False`` no product is fused with a sum: all that is left rounds alike on every machine and in
+        every language (see `evaluate`).
         """
         outputs = list(outputs)
         results = [_name(value) for value in outputs]

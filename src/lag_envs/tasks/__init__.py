@@ -7,11 +7,7 @@ add an environment, write its task and add a line here.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from lag_envs.tasks.base import Task
-
+from typing import Any
 
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "PivotedBar-v0": ("lag_envs.tasks.pivoted_bar:SwingUp", {}),

@@ -19,6 +19,9 @@ from lag_envs.stepping.tracing import Trace
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
+#: A step may be as long as a swing takes for that angle [rad], so that it needs no more substeps than are
+#: taken, also after many swings have been pumped up.
+LONGEST_TURN = 5000.0
 
 
 class Task(ABC):
@@ -54,9 +57,9 @@ class Task(ABC):
     rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
-    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares:
-    #: wherever in these ranges all of them lie, every accepted start and action gives finite observations
-    #: within their space, and steps of any `dt` are taken.
+    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares.
+    #: Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
+    #: gives finite observations within their space, and every step is taken.
     usable: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(
@@ -104,6 +107,17 @@ class Task(ABC):
                 raise ValueError(
                     f"{name} must lie between {low:g} and {high:g} in this environment, got {value!r}"
                 )
+        fastest = self.fastest
+        if fastest * self.dt > LONGEST_TURN:
+            raise ValueError(
+                f"dt must be at most {LONGEST_TURN / fastest:.3g} s where speeds reach {fastest:.3g} rad/s, "
+                f"got {self.dt!r} s with {self.scene}"
+            )
+
+    @property
+    def fastest(self) -> float:
+        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
+        return 0.0
 
     @classmethod
     def usable_ranges(cls) -> dict[str, tuple[float, float]]:

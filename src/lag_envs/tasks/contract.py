@@ -33,12 +33,12 @@ _UNBOUNDED = float(np.finfo(np.float32).max)
 class Task:
     """A task on a scene.
 
-    A subclass says what its attributes and methods ask for; `scene`, `interval`, `steps`, `action`, `observe` and
-    `reward` at least. Formulas go by name: ``before`` and ``after`` are the state at the step's two ends, with the
-    names of ``scene.state_names``, ``control`` the controls that were applied, ``target`` the targets. They use
-    ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, and functions of ``xp``: sin, cos, tan, atan, tanh,
-    sqrt, exp, log, where, abs, minimum, maximum. The scene's parameters and energies may be used:
-    ``self.scene.mass``, ``self.scene.potential(after, xp)``.
+    A subclass says what its attributes and methods ask for; `scene`, `interval`, `steps`, `action`, `observe`
+    and `reward` at least. Formulas go by name: ``before`` and ``after`` are the state at the step's two ends,
+    with the names of ``scene.state_names``, ``control`` the controls that were applied, ``target`` the
+    targets. They use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, and functions of
+    ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum. The scene's parameters
+    and energies may be used: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
 
     Attributes
     ----------
@@ -152,12 +152,12 @@ class Task:
         """Raise ValueError where the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for a start from which the task cannot go on; `state` goes by name and by index."""
+        """Raise ValueError for a start that the task cannot have; `state` goes by name and by index."""
 
     # --- what follows --------------------------------------------------------------------------------------
 
     def chance(self, per_interval: float) -> float:
-        """Return a step's chance of what has a chance per interval, so that a second has as many for any `dt`."""
+        """Return a step's chance of what has a chance per interval: a second has as many for any `dt`."""
         recorded = vars(self).get("_recorded_chance")
         if recorded is not None:
             return recorded(per_interval)
@@ -300,7 +300,8 @@ class TaskFormulas:
         self.choices = tuple(len(a.values) for a in self.acting if a.values)
         if self.choices and len(self.choices) != self.actions:
             raise FormulaError(
-                f"{type(task).__name__}.action mixes lists of values with ranges; give each control one or each the other"
+                f"{type(task).__name__}.action mixes lists of values with ranges; "
+                "give each control one or each the other"
             )
         self.clipped = not self.choices
         self.target_boxes = _target_boxes(task)
@@ -310,7 +311,7 @@ class TaskFormulas:
         self.has_last = type(task).last_reward is not Task.last_reward
         self.observation = self._names()
 
-    # --- constants -------------------------------------------------------------------------------------------
+    # --- constants ------------------------------------------------------------------------------------------
 
     def constants(self) -> dict[str, float]:
         """Return every number that compiled functions take, by name."""
@@ -342,7 +343,7 @@ class TaskFormulas:
         """Return the code of a control step."""
         return self._task.scene._stepper.code(absent)
 
-    # --- formulas --------------------------------------------------------------------------------------------
+    # --- formulas -------------------------------------------------------------------------------------------
 
     def _self(self, k: Any) -> Task:
         """Return a task whose numbers are those that are recorded."""
@@ -393,7 +394,8 @@ class TaskFormulas:
         for name in found:
             if name not in wanted:
                 raise FormulaError(
-                    f"{type(self._task).__name__}.guard: there is no control {name!r}, only {', '.join(wanted)}"
+                    f"{type(self._task).__name__}.guard: there is no control {name!r}, "
+                    f"only {', '.join(wanted)}"
                 )
         return list((wanted | dict(found)).values())
 
@@ -434,7 +436,8 @@ class TaskFormulas:
         found = self._call("observe", k, self._state(y), self._targets(g), xp)
         if not isinstance(found, Mapping) or not found:
             raise FormulaError(
-                f"{type(self._task).__name__}.observe must return numbers by name, in order, got {found!r:.60}"
+                f"{type(self._task).__name__}.observe must return numbers by name, in order, "
+                f"got {found!r:.60}"
             )
         return list(found.values())
 

@@ -33,8 +33,8 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
     Notes
     -----
     A class that can be imported is registered by its place, so that specifications survive JSON. One that
-    stands in a notebook or inside a function is registered itself; worker processes then need cloudpickle, which
-    Gymnasium's `AsyncVectorEnv` and Stable-Baselines3's `SubprocVecEnv` use.
+    stands in a notebook or inside a function is registered itself; worker processes then need cloudpickle,
+    which Gymnasium's `AsyncVectorEnv` and Stable-Baselines3's `SubprocVecEnv` use.
     """
     if isinstance(task, type):
         id = id or getattr(task, "id", "")
