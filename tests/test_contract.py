@@ -166,6 +166,8 @@ def test_declared_dicts_are_copies_that_cannot_be_changed():
     assert isinstance(Cart.coordinates, MappingProxyType)
     with pytest.raises(TypeError):
         Cart.coordinates["y"] = "m"
+    with pytest.raises(TypeError):
+        Incline.modes["tilt"]["psi"] = "rad"
 
 
 def test_scene_itself_is_no_scene():

@@ -677,6 +677,16 @@ def left_out_free_place_that_is_needed():
     return Bad
 
 
+@mistake("coordinates", "index or range", "structural")
+def coordinates_that_count_a_parameter():
+    return changed("coordinates", property(lambda self: {f"x_{i}": "m" for i in range(self.spring)}))
+
+
+@mistake("left_out", "comparison")
+def state_that_depends_on_a_parameter():
+    return changed("left_out", property(lambda self: () if self.friction == 0.0 else ("s",)))
+
+
 @mistake("reactions", "'wall'", "prescribed")
 def reaction_on_what_is_not_prescribed():
     class Bad(Good):

@@ -119,6 +119,11 @@ def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
     return other
 
 
+def symbolic_twin(scene: Any) -> Any:
+    """Return an object like the scene whose parameters are recorded numbers."""
+    return twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
+
+
 @dataclasses.dataclass(frozen=True)
 class Record:
     """What a scene's formulas gave for symbols.
@@ -208,7 +213,7 @@ def record(scene: Any, layout: Layout) -> Record:
         Naming class and formula, where one does what a recorded number cannot follow.
     """
     names = layout.names
-    copy = twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
+    copy = symbolic_twin(scene)
     q = Values("coordinate", {name: Expr.of(place(name)) for name in names})
     v = Values("velocity of a coordinate", {name: Expr.of(velocity(name)) for name in names})
     u = Values(

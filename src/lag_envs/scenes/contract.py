@@ -11,7 +11,7 @@ import weakref
 from abc import ABCMeta
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from lag_envs.stepping.general import SeriesStepper, StepBound, StepCode
 
 Array = NDArray[np.float64]
-C = TypeVar("C", bound=type)
 
 #: Class attributes that are mappings, and those that are names in order.
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
@@ -127,6 +126,12 @@ def _annotations(cls: type) -> dict[str, Any]:
 
         return dict(annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF))
     return dict(inspect.get_annotations(cls))
+
+
+def _frozen(given: Mapping) -> Mapping:
+    """Return a copy of a mapping, and of those in it, that cannot be changed."""
+    items = {key: _frozen(value) if isinstance(value, Mapping) else value for key, value in given.items()}
+    return MappingProxyType(items)
 
 
 def _complete(cls: type) -> None:
@@ -242,25 +247,21 @@ class Scene(metaclass=SceneType):
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         for parent in cls.__mro__[1:]:
-            if (
-                isinstance(parent, SceneType)
-                and parent is not Scene
-                and "__dataclass_fields__" not in vars(parent)
-            ):
+            if isinstance(parent, SceneType) and parent is not Scene:
                 _complete(parent)
         own, annotations = vars(cls), _annotations(cls)
         faults = []
         for name in (*MAPPINGS, *SEQUENCES):
-            if name in annotations and not str(annotations[name]).replace("typing.", "").startswith(
-                "ClassVar"
-            ):
-                # A dataclass would take it for a field; what is wrong is said when the class is used.
-                if isinstance(own.get(name), dataclasses.Field):
-                    faults.append(f"{name} is part of every scene; give the parameter another name")
-                    delattr(cls, name)
-                else:
-                    faults.append(f"{name} has an annotation; write {name} = ... without one")
-                del annotations[name]
+            kind = str(annotations.get(name, "ClassVar")).removeprefix("typing.")
+            if kind.startswith("ClassVar"):
+                continue
+            # A dataclass would take it for a field; what is wrong is said when the class is used.
+            if isinstance(own.get(name), dataclasses.Field):
+                faults.append(f"{name} is part of every scene; give the parameter another name")
+                delattr(cls, name)
+            else:
+                faults.append(f"{name} has an annotation; write {name} = ... without one")
+            del annotations[name]
         if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
             annotations["control"] = "str"
             if "control" not in own:
@@ -269,7 +270,7 @@ class Scene(metaclass=SceneType):
             cls.__annotations__ = annotations
         for name in MAPPINGS:
             if isinstance(own.get(name), Mapping):
-                setattr(cls, name, MappingProxyType(dict(own[name])))
+                setattr(cls, name, _frozen(own[name]))
         for name in SEQUENCES:
             if isinstance(own.get(name), list):
                 setattr(cls, name, tuple(own[name]))
@@ -342,19 +343,13 @@ class Scene(metaclass=SceneType):
         """Names of coordinates, controls and state."""
         found = vars(self).get("_cached_layout")
         if found is None:
-            of = type(self).__name__
-            chosen, absent = _controls(self)
-            found = make_layout(
-                of,
-                coordinates=self.coordinates,
-                prescribed=self.prescribed,
-                controls=chosen,
-                absent=absent,
-                state=self.state,
-                left_out=self.left_out,
-                reactions=self.reactions,
-                ratios=self.ratios,
-            )
+            # Properties may branch and count on structural fields, not on parameters.
+            copy, declared = recording.symbolic_twin(self), {}
+            for name in (*MAPPINGS, *SEQUENCES):
+                with recording.formula(self, name):
+                    declared[name] = getattr(copy, name)
+            controls, absent = _controls(self, declared.pop("modes"), declared.pop("controls"))
+            found = make_layout(type(self).__name__, controls=controls, absent=absent, **declared)
             vars(self)["_cached_layout"] = found
         return found
 
@@ -875,19 +870,19 @@ def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
     return scene
 
 
-def _controls(scene: Scene) -> tuple[Any, tuple[str, ...]]:
-    """Return the mode's controls, and the names of those that only other modes have."""
+def _controls(scene: Scene, modes: Any, controls: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return the mode's controls, and the names of all modes' controls."""
     of = type(scene).__name__
-    if not isinstance(scene.modes, Mapping):
-        raise FormulaError(f"{of}.modes must map names to controls, got {scene.modes!r:.80}")
-    if not scene.modes:
-        return scene.controls, ()
-    if scene.controls:
+    if not isinstance(modes, Mapping):
+        raise FormulaError(f"{of}.modes must map names to controls, got {modes!r:.80}")
+    if not modes:
+        return controls, ()
+    if controls:
         raise FormulaError(f"{of} has controls and modes; put the controls into the modes")
     every: dict[str, str] = {}
-    for mode, controls in scene.modes.items():
-        every |= units(f"{of}.modes[{mode!r}]", controls)
-    return scene.modes[scene.control], tuple(every)  # type: ignore[attr-defined]
+    for mode, given in modes.items():
+        every |= units(f"{of}.modes[{mode!r}]", given)
+    return modes[scene.control], tuple(every)  # type: ignore[attr-defined]
 
 
 def _check_class(cls: type[Scene]) -> None:
