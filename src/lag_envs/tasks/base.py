@@ -19,8 +19,8 @@ from lag_envs.stepping.tracing import Trace
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
-#: A step may be as long as a swing takes for that angle [rad], so that it needs no more substeps than are
-#: taken, also after many swings have been pumped up.
+#: Angle [rad] through which `Task.fastest` may turn in a step. It then needs far fewer substeps than are
+#: allowed, also after many steps have added to the speed.
 LONGEST_TURN = 5000.0
 
 

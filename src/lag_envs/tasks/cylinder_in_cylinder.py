@@ -144,7 +144,7 @@ class Tilt(_Shell):
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
     | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | its radius r, below `shell_radius` |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
     | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0.24 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
     | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
@@ -286,7 +286,7 @@ class Pump(_Shell):
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
     | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | its radius r, below `shell_radius` |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
     | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0.024 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
     | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
@@ -435,7 +435,7 @@ class Damping(Task):
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
     | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | its radius r, below `shell_radius` |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
     | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0 | N m s | 0 to 1e9 | constant drag; adds to the brake |
     | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
