@@ -101,7 +101,9 @@ def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
         For the first thing that does not; the text names the line and the remedy.
     """
     found = cheap(board, pin)
-    wrong = [text for finding in found.findings for text in finding.wrong]
+    # What history tells names the line that was changed, and not only the next that does not follow.
+    findings = sorted(found.findings, key=lambda finding: finding.name != "history")
+    wrong = [text for finding in findings for text in finding.wrong]
     if wrong:
         more = f" ({len(wrong) - 1} more: `lag-envs leaderboard audit` tells all)" if wrong[1:] else ""
         raise BoardError(wrong[0] + more)
@@ -135,6 +137,7 @@ def cheap(board: Board, pin: Path | None = None) -> Cheap:
         found.state = fold(found.lines)
     except BoardError as error:
         chain.wrong.append(f"{board.folder}: {error}")
+        found.findings.append(_history(board, found.log))
         return found
     whole = found.log[: len(found.log) - len(torn)]
     chained = [line.number for line in found.lines if line.event.prev is not None]
