@@ -142,7 +142,7 @@ NO_SEED_LISTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", NO_SEEDS, ids=repr)
+@pytest.mark.parametrize("seed", NO_SEEDS, ids=lambda seed: type(seed).__name__)
 def test_no_seeds(seed):
     env, envs = make("InclineBrake-v0"), gym.make_vec("InclineBrake-v0", num_envs=3)
     said = []
