@@ -19,7 +19,7 @@ import pytest
 from fake_submissions import ENV, write
 
 from lag_envs import cli
-from lag_envs.leaderboard import docs, protocol
+from lag_envs.leaderboard import alike, audit, docs, protocol
 from lag_envs.leaderboard.board import Board, board_data
 from lag_envs.leaderboard.log import STATES
 from lag_envs.leaderboard.ranking import LEVEL, RESAMPLES
@@ -55,7 +55,8 @@ def test_from_adding_to_the_ranking(run):
     (id,) = ids()
     assert status == 0
     assert out == f"{id}: pending, until a nonce is published: `lag-envs leaderboard nonce`\n"
-    assert run("nonce", "drand-1234") == (0, f"nonce: drand-1234\n{id}: verified\n", "")
+    beacon = "https://api.drand.sh/public/1234"
+    assert run("nonce", "drand-1234", "--source", beacon) == (0, f"nonce: drand-1234\n{id}: verified\n", "")
     assert run("add", "a")[1] == f"{id}: is there already, verified\n"
     status, out, _ = run("list")
     assert status == 0 and re.search(rf"1 +0\.\d{{4}} +0\.\d+ to 0\.\d+ +100\.0 % +learned +PPO +{id}", out)
@@ -70,7 +71,7 @@ def test_from_adding_to_the_ranking(run):
 def test_add_with_a_nonce(run):
     folders = [write(name, name) for name in ("a", "b")]
     status, out, _ = run("add", *folders, "--nonce", "test-1")
-    assert status == 0 and out == "".join(f"{id}: verified\n" for id in ids())
+    assert status == 0 and out == "nonce: test-1\n" + "".join(f"{id}: verified\n" for id in ids())
 
 
 def test_what_is_refused_is_told_and_costs_the_others_nothing(run):
@@ -121,8 +122,10 @@ def test_withdraw(run):
     write("a")
     run("add", "a", "--nonce", "n")
     (id,) = ids()
-    assert run("withdraw", id, "--reason", "wrong\x1b[2J numbers")[0] == 0
-    assert f"{id} withdrawn: wrong?[2J numbers" in run("list")[1]  # and nothing reaches the terminal
+    status, _, err = run("withdraw", id, "--reason", "wrong\x1b[2J numbers")
+    assert status == 2 and "this cannot be noted: withdrawn.reason: it holds the invisible U+001B" in err
+    assert run("withdraw", id, "--reason", "wrong numbers")[0] == 0
+    assert f"{id} withdrawn: wrong numbers" in run("list")[1]
     assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")
 
 
@@ -144,6 +147,7 @@ def test_mistakes(run):
     )
     assert "there is no 'x' on the board" in run("show", "x")[2]
     assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
+    assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
     Path("leaderboard/board.jsonl").write_text("<<<<<<< HEAD\n")
     assert "line 1 is no event" in run("list")[2]
 
@@ -177,8 +181,17 @@ def test_build(run):
 def test_serve(run):
     write("a", "An agent")
     run("add", "a", "--nonce", "n")
-    command = [sys.executable, "-m", "lag_envs.cli", "leaderboard", "serve", "--port", "0"]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    script = (
+        "import fake_submissions; from lag_envs import cli; fake_submissions.install(); raise SystemExit("
+    )
+    script += "cli.main(['leaderboard', 'serve', '--port', '0']))"
+    path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    server = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path},
+    )
     stop = threading.Timer(60, server.kill)
     stop.start()
     try:
@@ -235,8 +248,14 @@ def test_the_page_states_the_protocols_numbers():
         f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes with one",
         f"Score (IQM) in {protocol.DISTURBED_EPISODES} episodes when acting",
         f"Percentile bootstrap, {100 * LEVEL:.0f} %, {RESAMPLES:,} samples",
-        f"mean scores agree within {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),
+        f"mean scores differ by at most {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),
+        f"no more than {protocol.APART:.0%} of the episodes".replace("%", " %"),
+        f"Two policies play {alike.EPISODES} episodes",
+        f"differ by less than {alike.ACTIONS:.0e} (root".replace("e-0", "e-"),
+        f"of one learner that differ by less than {alike.TWINS:.0e}".replace("e-0", "e-"),
     ]
+    assert alike.RETURNS == 0.1 and "a tenth of a standard error of the score" in text
+    assert audit.SAMPLE == 4 and "four episodes of each policy" in text
     assert [phrase for phrase in stated if phrase not in text] == []
     assert protocol.LEARNED_POLICIES == 5 and "at least five training seeds" in text
     assert [state for state in STATES if f"| {state} |" not in text] == []

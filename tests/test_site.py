@@ -185,6 +185,37 @@ def test_little_is_enough():
     assert "protocol 0" in pages["Gone-v0-protocol-0.html"]
 
 
+def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
+    found = board_pages.data(("InclineBrake-v0",))
+    rows = found["environments"][0]["rows"]
+    like = {"id": "InclineBrake-v0-first", "name": "The <first>", "state": "withdrawn"}
+    rows[0] |= {"rank": None, "alike": like}
+    rows[1] |= {"looks_like": "P\u0420O & co"}
+    rows[2] |= {"reference": True}
+    pages, _ = render(found)
+    page = pages["InclineBrake-v0.html"]
+    ranks = re.findall(r'class="rank">([^<]*)<', page)
+    assert ranks[0] == "–" and page.count(">acts like") == 1 and page.count("though it looks the same") == 1
+    assert 'acts like <span dir="auto">The &lt;first&gt;</span>' in page and "(withdrawn)" in page
+    assert (
+        'not <span dir="auto">P\u0420O &amp; co</span>' in page and '<span class="remark">reference<' in page
+    )
+    index = pages["index.html"]
+    assert "9 ranked agents" in index and f"<bdi>{rows[1]['name']}</bdi>" in index  # the best with a rank
+
+
+def test_frozen_boards_stand_apart():
+    found = board_pages.data(("InclineBrake-v0",))
+    old = found["environments"][0] | {"frozen": True, "protocol": 1}
+    found = found | {"protocol": 2, "environments": [found["environments"][0] | {"protocol": 2}, old]}
+    pages, _ = render(found)
+    index = pages["index.html"]
+    assert index.count('class="card"') == 1
+    assert 'href="InclineBrake-v0-protocol-1.html">InclineBrake-v0, protocol 1<' in index
+    assert "protocol-1.html" not in pages["InclineBrake-v0.html"]
+    assert "frozen, protocol 1" in pages["InclineBrake-v0-protocol-1.html"]
+
+
 def files_of(folder):
     return {str(p.relative_to(folder)): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
 

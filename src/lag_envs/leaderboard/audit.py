@@ -120,6 +120,10 @@ class Cheap:
     #: What the submissions say of themselves, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
+    def chained(self, number: int) -> bool:
+        """Tell whether a line of the log holds the hash of what is before it."""
+        return any(line.number == number and line.event.prev is not None for line in self.lines)
+
 
 def cheap(board: Board, pin: Path | None = None) -> Cheap:
     """Make all checks that take no time."""
@@ -182,7 +186,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
         return found
     lines = log.split(b"\n")
     if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:
-        found.open = f"{path.name} of this release is of another board"
+        found.open = "this is not the board that this release knows: the log's first line is another"
         return found
     begun = b"\n".join(lines[: pin.lines]) + b"\n"
     if len(lines) <= pin.lines:
@@ -237,9 +241,14 @@ def _results(board: Board, found: Cheap) -> Finding:
         except BoardError as error:
             finding.wrong.append(f"{board.log}, line {_verified_at(found, entry)}: {error}")
             continue
-        found.results[entry.protocol, entry.id] = result
         where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
-        finding.wrong += [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
+        # Of the time before there was a chain.
+        if result.get("build") is None and found.chained(_verified_at(found, entry)):
+            odd.append(f"{where} does not say with which build it was made; {REMEDY}")
+        finding.wrong += odd
+        if not odd:
+            found.results[entry.protocol, entry.id] = result
     finding.told = f"{len(found.results)} are what was verified"
     return finding
 
@@ -343,6 +352,8 @@ def _history(board: Board, log: bytes) -> Finding:
         found.told = f"{len(tagged) - before} earlier versions are the beginning of this one"
         if before:
             found.told += f"; {before} are of boards that were begun again before there was a chain"
+        if git(folder, "rev-parse", "--is-shallow-repository").strip() == b"true":
+            found.told += "; the clone is shallow, so there may be more"
     except NoHistory as error:
         found.open = str(error)
     return found

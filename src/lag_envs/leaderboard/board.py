@@ -677,10 +677,12 @@ def _environment(
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
-    from lag_envs.scores import KNOWN_RETURNS
+    from lag_envs.scores import KNOWN_RETURNS, Known
 
     known = KNOWN_RETURNS[env_id]._asdict() if env_id in KNOWN_RETURNS else None
-    return known if scale is None else (known or {"optimum": None}) | scale.model_dump()
+    if scale is None:
+        return known
+    return (known or dict.fromkeys(Known._fields)) | scale.model_dump()
 
 
 def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:

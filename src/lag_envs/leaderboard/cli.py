@@ -166,7 +166,9 @@ def _open(args: argparse.Namespace) -> int:
     board = Board(args.board)
     number = board.open()
     waiting = len(board.read().waiting())
-    print(f"protocol {number}; {waiting} to be verified: commit and push, then `lag-envs leaderboard nonce`")
+    print(f"protocol {number}; to be verified under it: {waiting}")
+    if waiting:
+        print("commit and push, then `lag-envs leaderboard nonce`")
     return 0
 
 
@@ -252,6 +254,8 @@ def _some(board: Board) -> State:
 
 
 def _show(args: argparse.Namespace) -> int:
+    from lag_envs.leaderboard.audit import sound
+
     board = Board(args.board)
     state = _some(board)
     number = args.protocol or state.number
@@ -271,6 +275,8 @@ def _show(args: argparse.Namespace) -> int:
         boards = board_data(board)["environments"]
         found = next(b for b in boards if (b["id"], b["protocol"]) == (entry.env, entry.protocol))
         row = next(r for r in found["rows"] if r["id"] == entry.id)
+    else:
+        sound(board)
     if args.json:
         print(json.dumps(told | row, indent=2))
         return 0
@@ -294,7 +300,9 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _withdraw(args: argparse.Namespace) -> int:
-    Board(args.board).withdraw(args.id, args.reason)
+    board = Board(args.board)
+    _some(board)
+    board.withdraw(args.id, args.reason)
     print(f"{args.id}: withdrawn")
     return 0
 
@@ -321,7 +329,9 @@ def _audit(args: argparse.Namespace) -> int:
 
     from lag_envs.leaderboard.audit import Finding, audit
 
-    _some(Board(args.board))
+    board = Board(args.board)
+    if not os.path.lexists(board.log):
+        raise BoardError(f"{board.folder} has no log; there is nothing to audit")
     with tqdm(desc="playing again", unit=" results", disable=None, leave=False, delay=1.0) as bar:
 
         def tell(finding: Finding) -> None:
@@ -333,7 +343,7 @@ def _audit(args: argparse.Namespace) -> int:
                 for text in finding.wrong:
                     print(f"  {_plain(text)}", flush=True)
 
-        fine = audit(Board(args.board), args.pin, args.all, tell, lambda entry: bar.update())
+        fine = audit(board, args.pin, args.all, tell, lambda entry: bar.update())
     return 0 if fine else 1
 
 

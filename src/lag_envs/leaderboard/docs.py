@@ -41,12 +41,11 @@ def generated(project: Path) -> dict[Path, str]:
 
 def top(data: dict[str, Any]) -> str:
     """Return a table of the first rows of every board that is open and has some."""
-    rows = [
-        _line(environment["id"] if number == 0 else "", row)
-        for environment in data["environments"]
-        if not environment["frozen"]
-        for number, row in enumerate(environment["rows"][:TOP])
-    ]
+    rows = []
+    for environment in data["environments"]:
+        if not environment["frozen"]:
+            best = [row for row in environment["rows"] if row["rank"] is not None][:TOP]
+            rows += [_line("" if number else environment["id"], row) for number, row in enumerate(best)]
     if not rows:
         return "Nothing has been submitted yet."
     head = ("environment", "rank", "agent", "score (95 % interval)", "success", "acting 10 × as often")

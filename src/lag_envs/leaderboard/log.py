@@ -17,9 +17,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
 from lag_envs.leaderboard.fields import plain, shown
 from lag_envs.leaderboard.files import read_plain
@@ -60,8 +68,9 @@ EnvId = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+-v(0|[1-9][0-9]{0,3})$", max
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_readable)]
 Text = Annotated[str, Field(max_length=1_000), AfterValidator(_readable)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+#: Far from where sums overflow.
+Number = Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=0.0, le=1e15, allow_inf_nan=False)]
 Moment = Annotated[str, AfterValidator(_moment)]
 #: What `nonce` names as its source where it is a commit of the repository in which the board lies.
 COMMIT = "commit"
@@ -86,6 +95,12 @@ class Scale(Strict):
     random: Number
     best: Number
     policy: Name
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if self.best - self.random < 1e-9:
+            raise ValueError("the best return must be above that of random actions")
+        return self
 
 
 class Reference(Strict):

@@ -447,7 +447,7 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> list[str]:
     """Return a result as lines of text."""
     from lag_envs.leaderboard.protocol import REFERENCES
-    from lag_envs.leaderboard.ranking import corrected
+    from lag_envs.leaderboard.ranking import corrected, policy_error
     from lag_envs.scores import score
 
     if "refused" in result:
@@ -455,14 +455,16 @@ def table(result: dict[str, Any]) -> list[str]:
     env = result["env"]
     lines = [
         f"{plain(result['folder'])}: {env}, {result['episodes']} episodes each, {result['seconds']:.1f} s",
-        f"  {'seed':>6}  {'return':>12}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
+        f"  {'seed':>6}  {'return':>12}  {'±':>7}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:
-        mean = float(corrected(REFERENCES.get(env), [policy]).mean())
+        reference = REFERENCES.get(env)
+        mean = float(corrected(reference, [policy]).mean())
+        error = policy_error(reference, [policy])
         times = [t for t in policy["settle"] if t is not None]
         part = score(env, mean)
         lines.append(
-            f"  {policy['seed']:>6}  {mean:12.5g}  {'' if part is None else f'{part:.4f}':>7}"
+            f"  {policy['seed']:>6}  {mean:12.5g}  {error:7.2g}  {'' if part is None else f'{part:.4f}':>7}"
             f"  {np.mean(policy['success']):7.1%}  {f'{np.median(times):.2f} s' if times else '-':>7}"
             f"  {np.mean(policy['effort']):6.3f}"
         )

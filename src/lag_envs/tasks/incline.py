@@ -70,17 +70,20 @@ class Tilt(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m |
-    | radius | 0.05 | m | rolling radius R |
-    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0.03 | N s/m | coefficient c of the drag -cx' at the axis |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | control | tilt_rate | - | what the control is: "tilt_rate", or "tilt" |
-    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
-    | target | None | m | a mark for every episode, within ±0.5; None: random |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
+    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0.03 | N s/m | 0 to 1e9 | coefficient c of the drag -cx' at the axis |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | control | tilt_rate | - | - | what the control is: "tilt_rate", or "tilt" |
+    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    | target | None | m | ±0.5 | a mark for every episode; None: random |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -272,16 +275,19 @@ class Brake(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m |
-    | radius | 0.05 | m | rolling radius R |
-    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0 | N s/m | constant drag; adds to the brake |
-    | tilt | 0.261799 | rad | the slope φ, from 0 to π/2 |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
+    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0 | N s/m | 0 to 1e9 | constant drag; adds to the brake |
+    | tilt | 0.261799 | rad | 0 to 1.57 | the slope φ |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
     `info`.
@@ -326,6 +332,7 @@ class Brake(Task):
     scene: Incline
     scene_type = Incline
     defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
+    usable: ClassVar = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
     observation = ("distance", "v")
     limit_control = 6.0
     rest_action = -1.0
@@ -333,13 +340,9 @@ class Brake(Task):
     gentle, price = 0.5, 5.0
 
     def check(self) -> None:
-        """Refuse the other controls, and a slope on which the cylinder would not roll down."""
+        """Refuse the other controls."""
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
-        if self.scene.tilt < 0.0:
-            raise ValueError(
-                f"tilt must be at least 0 rad for the cylinder to roll down, got {self.scene.tilt:g} rad"
-            )
 
     @property
     def centre(self) -> Sequence[float]:

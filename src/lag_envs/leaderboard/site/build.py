@@ -41,7 +41,13 @@ class Column(NamedTuple):
 
 
 COLUMNS = (
-    Column("rank", "Rank", "Agents share a rank where it is not clear which of them is better.", True),
+    Column(
+        "rank",
+        "Rank",
+        "Agents share a rank where it is not clear which of them is better. One that acts like an earlier "
+        "one has none.",
+        True,
+    ),
     Column("name", "Agent", "The submission's name, and who submitted it.", True),
     Column(
         "score",
@@ -167,7 +173,8 @@ def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
     if known and known.get("optimum") is not None and known["best"] != known["random"]:
         board["optimum"] = (known["optimum"] - known["random"]) / (known["best"] - known["random"])
     # Of the best agent that can be watched; without any, the scene as it is at the start.
-    shown = next((row for row in board["rows"] if row["replays"]), None)
+    watched = [row for row in board["rows"] if row["replays"]]
+    shown = next((row for row in watched if row["rank"] is not None), watched[0] if watched else None)
     board["shown"] = shown and shown["name"]
     still = {"states": [board["start"]], "target": None} if board["start"] else None
     board["poster"] = _poster(shown["replays"][0], board) if shown else still
@@ -176,8 +183,9 @@ def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     empty: dict[str, Any] = dict.fromkeys(
-        [c.key for c in COLUMNS] + ["interval", "license", "description", "hardware", "id", "above"]
+        [c.key for c in COLUMNS] + ["interval", "license", "description", "hardware", "id", "above", "alike"]
     )
+    empty |= {"looks_like": "", "reference": False}
     row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row
     row["code"] = safe_url(row.get("code"))
     row["curves"], row["profile"] = row["curves"] or [], row["profile"] or []
