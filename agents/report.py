@@ -407,8 +407,8 @@ def _behaviour(env_id: str) -> list[str]:
         for name, by in agents.items()
     ]
     text = (
-        f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`), in the mean where nothing"
-        " else is said; of learners the range of their seeds."
+        f"In the same {found['episodes']:,} episodes (`python -m agents.behaviour`): means, where"
+        " nothing else is said; of learners the range of their seeds."
     )
     if any(name.startswith("lost") for name in head):
         text += " *Lost* is what rewards lack to 1 per step."

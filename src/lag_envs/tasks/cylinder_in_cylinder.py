@@ -185,10 +185,12 @@ class Tilt(_Shell):
 
     ## Optimal Value
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures
-    it, in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean
-    returns ± standard errors, of the other policies over 4,096 episodes; the feedback is action = 30.3 (θ* -
-    θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
+    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
+    feedback is
+
+        action = 30.3 (θ* - θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1
 
     | Id | Random actions | Zero control | Feedback | Best known |
     | -- | -------------- | ------------ | -------- | ---------- |
@@ -325,9 +327,11 @@ class Pump(_Shell):
     ## Optimal Value
 
     Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
-    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the energy pump
-    is action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1:
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum,
+    tells docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
+    energy pump is
+
+        action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1
 
     | Id | Random actions | Zero control | Energy pump | Best known |
     | -- | -------------- | ------------ | ----------- | ---------- |
@@ -472,9 +476,11 @@ class Damping(Task):
     ## Optimal Value
 
     Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
-    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the switching
-    line is full brake away from the bottom, and action = 14.6 (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum,
+    tells docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
+    switching line is
+
+        full brake away from the bottom; towards it action = 14.6 (|θ'| - 6.94 |θ|), clipped to ±1
 
     | Id | Random actions | Zero control | Switching line | Best known |
     | -- | -------------- | ------------ | -------------- | ---------- |

@@ -110,10 +110,12 @@ class Tilt(Task):
 
     ## Optimal Value
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures
-    it, in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean
-    returns ± standard errors, of the other policies over 4,096 episodes; the cascade is φ_wanted = -1.45 (x -
-    x*) - 1.28 w, clipped to ±0.1, and action = 43.4 (φ_wanted - φ), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
+    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
+    cascade is
+
+        φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1, and action = 43.4 (φ_wanted - φ), clipped to ±1
 
     | Id | Random actions | Zero control | Cascade | Best known |
     | -- | -------------- | ------------ | ------- | ---------- |
@@ -312,11 +314,13 @@ class Brake(Task):
 
     ## Optimal Value
 
-    Known: roll freely, then brake fully, from the best moment on. `lag_envs.controllers.optimal_return` is
-    what that returns from any start; no policy exceeds it. The best policy known, which acts at intervals,
-    misses it by 0.0002 in the mean (`python -m agents.scale` measures both, in episodes of their own). Mean
-    returns ± standard errors, of the other policies over 4,096 episodes; the switching line is action = 14.6
-    (v - 0.149 - 2.33 distance), clipped to ±1:
+    Known: roll freely, then brake fully, from the best moment on. `lag_envs.controllers.optimal_return`
+    is what that returns from any start; no policy exceeds it. The best policy known, which acts at
+    intervals, misses it by 0.0002 in the mean (`python -m agents.scale` measures both, in episodes of
+    their own). Mean returns ± standard errors, of the other policies over 4,096 episodes; the switching
+    line is
+
+        action = 14.6 (v - 0.149 - 2.33 distance), clipped to ±1
 
     | Id | Random actions | Zero control | Switching line | Best known |
     | -- | -------------- | ------------ | -------------- | ---------- |

@@ -121,9 +121,9 @@ class SwingUp(Task):
 
     ## Optimal Value
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures
-    it, in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean
-    returns ± standard errors, of the other policies over 4,096 episodes:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
+    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes:
 
     | Id | Random actions | Zero control | Best known |
     | -- | -------------- | ------------ | ---------- |
@@ -330,10 +330,12 @@ class Balance(SwingUp):
 
     ## Optimal Value
 
-    Not known. The best policy known is a linear-quadratic regulator (`python -m agents.scale` measures it, in
-    episodes of its own); what value iteration estimates of a far easier task, tells docs/agents.md. Mean
-    returns ± standard errors, of the other policies over 4,096 episodes; the linear feedback is action = 1.83
-    s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
+    Not known. The best policy known is a linear-quadratic regulator (`python -m agents.scale` measures
+    it, in episodes of its own); what value iteration estimates of a far easier task, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
+    linear feedback is
+
+        action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1
 
     | Id | Random actions | Zero control | Linear feedback | Best known |
     | -- | -------------- | ------------ | --------------- | ---------- |
