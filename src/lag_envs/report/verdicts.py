@@ -203,7 +203,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "are its own machine code called from a compiled loop, longer times one call of propagate_until, a "
         "batch goes in blocks of twice the width that it recommends. SciPy's compiled dopri5, dop853 and "
         "lsoda have a compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is "
-        "compiled as a whole, a scan over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
+        "compiled as a whole, a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
         "runs in its compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no "
         "batch, so that theirs is one state after the other. What would take longer than some seconds is not "
         "run.",
