@@ -79,38 +79,34 @@ def stepper(system: System):
 def inputs(system, state, control):
     """Return the inputs of the series by name, places and velocities."""
     found, constants, code = stepper(system)
-    given = constants | found.prepare(FLOATS, state, control, constants) | {"start_elapsed": 0.0}
+    given = constants | found.prepare(FLOATS, state, control, constants)
     n = code.record.size
-    return {name: given[name] for name in code.record.inputs}, *([given[f"{x}{i}"] for i in range(n)] for x in "qv")
+    return {name: given[name] for name in code.record.given}, *([given[f"{x}{i}"] for i in range(n)] for x in "qv")
 
 
-def _run(rows, order, tolerance):
-    attempt(rows, 0, order, tolerance)  # noqa: F821
+def _run(rows, dt, order, tolerance):
+    return attempt(rows, 0, dt, order, tolerance)  # noqa: F821
 
 
 @cache
-def compiled(record, lanes, fused=True):
+def compiled(record, lanes=1, fused=True):
     return compile_python("run", _run, compile_attempt(record, lanes, fused))
 
 
-def attempts(system, cases, order, tolerance, lanes=LANES, fused=True):
+def attempts(system, cases, order, tolerance):
     """Return for each case (state, control, h) the length that was certified, 0 if none, and bounds on the tails."""
     record = stepper(system)[2].record
     layout, n = Layout(record), record.size
-    run, results = compiled(record, lanes, fused), []
-    for first in range(0, len(cases), lanes):
-        some = cases[first : first + lanes]
-        rows = np.zeros((layout.rows, lanes))
-        for lane, (state, control, h) in enumerate([*some, *[some[-1]] * (lanes - len(some))]):
-            given, q, v = inputs(system, state, control)
-            for name, row in layout.inputs.items():
-                rows[row, lane] = given[name]
-            rows[layout.q : layout.q + n, lane], rows[layout.v : layout.v + n, lane] = q, v
-            rows[layout.h, lane] = h
-        run(rows.reshape(-1), order, tolerance)
-        for lane in range(len(some)):
-            used = rows[layout.used, lane] if rows[layout.done, lane] else 0.0
-            results.append((used, rows[layout.bound : layout.bound + n, lane].tolist()))
+    run, results = compiled(record), []
+    for state, control, h in cases:
+        rows = np.zeros(layout.rows)
+        given, q, v = inputs(system, state, control)
+        for name, row in layout.inputs.items():
+            rows[row] = given[name]
+        rows[layout.q : layout.q + n], rows[layout.v : layout.v + n] = q, v
+        rows[layout.left] = rows[layout.wish] = h
+        run(rows, h, order, tolerance)
+        results.append((h - rows[layout.left], rows[layout.bounds + n : layout.bounds + 2 * n].tolist()))
     return results
 
 
