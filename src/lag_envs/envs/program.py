@@ -302,7 +302,7 @@ class Program:
             # The status of a lane that is to be restarted tells that it is not to be stepped.
             before = [
                 *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
-                *_store(_at, self.u), *(f"{_at(row)} = {name}" for name, row in rows.items()),
+                *_store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
             ]  # fmt: skip
             after = [f"{name} = {_at(rows[name])}" for name in self._stepper.results]
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"

@@ -21,8 +21,11 @@ from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.lowering import Lowering, SeriesRecord
+from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
+
+#: Rows that `advance_block` fills itself.
+SCRATCH = ("left", "wish")
 
 
 class SeriesStepper:
@@ -46,7 +49,7 @@ class SeriesStepper:
 
     def _moving(self) -> dict[str, list[Expr]]:
         """Return the moving prescribed coordinates as polynomials in time."""
-        elapsed = Expr.of(Atom("start", "elapsed"))
+        elapsed = Expr.of(CLOCK)
         moving: dict[str, list[Expr]] = {}
         for p in self._layout.at("acceleration", "rate"):
             s = Expr.of(Atom("start", p.name))
@@ -83,7 +86,7 @@ class SeriesStepper:
         for name in self._whole.inputs:
             if name.startswith("control_"):
                 inputs[name] = given[name.removeprefix("control_")]
-            elif name.startswith("start_") and name != "start_elapsed":
+            elif name.startswith("start_"):
                 inputs[name] = given[name.removeprefix("start_")]
         q = [
             given.get(name, 0.0) for name in self._layout.free
@@ -182,9 +185,7 @@ class SeriesStepper:
         from lag_envs.stepping.driver import compile_advance_tangents
 
         record, n = self._tangents, len(self._layout.free)
-        columns = tuple(
-            x for x in record.inputs if x.startswith(("control_", "start_")) and x != "start_elapsed"
-        )
+        columns = tuple(x for x in record.inputs if x.startswith(("control_", "start_")))
         k: dict[str, Any] = {f"p_{name}": parameters[name] for name in self._parameters}
         constants = _evaluated(record, {parameter(name): value for name, value in parameters.items()})
         count, wide = len(states), states.shape[1] + controls.shape[1]
@@ -193,8 +194,8 @@ class SeriesStepper:
         y, u = given[: states.shape[1]], given[states.shape[1] :]
         before = self.prepare(VariableFunctions(), y, u, k)
         moving = [f"q{i}" for i in range(n)] + [f"v{i}" for i in range(n)]
-        values = np.zeros((count, len(record.inputs) + 2 * n))
-        for i, name in enumerate([*record.inputs, *moving]):
+        values = np.zeros((count, len(record.given) + 2 * n))
+        for i, name in enumerate([*record.given, *moving]):
             if name in before:
                 values[:, i] = before[name].value
             elif name in constants:
@@ -206,7 +207,7 @@ class SeriesStepper:
         core = slopes.reshape(count, 2 * n, -1)
         inner = np.stack([before[name].slopes for name in [*moving, *columns]])
         ends = np.einsum("bik,kjb->ijb", core, inner)
-        after = [Variable(values[:, len(record.inputs) + i], ends[i]) for i in range(2 * n)]
+        after = [Variable(values[:, len(record.given) + i], ends[i]) for i in range(2 * n)]
         finished = self.finish(VariableFunctions(), after[:n], after[n:], y, u, dt, k)
         return np.stack([z.slopes for z in finished]).transpose(2, 0, 1), 0
 
@@ -276,7 +277,7 @@ class StepCode:
         Names of the constants that the code uses.
     rows : list of str
         Rows of a lane that the block function reads and writes: inputs, then places and velocities, then the
-        status.
+        status, then `SCRATCH`, which it fills itself.
     """
 
     def __init__(self, stepper: SeriesStepper, record: SeriesRecord, absent: frozenset[str]) -> None:
@@ -291,11 +292,10 @@ class StepCode:
         given: dict[str, Any] = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
         self._inputs = [
-            name if not name.startswith("c") or name.startswith("control_") else f"k_{name}"
-            for name in record.inputs
+            name if name.startswith(("control_", "start_")) else f"k_{name}"
+            for name in record.given
         ]
-        wanted = [name for name in record.inputs if not name.startswith("c") or name.startswith("control_")]
-        wanted = [name for name in wanted if name != "start_elapsed"]
+        wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
 
         def run(formula: Callable, inputs: Sequence[str]) -> tuple[list[str], list]:
             trace = ElementaryTrace()
@@ -344,7 +344,9 @@ class StepCode:
             if isinstance(value, str)
             and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
         ]
-        self.rows = [*self._inputs, *q, *v, "status"]
+        #: Rows that are to be filled in before the step.
+        self.given = [*self._inputs, *q, *v, "status"]
+        self.rows = [*self.given, *SCRATCH]
         #: Those of them that the rest of the step needs afterwards.
         self.results = [*q, *v, "status"]
 
@@ -353,7 +355,7 @@ class StepCode:
         """Numbers that `compile` needs in its array of rows."""
         from lag_envs.stepping.machine import Layout
 
-        return Layout(self.record).rows + 2 * self._n
+        return Layout(self.record).rows
 
     @property
     def arguments(self) -> str:
@@ -374,7 +376,7 @@ class StepCode:
         body = [
             f"def advance({self.arguments}):",
             *self.prepare,
-            *(f"rows[{i}] = {name}" for i, name in enumerate(self._inputs) if name != "start_elapsed"),
+            *(f"rows[{i}] = {name}" for i, name in enumerate(self._inputs)),
             *(f"rows[{layout.q + i}] = q{i}" for i in range(n)),
             *(f"rows[{layout.v + i}] = v{i}" for i in range(n)),
             "status = advance_lane(rows, dt, np.int64(order))",

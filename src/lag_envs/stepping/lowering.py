@@ -29,6 +29,10 @@ Weight = str | float
 #: Kinds of symbols that change within a step.
 VARYING = frozenset({"place", "velocity"})
 
+#: The time since the control step began, as a symbol of the places of prescribed coordinates, and as an input.
+CLOCK = Atom("clock", "elapsed")
+ELAPSED = "clock_elapsed"
+
 #: Functions that are integrated along their argument.
 FUNCTIONS = frozenset({"sin", "cos", "exp", "log", "atan", "tanh"})
 
@@ -82,6 +86,11 @@ class SeriesRecord:
     force: tuple[int, ...]
     tangents: Mapping[str, Mapping[str, Weight]] = dataclasses.field(default_factory=dict)
 
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The inputs that are the same for all substeps: all but the time."""
+        return tuple(name for name in self.inputs if name != ELAPSED)
+
     @cached_property
     def digest(self) -> str:
         """All that decides the code, in short: not what the constants are made of."""
@@ -113,7 +122,7 @@ class Lowering:
         Names of the free coordinates.
     prescribed : mapping from str to sequence of Expr
         For each moving prescribed coordinate its place as a polynomial in time, by coefficients in symbols of
-        kind ``control`` (held) or ``start`` (its place and rate when the step begins).
+        kind ``control`` (held), ``start`` (its place and rate when the control step begins) and `CLOCK`.
     tangents : bool, default False
         Whether scalars come with their derivatives by controls and starts.
     """
@@ -173,7 +182,7 @@ class Lowering:
                 self._slopes[total.name] = {
                     f"{s.kind}_{s.name}": self.scalar(derivative(expr, s))
                     for s in sorted(expr.symbols(), key=lambda s: s.text)
-                    if s.kind in ("control", "start") and s.name != "elapsed"
+                    if s.kind in ("control", "start")
                 }
         return self._scalars[expr.text]
 

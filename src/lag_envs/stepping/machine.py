@@ -1,4 +1,4 @@
-"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or for several."""
+"""Prints the step of `lag_envs.stepping.series` to machine code: one lane or several at once, with the same bits."""
 
 from __future__ import annotations
 
@@ -16,34 +16,43 @@ from numba.extending import intrinsic
 from lag_envs.mechanics import algebra
 from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
 from lag_envs.stepping.dual import Dual
-from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.series import LARGEST_ORDER, Series
+from lag_envs.stepping.series import LARGEST_ORDER, Lane, Series
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
+#: Lanes whose rows lie together.
+BLOCK = 64
 #: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
 STRIDE = LARGEST_ORDER + 3
 
 
 class Layout:
-    """Where the numbers of one attempt lie: rows of one number per lane.
+    """Where the numbers of a lane lie: rows, one behind the other or `BLOCK` numbers apart.
 
-    Parameters
+    Attributes
     ----------
-    record : SeriesRecord
-        What is stepped.
+    inputs : dict of str to int
+        Inputs by name.
+    q, v : int
+        The first place and the first velocity.
+    status : int
+        The number of attempts, negative where the lane is not stepped.
+    left, wish : int
+        What is left of the control step, 0 where it is done, and the step that is wished for [s].
+    bounds : int
+        Sums of the bounds on what places and velocities leave out; a single lane has them.
+    rows : int
+        Number of rows.
     """
 
     def __init__(self, record: SeriesRecord) -> None:
-        n, first = record.size, len(record.inputs)
-        #: Row of each input, then of places, velocities and the step that is wished for.
-        self.inputs = {name: i for i, name in enumerate(record.inputs)}
-        self.q, self.v, self.h = first, first + n, first + 2 * n
-        #: Results: 1 where a step was certified, its length, places and velocities after it, bounds on v.
-        self.done = self.h + 1
-        self.used, self.q_after = self.done + 1, self.done + 2
-        self.v_after, self.bound = self.q_after + n, self.q_after + 2 * n
-        self.rows = self.bound + n
+        n = record.size
+        self.inputs = {name: i for i, name in enumerate(record.given)}
+        self.q = len(self.inputs)
+        self.v, self.status = self.q + n, self.q + 2 * n
+        self.left, self.wish, self.bounds = self.status + 1, self.status + 2, self.status + 3
+        self.rows = self.bounds + 2 * n
 
 
 class Machine:
@@ -178,7 +187,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
+        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
         module = self._b.module
         request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
@@ -222,24 +231,23 @@ class Machine:
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
     modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
-    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
-        sys.modules[__name__]
-    )
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(sys.modules[__name__])
     return hashlib.sha256(source.encode()).hexdigest()
 
 
 def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
-    """Return ``attempt(rows, at, order, tolerance)``, to be called from compiled code.
+    """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
 
-    It reads and writes the rows of `Layout`, `lanes` numbers each, that begin at ``rows[at]``; see
-    `Series.attempt`.
+    It takes a step of each lane for which something is left, of the length that is wished for or of a part of it,
+    and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at ``rows[at]``.
+    It returns 1 where nothing is left, else 0. See `Series.attempt`.
 
     Parameters
     ----------
     record : SeriesRecord
         What is stepped.
     lanes : int
-        How many steps are taken at once.
+        How many steps are taken at once. The rows of a single lane are one number, of several `BLOCK` numbers.
     fused : bool, default True
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
     """
@@ -250,31 +258,30 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
         array = context.make_array(signature.args[0])(context, builder, args[0])
         first = builder.gep(array.data, [args[1]])
         function = builder.module.globals.get(name) or _write(builder.module, name, record, lanes, fused)
-        builder.call(function, [first, args[2], args[3]])
-        return context.get_dummy_value()
+        return builder.call(function, [first, *args[2:]])
 
     @intrinsic
-    def attempt(typingctx, rows, at, order, tolerance):  # type: ignore[no-untyped-def]
-        return types.void(rows, types.int64, types.int64, types.float64), codegen
+    def attempt(typingctx, rows, at, dt, order, tolerance):  # type: ignore[no-untyped-def]
+        return types.int64(rows, types.int64, types.float64, types.int64, types.float64), codegen
 
     attempt.__name__ = name
     return attempt
 
 
 def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused: bool) -> ir.Function:
-    """Write the function ``name(rows, order, tolerance)`` into a module."""
-    step, layout = Series(record), Layout(record)
-    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT, _DOUBLE])
-    function = ir.Function(module, kind, name)
+    """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
+    step, layout, n = Series(record), Layout(record), record.size
+    function = ir.Function(module, ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE]), name)
     function.linkage = "internal"
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
-    rows, order, tolerance = function.args
+    rows, dt, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     t = Machine(builder, step.slots * STRIDE, lanes, fused)
+    apart = 1 if lanes == 1 else BLOCK
 
     def pointer(row: int) -> ir.Value:
-        return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * lanes)]), t.kind.as_pointer())
+        return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * apart)]), t.kind.as_pointer())
 
     def read(row: int) -> ir.Value:
         value = builder.load(pointer(row))
@@ -284,28 +291,33 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
     def write(row: int, value: ir.Value) -> None:
         builder.store(value, pointer(row)).align = 8
 
-    n = record.size
+    def splat(value: ir.Value) -> ir.Value:
+        return value if lanes == 1 else primitives.splat(builder, value, lanes)
+
     inputs = {name: read(row) for name, row in layout.inputs.items()}
-    q = [read(layout.q + i) for i in range(n)]
-    v = [read(layout.v + i) for i in range(n)]
-    limit = tolerance if lanes == 1 else primitives.splat(builder, tolerance, lanes)
-    done, used, q, v, bounds = step.attempt(t, inputs, q, v, read(layout.h), order, limit)
-    write(layout.done, builder.select(done, t.number(1.0), t.number(0.0)))
-    write(layout.used, used)
+    q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
+    before = Lane(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    lane, bounds = step.substep(t, inputs, before, splat(dt), order, splat(tolerance))
     for i in range(n):
-        write(layout.q_after + i, q[i])
-        write(layout.v_after + i, v[i])
-        write(layout.bound + i, bounds[i])
-    builder.ret_void()
+        write(layout.q + i, lane.q[i])
+        write(layout.v + i, lane.v[i])
+    write(layout.status, lane.status)
+    write(layout.left, lane.left)
+    write(layout.wish, lane.wish)
+    if lanes == 1:
+        for row, bound in enumerate(bounds, layout.bounds):
+            write(row, t.add(read(row), bound))
+    over = t.all(t.negated(t.less(t.number(0.0), lane.left)))
+    builder.ret(builder.zext(over, _INT))
     return function
 
 
 def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
-    The rows are inputs, places, velocities and the step, as in `Layout`, and then the derivatives of the
-    places and velocities by places, velocities and the inputs named in `columns`, as a matrix. Places,
-    velocities and the matrix are replaced by those after the step.
+    The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the step, and
+    then the derivatives of the places and velocities by places, velocities and the inputs named in `columns`, as
+    a matrix. Places, velocities and the matrix are replaced by those after the step.
 
     Parameters
     ----------
@@ -337,32 +349,33 @@ def _write_tangent(
 ) -> ir.Function:
     """Write the function ``name(rows, order)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
-    width = 2 * n + len(columns)
+    width, matrix = 2 * n + len(columns), layout.status + 2
     function = ir.Function(module, ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT]), name)
     function.linkage = "internal"
     set.add(function.attributes, "noinline")
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
-    t: Any = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
+    t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
 
     def at(row: int) -> ir.Value:
         return builder.gep(rows, [ir.Constant(_INT, row)])
 
     def moving(row: int, i: int) -> dual.Number:
         return dual.Number(
-            builder.load(at(row)), tuple(builder.load(at(layout.done + i * width + k)) for k in range(width))
+            builder.load(at(row)), tuple(builder.load(at(matrix + i * width + k)) for k in range(width))
         )
 
     inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
+    inputs[ELAPSED] = t.plain(builder.load(at(layout.status)))
     q = [moving(layout.q + i, i) for i in range(n)]
     v = [moving(layout.v + i, n + i) for i in range(n)]
-    h = t.plain(builder.load(at(layout.h)))
+    h = t.plain(builder.load(at(layout.status + 1)))
     step.expand(t, inputs, q, v, h, order)
     q, v = step.advance(t, q, h, order)
     for i, number in enumerate([*q, *v]):
         builder.store(number.value, at(layout.q + i))
         for k, slope in enumerate(number.slopes):
-            builder.store(plain.number(0.0) if slope is None else slope, at(layout.done + i * width + k))
+            builder.store(plain.number(0.0) if slope is None else slope, at(matrix + i * width + k))
     builder.ret_void()
     return function

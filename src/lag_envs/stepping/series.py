@@ -33,7 +33,7 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.lowering import FUNCTIONS, Node, SeriesRecord
+from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, Node, SeriesRecord
 from lag_envs.stepping.tracing import Operation, evaluate
 
 #: The orders that a series may have.
@@ -110,6 +110,28 @@ class Start(NamedTuple):
     zero: dict[int, Any]
     inverse: Inverse
     scalars: dict[str, Any]
+
+
+class Lane(NamedTuple):
+    """A control step on its way.
+
+    Attributes
+    ----------
+    q, v : sequence of number
+        Places and velocities.
+    status : number
+        Number of attempts so far.
+    left : number
+        What is left of the step [s]; 0 where it is done.
+    wish : number
+        The substep that is to be tried next [s].
+    """
+
+    q: Sequence
+    v: Sequence
+    status: Any
+    left: Any
+    wish: Any
 
 
 class Series:
@@ -511,6 +533,41 @@ class Series:
         for x in (*q, *v):  # what overflows is not done
             done = t.both(done, t.less(t.abs(x), t.number(math.inf)))
         return done, h, q, v, bounds
+
+    def substep(
+        self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any, order: Any, tolerance: Any
+    ) -> tuple[Lane, list]:
+        """Go on with a control step dt of which something is left, by what one expansion gives.
+
+        Returns
+        -------
+        lane : Lane
+            What it is afterwards; as before where nothing was left or certified.
+        bounds : list of number
+            Bounds on what places and velocities leave out.
+        """
+        zero = t.number(0.0)
+        if ELAPSED in self.record.inputs:
+            inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
+        wanted = t.less(zero, lane.left)
+        done, used, q, v, bounds = self.attempt(
+            t, inputs, lane.q, lane.v, lane.wish, order, tolerance, wanted
+        )
+        done = t.both(done, wanted)
+        used = t.select(done, used, zero)
+        left = t.sub(lane.left, used)
+        # What is nearly a step more is taken as one.
+        longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
+        after = Lane(
+            [t.select(done, x, before) for x, before in zip(q, lane.q, strict=True)],
+            [t.select(done, x, before) for x, before in zip(v, lane.v, strict=True)],
+            t.add(lane.status, t.select(wanted, t.number(1.0), zero)),
+            left,
+            t.select(done, longer, t.mul(t.number(0.0625), lane.wish)),
+        )
+        per = t.mul(used, t.reciprocal(t.plus(order, 2)))
+        bounds = [*(t.mul(per, bound) for bound in bounds), *bounds]
+        return after, [t.select(done, bound, zero) for bound in bounds]
 
 
 class Inverse:
