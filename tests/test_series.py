@@ -14,11 +14,11 @@ from series_systems import SYSTEMS, System, acceleration
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.machine import Layout, compile_attempt
-from lag_envs.stepping.series import Plain, Series
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(
-    number=float, **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")}
+    number=float,
+    **{name: getattr(math, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan", "tanh")},
 )
 LANES = 8
 
@@ -40,7 +40,7 @@ EXACT = types.SimpleNamespace(
 
 
 def taylor(system, state, control, h, end):
-    """Return exact coefficients of places and velocities up to an order, time in steps of h, by Picard's iteration.
+    """Return exact coefficients of places and velocities, time in steps of h, by Picard's iteration.
 
     Each iteration makes one more coefficient exact: nothing is shared with the recurrences under test.
     """
@@ -51,7 +51,11 @@ def taylor(system, state, control, h, end):
     q, v = ([flint.arb_series([x]) for x in values] for values in (q0, v0))
     for known in range(1, end + 1):
         flint.ctx.cap = known
-        s = flint.arb_series([flint.arb(state[0]), h * flint.arb(state[1]), h * h * u[0] / 2]) if first else None
+        s = (
+            flint.arb_series([flint.arb(state[0]), h * flint.arb(state[1]), h * h * u[0] / 2])
+            if first
+            else None
+        )
         rates = acceleration(system, q, v, u, s, u[0] if first else None, EXACT)
         flint.ctx.cap = known + 1
         q = [(x * h).integral() + c for x, c in zip(v, q0, strict=True)]
@@ -81,7 +85,9 @@ def inputs(system, state, control):
     found, constants, code = stepper(system)
     given = constants | found.prepare(FLOATS, state, control, constants)
     n = code.record.size
-    return {name: given[name] for name in code.record.given}, *([given[f"{x}{i}"] for i in range(n)] for x in "qv")
+    return {name: given[name] for name in code.record.given}, *(
+        [given[f"{x}{i}"] for i in range(n)] for x in "qv"
+    )
 
 
 def _run(rows, dt, order, tolerance):
@@ -94,7 +100,7 @@ def compiled(record, lanes=1, fused=True):
 
 
 def attempts(system, cases, order, tolerance):
-    """Return for each case (state, control, h) the length that was certified, 0 if none, and bounds on the tails."""
+    """Return for each case (state, control, h) the certified length, 0 if none, and bounds on the tails."""
     record = stepper(system)[2].record
     layout, n = Layout(record), record.size
     run, results = compiled(record), []
@@ -111,7 +117,7 @@ def attempts(system, cases, order, tolerance):
 
 
 def excess(system, case, order, h, bounds):
-    """Return by how much the worst true tail exceeds its bound, as a ratio; NaN where the step has no length."""
+    """Return the ratio of the worst true tail to its bound; NaN where the step has no length."""
     state, control, _ = case
     q, v = taylor(system, state, control, h, order + 18)
     after = [bound * h / (order + 2) for bound in bounds]

@@ -1,8 +1,9 @@
 """Whole control steps from attempts: substeps as the certificate asks for, one lane or a block of lanes.
 
-An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here it is
-repeated until the control step is over. In a block the lanes that are not done are gathered and go on together.
-Each lane goes through the same attempts as it would alone, so its bits do not depend on its neighbours.
+An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here
+it is repeated until the control step is over. In a block the lanes that are not done are gathered and go on
+together. Each lane goes through the same attempts as it would alone, so its bits do not depend on its
+neighbours.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
 def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
-    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds. A lane whose status is
-    negative to begin with is left alone. Afterwards it is the number of attempts, negative where a lane was
-    refused.
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds. A lane whose
+    status is negative to begin with is left alone. Afterwards it is the number of attempts, negative where a
+    lane was refused.
     """
     for i in range(BLOCK):
         stepped = i < count and memory[base + status * BLOCK + i] >= 0.0
@@ -73,7 +74,9 @@ def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
             attempt(rows, first, dt, order, tolerance)
         kept = 0
         for i in range(going):
-            spent = rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
+            spent = (
+                rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
+            )
             if rows[left * BLOCK + i] > 0.0 and spent:
                 memory[base + status * BLOCK + lane[i]] = -rows[status * BLOCK + i]
                 refused += 1
@@ -114,7 +117,7 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE) -> Calla
 
 
 def lanes(record: SeriesRecord) -> int:
-    """Return how many lanes are stepped at once: as many as have room for their series in the nearest cache."""
+    """Return how many lanes are stepped at once: as many as find room in the nearest cache."""
     slots = Series(record).slots
     return 16 if slots < 5 else 8 if slots < 24 else 4
 
@@ -132,8 +135,8 @@ def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) ->
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane. `slopes` are those of `compile_tangent`, and their matrix is that of unit vectors to
-    begin with.
+    `rows` are those of a lane. `slopes` are those of `compile_tangent`, and their matrix is that of unit
+    vectors to begin with.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = dt
@@ -152,10 +155,10 @@ def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
 
 
 def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
-    """Take a control step from each row of `values`, see `_advance_tangent`; return the row that was refused, or 0.
+    """Take a control step from each row of `values`; return the row that was refused, or 0.
 
-    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` becomes the
-    matrix of derivatives of places and velocities, row by row.
+    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes`
+    becomes the matrix of derivatives of places and velocities, row by row.
     """
     rows, matrix = np.zeros(size), status + 2
     moving = np.zeros(matrix + 2 * n * width)

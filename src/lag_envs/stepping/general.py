@@ -292,8 +292,7 @@ class StepCode:
         given: dict[str, Any] = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
         self._inputs = [
-            name if name.startswith(("control_", "start_")) else f"k_{name}"
-            for name in record.given
+            name if name.startswith(("control_", "start_")) else f"k_{name}" for name in record.given
         ]
         wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
 

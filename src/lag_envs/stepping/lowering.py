@@ -29,7 +29,8 @@ Weight = str | float
 #: Kinds of symbols that change within a step.
 VARYING = frozenset({"place", "velocity"})
 
-#: The time since the control step began, as a symbol of the places of prescribed coordinates, and as an input.
+#: The time since the control step began, as a symbol of the places of prescribed coordinates, and as an
+#: input.
 CLOCK = Atom("clock", "elapsed")
 ELAPSED = "clock_elapsed"
 

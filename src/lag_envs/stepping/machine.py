@@ -1,4 +1,4 @@
-"""Prints the step of `lag_envs.stepping.series` to machine code: one lane or several at once, with the same bits."""
+"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or several, with the same bits."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ class Machine:
         return values
 
     def _as_written(self) -> ir.MDValue:
-        """Return the request not to unroll a loop: ours are short, and longer code takes longer to compile."""
+        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
         module = self._b.module
         request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
         loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
@@ -231,23 +231,26 @@ class Machine:
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
     modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
-    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(sys.modules[__name__])
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
+        sys.modules[__name__]
+    )
     return hashlib.sha256(source.encode()).hexdigest()
 
 
 def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
     """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
 
-    It takes a step of each lane for which something is left, of the length that is wished for or of a part of it,
-    and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at ``rows[at]``.
-    It returns 1 where nothing is left, else 0. See `Series.attempt`.
+    It takes a step of each lane for which something is left, of the length that is wished for or of a part of
+    it, and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at
+    ``rows[at]``. It returns 1 where nothing is left, else 0. See `Series.attempt`.
 
     Parameters
     ----------
     record : SeriesRecord
         What is stepped.
     lanes : int
-        How many steps are taken at once. The rows of a single lane are one number, of several `BLOCK` numbers.
+        How many steps are taken at once. The rows of a single lane are one number, of several `BLOCK`
+        numbers.
     fused : bool, default True
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
     """
@@ -271,7 +274,9 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
 def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused: bool) -> ir.Function:
     """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
-    function = ir.Function(module, ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE]), name)
+    function = ir.Function(
+        module, ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE]), name
+    )
     function.linkage = "internal"
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
@@ -315,9 +320,9 @@ def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused
 def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
-    The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the step, and
-    then the derivatives of the places and velocities by places, velocities and the inputs named in `columns`, as
-    a matrix. Places, velocities and the matrix are replaced by those after the step.
+    The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the
+    step, and then the derivatives of the places and velocities by places, velocities and the inputs named in
+    `columns`, as a matrix. Places, velocities and the matrix are replaced by those after the step.
 
     Parameters
     ----------
