@@ -1,4 +1,4 @@
-"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or several, with the same bits."""
+"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or for several."""
 
 from __future__ import annotations
 
@@ -361,7 +361,7 @@ def _write_tangent(
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
-    t = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
+    t: Any = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
 
     def at(row: int) -> ir.Value:
         return builder.gep(rows, [ir.Constant(_INT, row)])
