@@ -9,6 +9,7 @@ from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum, StepRefused, TwoLinkArm
 from lag_envs.scenes.new_incline import Incline
+from lag_envs.stepping.lowering import ELAPSED
 from lag_envs.stepping.series import Plain, Series
 
 CASES = {
@@ -39,14 +40,19 @@ def exact_step(scene, state, control, dt):
         t = Plain(series.slots, mpmath.mpf, mpmath)
         n = len(scene._layout.free)
         q, v = ([start[f"{letter}{i}"] for i in range(n)] for letter in "qv")
-        inputs = {**constants, **start, "start_elapsed": mpmath.mpf(0)}
+        inputs = {**constants, **start, ELAPSED: mpmath.mpf(0)}
         series.expand(t, {name: inputs[name] for name in stepper._whole.inputs}, q, v, h, 40)
         q, v = series.advance(t, q, h, 40)
         state = stepper.finish(mpmath, q, v, state, control, h, numbers)
     return mpmath.matrix(state)
 
 
-@pytest.mark.parametrize("case", CASES)
+FAST = ("cart_pole", "turning plane")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in FAST else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_jacobian_is_the_derivative(case):
     scene, state, control, dt = CASES[case]
     a, b = scene.jacobian(state, control, dt) if control else scene.jacobian(state, dt=dt)
