@@ -43,8 +43,8 @@ KNOWN_RETURNS = {
     "PivotedBarBalance-v0": Known(21.4, 452.7, 0.14, "LQR"),
     "InclineTilt-v0": Known(9.41, 181.57, 0.026, "iLQR"),
     "InclineBrake-v0": Known(-4.325, -1.724, 0.0004, "switching line", optimum=-1.7238),
-    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.004, "iLQR"),
-    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.04, "optimal"),
+    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.003, "iLQR"),
+    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.014, "optimal"),
     "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.06, "optimal"),
 }
 

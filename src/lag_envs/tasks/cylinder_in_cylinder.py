@@ -194,7 +194,7 @@ class Tilt(_Shell):
 
     | Id | Random actions | Zero control | Feedback | Best known |
     | -- | -------------- | ------------ | -------- | ---------- |
-    | CylinderInCylinderTilt-v0 | 42.26 ± 0.36 | 61.3 ± 1.1 | 197.602 ± 0.028 | 197.6717 ± 0.0037 |
+    | CylinderInCylinderTilt-v0 | 42.26 ± 0.36 | 61.3 ± 1.1 | 197.602 ± 0.028 | 197.6714 ± 0.0033 |
 
     ## Version History
 
@@ -335,7 +335,7 @@ class Pump(_Shell):
 
     | Id | Random actions | Zero control | Energy pump | Best known |
     | -- | -------------- | ------------ | ----------- | ---------- |
-    | CylinderInCylinderPump-v0 | 6.2510 ± 0.0057 | 7.2179 ± 0.0010 | 142.055 ± 0.043 | 145.637 ± 0.043 |
+    | CylinderInCylinderPump-v0 | 6.2510 ± 0.0057 | 7.2179 ± 0.0010 | 142.055 ± 0.043 | 145.695 ± 0.013 |
 
     ## Version History
 
@@ -484,7 +484,7 @@ class Damping(Task):
 
     | Id | Random actions | Zero control | Switching line | Best known |
     | -- | -------------- | ------------ | -------------- | ---------- |
-    | CylinderInCylinderDamping-v0 | 294.34 ± 0.99 | 13.19 ± 0.37 | 363.77 ± 0.73 | 367.050 ± 0.063 |
+    | CylinderInCylinderDamping-v0 | 294.34 ± 0.99 | 13.19 ± 0.37 | 363.77 ± 0.73 | 367.053 ± 0.063 |
 
     Zero control is the action -1, no brake.
 
