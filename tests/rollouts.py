@@ -8,9 +8,21 @@ import gymnasium as gym
 import numpy as np
 
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.pivoted_bar import SwingUp
 
 IDS = list(TASKS)
 RENDERS = find_spec("pygame") is not None and find_spec("lag_envs.envs.rendering") is not None
+
+
+class AnyBar(SwingUp):
+    """A bar of whatever parameters its scene accepts, so that steps can be refused."""
+
+    def check_usable(self):
+        pass
+
+
+#: Keyword that makes an environment of `AnyBar`.
+ANY_BAR = {"task": "rollouts:AnyBar"}
 
 
 def make(env_id, **options):

@@ -127,7 +127,7 @@ def test_episode_length(env_id):
 
 @pytest.mark.parametrize("place", dict.fromkeys(place for place, _ in TASKS.values()))
 def test_argument_table(place):
-    """Every parameter that the task leaves free is there, with its default."""
+    """Every parameter that the task leaves free is there, with its default and its range."""
     task = load_task(place)()
     rows = {row["Keyword"]: row for row in table(sections(type(task).__doc__)["Arguments"])}
     fields = {field.name: field for field in dataclasses.fields(task.scene)}
@@ -144,6 +144,9 @@ def test_argument_table(place):
             assert row["Default"] == str(value), name
         if name in fields and "unit" in fields[name].metadata:
             assert row["Unit"] == fields[name].metadata["unit"], name
+        if name in task.usable_ranges():
+            stated = [float(number) for number in row["Range"].split(" to ")]
+            assert stated == pytest.approx(task.usable_ranges()[name], rel=1e-3), name
 
 
 # --- figures ---
@@ -286,8 +289,8 @@ def test_scale_is_what_was_measured(env_id):
     best = found[known.policy]
     assert known.error == pytest.approx(best["error"], rel=0.2)
     assert abs(known.best - best["mean"]) < 3.0 * known.error
-    # Where it lies farther off, it is by a thousandth of the way between the two at most.
-    assert abs(known.random - found["random"]["mean"]) < 1e-3 * (known.best - known.random)
+    # What counts as random was set from fewer episodes.
+    assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
     assert (known.optimum is not None) == ("optimum" in found)
     if known.optimum is not None:
         assert known.optimum == pytest.approx(found["optimum"]["mean"], abs=1e-4)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -68,6 +69,13 @@ def test_core_alone_can_be_installed_and_stepped(tmp_path):
     # -I keeps the surrounding environment's PYTHONPATH out.
     assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
     assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
+    # What is for other libraries is in the wheel, and says what it needs.
+    assert "lag_envs.sb3.ScaledReward" in run(
+        python.with_name("lag-envs"), "hyperparams", "ppo", cwd=tmp_path
+    )
+    for module, extra in (("lag_envs.sb3", "agents"), ("lag_envs.zoo", "zoo")):
+        with pytest.raises(AssertionError, match=rf'pip install "lag-envs\[{extra}\]"'):
+            run(python, "-I", "-m", module, "enjoy", cwd=tmp_path)
 
 
 def test_one_distribution_brings_pygame():
@@ -91,3 +99,14 @@ def test_no_skips_fails_what_is_skipped(tmp_path):
 
     assert "1 passed, 3 skipped" in outcome()
     assert "1 failed, 1 passed, 2 errors" in outcome("--no-skips", "--continue-on-collection-errors")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "version", re.findall(r":: Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text()), ids=str
+)
+def test_every_dependency_has_wheels(version, tmp_path):
+    """For each Python that we name; rliable is Python alone and has no wheel for any."""
+    pins = [p for p in (ROOT / "constraints.txt").read_text().split() if "==" in p and "rliable" not in p]
+    options = ["--only-binary=:all:", "--no-deps", "--target", tmp_path, "--python-version", version]
+    run(sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", *options, *pins, cwd=tmp_path)

@@ -110,11 +110,17 @@ def test_kernels_refuse_other_constants():
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("method", ["RK4", "RK4, carried", "DOP853, carried"])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("PivotedBar", "RK4"), ("PivotedBar", "RK4, carried"), ("PivotedBar", "ETD4RK, carried"),
+        ("Incline, drag", "DOP853"),
+        *((name, "DOP853, carried") for name in VARIANTS if name != "Incline, drag"),
+    ],
+)  # fmt: skip
 def test_steppers_are_accurate(name, method, mode):
-    if method in Compiled.methods(Problems(ensemble(name, 1)).equation):
-        assert worst(Compiled(method, 32), name, mode == "batch") < 1e-9
+    assert method in Compiled.methods(Problems(ensemble(name, 1)).equation)
+    assert worst(Compiled(method, 32), name, mode == "batch") < 1e-9
 
 
 @pytest.mark.slow
@@ -233,6 +239,9 @@ def test_a_scene_of_ones_own():
         for together in (False, True):
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
+    wrong = Some()
+    wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # what is not carried is not asked for
+    assert Compiled("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(exact, rel=1e-4, abs=0)
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
         Compiled("ETD4RK", 1).build(Some(), 0.1, 4, False)
     assert "Verlet" in Compiled.methods(Problems(ensemble("PivotedBar", 1)).equation)
@@ -487,7 +496,7 @@ def test_long_horizons_are_exact_products():
 
 
 def test_targets_are_compared_once():
-    found = verdicts.duels(verdicts.gathered(OWN), {})
+    found = verdicts.compared(verdicts.gathered(OWN), {})
     assert [(d.mode, d.target) for d in found] == [(mode, target) for mode in MODES for target in TARGETS]
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from functools import cache
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -23,10 +24,11 @@ from reference import (
 from scipy.integrate import solve_ivp
 
 from lag_envs import scenes
-from lag_envs.report.reference import Pendulum, elliptic, linear
+from lag_envs.report.reference import Pendulum, elliptic, linear, slow_manifold, taylor
 from lag_envs.report.reference import pendulum as pendulum_reference
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.stepping.pendulum import Drive
 from lag_envs.stepping.slope import Pull, Turn
 from lag_envs.tasks import TASKS, load_task
@@ -38,6 +40,14 @@ KINDS = "task", "damped", "stiff", "extreme"
 def precise():
     with mp.workdps(60):
         yield
+
+
+class CoarseBar(PivotedBar):
+    """A bar whose series is asked for less, as those that the report compares with."""
+
+    @property
+    def flow(self):
+        return pendulum_flow(8, 1e-6)
 
 
 # --- the series -----------------------------------------------------------------------------------
@@ -157,8 +167,51 @@ def test_every_task_is_one_certified_step():
             if bound is not None:
                 pendulums.add(name)
                 assert bound.substeps == 1, (name, case)
-                assert 0.0 < bound.theta < bound.theta_dot < 1.0001e-12, (name, case)
+                assert 0.0 < bound.theta < bound.theta_dot <= 1e-12, (name, case)
     assert len(pendulums) == 6
+
+
+PENDULUMS = {
+    "bar": PivotedBar(track=None),
+    "damped bar": PivotedBar(mass=0.2, com_distance=0.3, damping=0.001, track=None),
+    "short bar with a track": PivotedBar(com_distance=0.1, damping=1e-4),
+    "bar without gravity": PivotedBar(gravity=0.0, track=None),
+    "shell": CylinderInCylinder(),
+    "damped shell": CylinderInCylinder(damping=0.24),
+    "shell, drag": CylinderInCylinder(control="damping"),
+    "a rougher series": CoarseBar(track=None),
+}
+
+
+@pytest.mark.parametrize("name", PENDULUMS)
+@pytest.mark.parametrize("dt", [0.002, 0.02, 0.05, 0.3])
+def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
+    """Walk the speed: one substep up to the certified speed, within 1e-12 rad/s; several within the size."""
+    scene = PENDULUMS[name]
+    tolerance, place = scene.flow.tolerance, scene.angle + 1
+    state = np.linspace(0.3, 1.0, len(scene.state_names))
+    advance, x = scene.stepper().compile(), scene.largest_x(dt)
+    constants = [v for v in scene.constants().values() if v]
+    reached = set()
+    for u in (0.0, 5.0, 200.0):
+        certified = scene.certified_speed(state, u, dt)
+        field = math.hypot(*scene.drive(scene.lift(state), u, SimpleNamespace(**scene.constants()), math)[:2])
+        near = max(certified, 0.0)
+        walk = {near, near * (1.0 + 1e-12), near + 0.01, 1.1 * near, *np.linspace(0.0, 40.0, 300)}
+        walk |= {*np.linspace(0.5 * near, 2.0 * near, 100)}
+        for speed in walk:
+            state[place] = speed * (1.0 if u else -1.0)
+            bound = scene.truncation_bound(state, u, dt)
+            assert (bound.substeps == 1) == (speed <= certified), speed
+            size = 1.0 if bound.substeps == 1 else max(1.0, speed, math.sqrt(field))
+            assert bound.theta_dot <= tolerance * size, (speed, bound)
+            reached.add(bound.substeps)
+        for speed in (0.999 * near, 1.001 * near + 1e-3):
+            state[place] = speed
+            *_, taken = advance(*map(float, scene.lift(state)), u, dt, x, *constants)
+            expected = scene.truncation_bound(state, u, dt).substeps
+            assert taken == expected or (expected > 500 and 1 < taken < expected)  # along the slow manifold
+    assert {1, 2} <= reached or dt > 0.02
 
 
 def corners(name):
@@ -185,7 +238,10 @@ def body(kind, **parameters):
 
 
 def one_step(case):
-    """Return the step's error over 1e-12 scale and over eps cond + 1e-12 scale; None where refused."""
+    """Return the step's error over 1e-12 scale and over eps cond + 1e-12 scale; None where refused.
+
+    cond counts roundings of state, control and parameters: the scene's constants are floats made from them.
+    """
     arguments = [case[k] for k in ("scene", "params", "state", "control", "dt")]
     scene = body(case["scene"], **case["params"])
     try:
@@ -198,7 +254,7 @@ def one_step(case):
     plain = max(float(e) / (1e-12 * s) for e, s in zip(errors, sizes, strict=True))
     if plain < 0.1:
         return plain, plain
-    amplified = conditioning(*arguments)
+    amplified = conditioning(*arguments, include_params=True)
     shares = zip(errors, sizes, amplified, strict=True)
     return plain, max(float(e) / (EPS * a + 1e-12 * s) for e, s, a in shares)
 
@@ -219,7 +275,7 @@ def test_one_step_of_extremes():
     for case in random_cases("extreme", 36, 24):
         error = one_step(case)
         refused += error is None
-        assert error is None or error[1] < 50.0, case
+        assert error is None or error[1] < 10.0, case
     assert refused <= 1
 
 
@@ -241,9 +297,8 @@ def test_one_step_of_many(kind, capsys):
         for key, (plain, share, refused) in worst.items():
             print("   ", *key, f"{plain:.1e} {share:.1e} {refused}")
     assert set(worst) == set(VARIANTS)
-    assert max(e[0 if kind != "extreme" else 1] for e in worst.values()) < {"task": 1e-3, "extreme": 100}.get(
-        kind, 0.1
-    )
+    allowed = {"task": 1e-3, "extreme": 10.0}.get(kind, 0.1)
+    assert max(e[0 if kind != "extreme" else 1] for e in worst.values()) < allowed
 
 
 @cache
@@ -262,9 +317,7 @@ def pendulum_errors(theta, omega, drive, dt):
         max(1.0, abs(theta), abs(omega) * dt, abs(end[0])),
         max(1.0, abs(omega), math.sqrt(field), abs(end[1])),
     )
-    assert end[2:4] == pytest.approx(
-        [math.cos(end[0]), math.sin(end[0])], abs=1e-15 * (size[0] + math.sqrt(substeps))
-    )
+    assert end[2:4] == pytest.approx([math.cos(end[0]), math.sin(end[0])], abs=1e-15 * size[0])
     return *(float(abs(a - b)) / (1e-12 * s) for a, b, s in zip(end[:2], exact, size, strict=True)), substeps
 
 
@@ -286,6 +339,86 @@ def test_heavy_damping_at_its_thresholds(decay, share):
             a, b, d, r = (field * part for part in parts)
             *errors, _ = pendulum_errors(theta, omega, Drive(a, b, gamma, d, r / dt), dt)
             assert max(errors) < 0.1, (omega, parts)
+
+
+@pytest.mark.parametrize("share", [0.2e-2, 0.999e-2, 1.001e-2])
+@pytest.mark.parametrize("decay", [90.0, 800.0])
+def test_heavy_damping_of_a_fast_drive(decay, share):
+    """drive = share gamma², the field much smaller: it turns the pendulum round and round."""
+    dt = 0.02
+    gamma = decay / dt
+    push = share * gamma * gamma
+    for field in (1e-4 * push, 0.05 * push):
+        for d, r in ((1.0, 0.0), (-0.3, 0.7)):
+            drive = Drive(field, -0.5 * field, gamma, d * push, r * push / dt)
+            *errors, substeps = pendulum_errors(0.4, -2.0, drive, dt)
+            assert max(errors) < 1e-2 and substeps > 1
+
+
+@pytest.mark.parametrize("dt", [1.0, 0.1, 0.02])
+@pytest.mark.parametrize("spin", [100.0, 333.0, 700.0, 1650.0, 2500.0, 1e4])
+@pytest.mark.parametrize("control", [0.0, -3000.0])
+def test_heavy_drag_in_a_turning_shell(spin, dt, control):
+    """Without gravity the motion is linear, whatever the shell's rate: θ = ψ' (t - (1 - e^(-Γt))/Γ)."""
+    for decay in (1e6, 1e4, 1e2):
+        shell = CylinderInCylinder(damping=0.24 * decay / dt, gravity=0.0)
+        end = shell.simulate([0.3, 0.0, spin], [control], dt)[1]
+        params = {
+            name: getattr(shell, name) for name in ("mass", "shell_radius", "radius", "inertia", "damping")
+        }
+        given = {**params, "gravity": 0.0, "control": "tilt"}
+        exact = flow("CylinderInCylinder", given, (0.3, 0.0, spin), control, dt)
+        for value, truth in zip(end, exact, strict=True):
+            assert abs(value - truth) < 3e-15 * max(1, abs(truth)), decay
+
+
+def turned_by_gravity(k, spin, dt):
+    """Return by how much gravity moves the cylinder in a shell with heavy drag, to first order in it [rad].
+
+    ε'' + Γε' = -α sinθ along θ = ψ' (t - (1 - e^(-Γt))/Γ), so ε = -α ∫ (1 - e^(-Γ(T-t)))/Γ sinθ dt.
+    """
+    alpha, drag = k["weight"], k["drag"]
+    layer = 50.0 / drag
+    ends = np.array([0.0, *np.linspace(layer, dt - layer, 2 + int(2.0 * spin * dt)), dt])
+    ends = np.unique([*ends, *np.linspace(0.0, layer, 30), *np.linspace(dt - layer, dt, 30)])
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    half = 0.5 * np.diff(ends)[:, None]
+    t = ends[:-1, None] + half * (1.0 + nodes)
+    theta = spin * (t + np.expm1(-drag * t) / drag)
+    return alpha / drag * float(np.sum(half * weights * np.expm1(-drag * (dt - t)) * np.sin(theta)))
+
+
+@pytest.mark.parametrize("spin", [100.0, 700.0, 2500.0])
+@pytest.mark.parametrize("gravity", [9.81, 1e-3, 1e-25])
+def test_heavy_drag_in_a_turning_shell_with_gravity(spin, gravity):
+    """Gravity's part by quadrature; what is left out of it is of the order of (α/Γ)²/ψ' dt."""
+    for dt, decay in ((1.0, 1e6), (0.3, 1e6), (0.02, 1e6), (0.02, 1e5)):
+        shell = CylinderInCylinder(damping=0.24 * decay / dt, gravity=gravity)
+        k = shell.constants()
+        end = shell.simulate([0.0, 0.0, spin], [0.0], dt)[1]
+        with mp.workdps(40):
+            drag = mpf(k["drag"])
+            free = mpf(spin) * (mpf(dt) - (1 - mp.exp(-drag * mpf(dt))) / drag)
+            left_out = (k["weight"] / k["drag"]) ** 2 / spin * dt
+            size = max(1.0, spin * dt)
+            assert abs(end[0] - free - turned_by_gravity(k, spin, dt)) < 1e-15 * size + left_out
+        assert end[1] == pytest.approx(spin, abs=2.0 * k["weight"] / k["drag"] + 1e-15 * spin)
+
+
+def test_heavy_drag_in_a_turning_shell_against_collocation():
+    """The same with gravity, rate and acceleration of the shell, by the reference's own slow manifold."""
+    dt, spin, control = 0.02, 700.0, -2000.0
+    shell = CylinderInCylinder(damping=0.24 * 1e6 / dt)
+    k = shell.constants()
+    end = shell.simulate([0.3, 0.0, spin], [control], dt)[1]
+    drag = mpf(k["drag"])
+    drive = mpf(k["push"]) * mpf(control) + drag * mpf(spin)
+    p = Pendulum(mpf(k["weight"]), mpf(0), drag, drive, drag * mpf(control))
+    layer = mpf(90) / drag
+    leaving = taylor(p, mpf(0.3), mpf(0), layer, 30)
+    exact = slow_manifold(p, *leaving, layer, mpf(dt), 30)
+    for value, truth in zip(end, exact, strict=False):
+        assert abs(value - truth) < 3e-15 * abs(truth)
 
 
 @pytest.mark.parametrize("decay", [1e4, 1e6])
@@ -374,7 +507,17 @@ HARD = {
     "strong gravity": ("PivotedBar", {**BAR, "gravity": 1e3}, (math.pi, 0.0), 0.0, 0.5),
     "upright": ("PivotedBar", BAR, (math.pi, 0.0), 0.0, 1.0),
     "upright, tiny step": ("PivotedBar", BAR, (math.pi, 1.0), 1e6, 1e-6),
+    "drive of 1e6, hardly damped": ("PivotedBar", {**BAR, "damping": 1e-3}, (1.0, 0.0), -1e6, 0.02),
     "short bar": ("PivotedBar", {**BAR, "com_distance": 1e-8}, (1.0, 3.0), 1.0, 0.01),
+    "short bar for a second": ("PivotedBar", {**BAR, "com_distance": 1e-8}, (1.0, 3.0), 1.0, 1.0),
+    "short bar that turns": ("PivotedBar", {**BAR, "com_distance": 3e-9}, (1.0, 2e5), -3.0, 0.3),
+    "short bar, hardly damped": (
+        "PivotedBar",
+        {**BAR, "com_distance": 1e-7, "damping": 1e-14},
+        (2.0, 3.0),
+        1.0,
+        0.001,
+    ),
     "separatrix above": ("PivotedBar", BAR, (0.0, 2 * math.sqrt(9.81 / 0.5) * (1 + 1e-15)), 0.0, 1.0),
     "separatrix below": ("PivotedBar", BAR, (0.0, 2 * math.sqrt(9.81 / 0.5) * (1 - 1e-15)), 0.0, 1.0),
     "far angle": ("PivotedBar", BAR, (1e9, 3.0), 1.0, 0.02),
@@ -394,24 +537,36 @@ HARD = {
         15.0,
         1.0,
     ),
+    "r near R, a million substeps": (
+        "CylinderInCylinder",
+        {**SHELL, "damping": 0.0, "radius": 0.5 * (1 - 1e-9), "control": "damping"},
+        (1.0, 3.0),
+        0.0,
+        1.0,
+    ),
+    "plane that turns fast": (
+        "Incline",
+        {"mass": 1.0, "radius": 0.05, "damping": 0.3, "control": "tilt_rate"},
+        (0.3, -1.0, 0.2),
+        -300.0,
+        1.0,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", HARD)
 def test_hard_case(name):
-    """Accurate within what rounding of the state and of the parameters does; and quick."""
+    """Accurate to a few roundings of state and parameters, however many substeps there are; and quick."""
     kind, params, state, control, dt = HARD[name]
     scene = body(kind, **params)
     scene.simulate(state, [0.0], 1e-6)  # compile
-    began = time.perf_counter()
+    began = time.process_time()
     end = scene.simulate(state, [control], dt)[1]
-    assert time.perf_counter() - began < 0.2
+    assert time.process_time() - began < 0.5
     arguments = kind, params, state, control, dt
-    exact, sizes = flow(*arguments, dps=30), scales(*arguments)
-    amplified = conditioning(*arguments, include_params=True)
-    for value, truth, size, gain in zip(end, exact, sizes, amplified, strict=True):
-        # Ten thousand substeps each round once: over 24 controls near 1e6 the walk measured 2 to 42.
-        assert abs(value - truth) < 60 * EPS * gain + 1e-12 * size
+    exact, amplified = flow(*arguments, dps=30), conditioning(*arguments, include_params=True)
+    for value, truth, gain in zip(end, exact, amplified, strict=True):
+        assert abs(value - truth) < 3 * EPS * max(1, gain, abs(truth))
 
 
 @pytest.mark.parametrize(
@@ -432,10 +587,10 @@ def test_refusal(scene, state, control, dt):
     """A step that cannot be taken says so at once, keeps what was computed, and leaves the scene usable."""
     calm = np.full(len(state), 0.1)
     before = scene.simulate(calm, [0.0], 0.02)
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(StepRefused, match=r"refused: from .* with control .* and dt=") as error:
         scene.simulate(state, [control] * 3, dt)
-    assert time.perf_counter() - began < 0.2
+    assert time.process_time() - began < 0.2
     assert np.array_equal(error.value.trajectory[0], state)
     assert np.isfinite(error.value.trajectory).all()
     assert np.array_equal(scene.simulate(calm, [0.0], 0.02), before)
@@ -454,8 +609,8 @@ def test_refused_step_keeps_the_rows_before():
     [
         ([0.0, 0.0], [1.0, math.nan], 0.02, r"control must be finite, got nan at \[1\]"),
         ([0.0, 0.0], [math.inf], 0.02, "control must be finite, got inf"),
-        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got \(\)"),
-        ([0.0, 0.0], [[1.0]], 0.02, r"shape \(T,\), got \(1, 1\)"),
+        ([0.0, 0.0], 1.0, 0.02, r"shape \(T,\), got shape \(\): 1\.0"),
+        ([0.0, 0.0], [[1.0]], 0.02, r"shape \(T,\), got shape \(1, 1\): "),
         ([0.0, 0.0], ["one"], 0.02, "control must be real numbers"),
         ([0.0, 0.0, 0.0], [1.0], 0.02, r"state must be \(theta, theta_dot\), got .* \(3,\)"),
         ([0.0, math.nan], [1.0], 0.02, "state must be finite, got .*theta_dot"),

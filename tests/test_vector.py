@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from rollouts import IDS, actions, make
+from rollouts import ANY_BAR, IDS, actions, make
 
 from lag_envs.scenes.base import StepRefused
 
@@ -610,7 +610,7 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
         "damping": 0.0,
     }
     mild = {"com_distance": [0.3, 0.4], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme)
+    envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme, **ANY_BAR)
     twin = gym.make_vec("PivotedBarFree-v0", num_envs=2, autoreset_mode=mode, **mild)
     envs.reset(seed=[1, 2, 3])
     twin.reset(seed=[1, 3])
@@ -654,7 +654,8 @@ def test_a_restarting_environment_ignores_its_action():
 
 
 def test_a_refusal_carries_what_the_others_did():
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=2, com_distance=[0.3, 1e-30], damping=0.0)
+    lengths = {"com_distance": [0.3, 1e-30], "damping": 0.0}
+    envs = gym.make_vec("PivotedBarFree-v0", num_envs=2, **lengths, **ANY_BAR)
     envs.reset(seed=1)
     with pytest.raises(StepRefused) as error:
         envs.step(np.zeros((2, 1), np.float32))

@@ -100,7 +100,7 @@ def run_info(args: argparse.Namespace) -> int:
     )
     text += ["", "Parameters, keywords of gym.make"]
     text += _columns(
-        [*(_parameter(field, scene) for field in dataclasses.fields(scene)), *_own_parameters(task)]
+        [*(_parameter(field, task) for field in dataclasses.fields(scene)), *_own_parameters(task)]
     )
     text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
     place = f"{type(task).__module__}.{type(task).__name__}"
@@ -115,12 +115,11 @@ def _description(task: Task) -> list[str]:
     return [summary, "", rest.partition("\n\n## ")[0]]
 
 
-def _parameter(field: dataclasses.Field, scene: Any) -> tuple[str, str, str]:
-    value, meta = getattr(scene, field.name), field.metadata
-    words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
-    rules = ((word, meta.get(key)) for key, word in words.items())
-    rule = ", ".join(f"{word} {limit:g}" for word, limit in rules if limit is not None)
-    shown = f"{value:.6g} {meta.get('unit', '')}" if isinstance(value, float) else repr(value)
+def _parameter(field: dataclasses.Field, task: Task) -> tuple[str, str, str]:
+    value = getattr(task.scene, field.name)
+    low, high = task.usable_ranges().get(field.name, (-math.inf, math.inf))
+    rule = f"{low:g} to {high:g}" if math.isfinite(low) else ""
+    shown = f"{value:.6g} {field.metadata.get('unit', '')}" if isinstance(value, float) else repr(value)
     return f"  {field.name}", shown.rstrip(), rule
 
 

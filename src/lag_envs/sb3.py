@@ -20,15 +20,15 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
-import lag_envs  # noqa: F401  (registers the environments)
-from lag_envs.leaderboard.policies import bin_centres
-
 try:
     from stable_baselines3.common import vec_env
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         f'{error.name} is missing: pip install "lag-envs[agents]"', name=error.name
     ) from error
+
+import lag_envs  # noqa: F401  (registers the environments)
+from lag_envs.leaderboard.policies import bin_centres
 
 
 def make_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> VecEnv:

@@ -38,14 +38,14 @@ class Known(NamedTuple):
 
 
 KNOWN_RETURNS = {
-    "PivotedBar-v0": Known(-0.72, 419.01, 0.02, "iLQR"),
-    "PivotedBarFree-v0": Known(-2.41, 422.49, 0.02, "iLQR"),
+    "PivotedBar-v0": Known(-0.72, 419.01, 0.012, "iLQR"),
+    "PivotedBarFree-v0": Known(-2.41, 422.49, 0.013, "iLQR"),
     "PivotedBarBalance-v0": Known(21.4, 452.7, 0.14, "LQR"),
-    "InclineTilt-v0": Known(9.41, 181.57, 0.03, "iLQR"),
-    "InclineBrake-v0": Known(-4.325, -1.724, 0.001, "switching line", optimum=-1.7238),
-    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.01, "iLQR"),
-    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.03, "optimal"),
-    "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.2, "optimal"),
+    "InclineTilt-v0": Known(9.41, 181.57, 0.026, "iLQR"),
+    "InclineBrake-v0": Known(-4.325, -1.724, 0.0004, "switching line", optimum=-1.7238),
+    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.004, "iLQR"),
+    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.04, "optimal"),
+    "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.06, "optimal"),
 }
 
 

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import time
 import tomllib
-import urllib.error
 import urllib.request
 from datetime import date
 from pathlib import Path
@@ -40,6 +39,8 @@ QUIET = {
     "RAY_AUTH_MODE": "disabled",
     "RAY_USAGE_STATS_ENABLED": "0",
     "PYTHONUNBUFFERED": "1",
+    # The networks are small: threads would wait for each other.
+    "OMP_NUM_THREADS": "1",
 }
 
 
@@ -104,19 +105,33 @@ def fetch(source: dict[str, Any], path: str, digest: str) -> bytes:
         Where it is not the file that was looked at.
     """
     kept = HOME / "scripts" / source["repository"] / source["commit"] / path
-    if not kept.exists():
+    if kept.exists():
+        data = kept.read_bytes()
+    else:
         address = f"https://raw.githubusercontent.com/{source['repository']}/{source['commit']}/{path}"
         try:
             with urllib.request.urlopen(address, timeout=30.0) as answer:
                 data = answer.read()
-        except (OSError, urllib.error.URLError) as error:
-            raise NotRun(f"{source['repository']}: {path} could not be downloaded ({error})") from error
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        kept.write_bytes(data)
-    data = kept.read_bytes()
-    if hashlib.sha256(data).hexdigest() != digest:
-        raise Failed(f"{kept} does not have the digest {digest}")
+        except OSError as error:
+            raise NotRun(f"{path} of {source['repository']} could not be downloaded ({error})") from error
+    found = hashlib.sha256(data).hexdigest()
+    if found != digest:
+        raise Failed(f"{path} of {source['repository']} has the digest {found}, not {digest}")
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_bytes(data)
     return data
+
+
+def scripts(entry: dict[str, Any]) -> dict[str, str]:
+    """Return the files of a run by name, with what is replaced in them."""
+    source = entry.get("source", {"files": {}})
+    texts = {Path(p).name: fetch(source, p, digest).decode() for p, digest in source["files"].items()}
+    for old, new in entry.get("replace", []):
+        places = [name for name, text in texts.items() for _ in range(text.count(old))]
+        if len(places) != 1:
+            raise Failed(f"{old!r} is to be replaced in one place, and stands in {len(places)}")
+        texts[places[0]] = texts[places[0]].replace(old, new)
+    return texts
 
 
 # --- runs ---
@@ -127,14 +142,8 @@ def run(name: str, number: int, entry: dict[str, Any], programs: Path) -> float:
     folder = HOME / "runs" / f"{name}-{number}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    source = entry.get("source", {"files": {}})
-    for path, digest in source["files"].items():
-        text = fetch(source, path, digest).decode()
-        for old, new in entry.get("replace", []):
-            if text.count(old) != 1:
-                raise Failed(f"{path} has {text.count(old)} places with {old!r}, not one")
-            text = text.replace(old, new)
-        (folder / Path(path).name).write_text(text)
+    for file_name, text in scripts(entry).items():
+        (folder / file_name).write_text(text)
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment |= QUIET | {"HOME": str(folder), "OURS": str(HERE)}
     environment["PATH"] = f"{programs}{os.pathsep}{environment['PATH']}"

@@ -43,15 +43,21 @@ def constants_of(task: Task) -> dict[str, float]:
 
 
 def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
-    """Return the program of a task: the same for all tasks that differ in their numbers only."""
-    values = (getattr(task.scene, field.name) for field in dataclasses.fields(task.scene))
-    choices = tuple(math.isinf(v) if isinstance(v, float) else repr(v) for v in values)
-    key = (type(task), type(task.scene), choices, task.variant, absent, varying)
-    if key not in _programs:
-        _programs[key] = Program(task, absent, varying)
-    return _programs[key]
+    """Return the program of a task: one for all tasks that differ in `constants_of` only."""
+    scene = task.scene
+    values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
+    choices = [math.isinf(v) if isinstance(v, float) else repr(v) for v in values]
+    # Formulas may also name attributes of the task, which somebody may have set by hand.
+    own = [(name, repr(v)) for name, v in vars(task).items() if name not in _NUMBERS]
+    shared = [v for c in type(task).__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+    parts = (type(task), type(scene), task.variant, absent, varying, *choices, *own, *shared)
+    if parts not in _programs:
+        _programs[parts] = Program(task, absent, varying)
+    return _programs[parts]
 
 
+#: Attributes of a task whose numbers reach its code as constants, if at all.
+_NUMBERS = {"scene", "dt", "duration", "target"}
 _programs: dict[tuple, Program] = {}
 
 

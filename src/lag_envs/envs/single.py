@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from lag_envs.envs.program import SLOW, constants_of, program_for
+from lag_envs.scenes.base import is_masked, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -57,6 +59,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any
     ) -> None:
         check_render_mode(render_mode)
+        check_flag("diagnostics", diagnostics)
         self.task: Task = load_task(task)(**options)
         self.scene = self.task.scene
         self.__doc__ = self.task.__doc__
@@ -92,7 +95,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters
         ----------
         seed : int, optional
-            Seeds starts, targets and kicks of this and of the following episodes.
+            Seeds starts, targets and kicks of this and of the following episodes; at least 0.
         options : dict, optional
             ``"state"``: the start, in the scene's order and units; ``"target"``, where the task has one.
 
@@ -105,16 +108,17 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
         Raises
         ------
-        ValueError
-            For unknown options, and a state or target with which the task cannot start. The episode in
-            progress, if there is one, is left as it is.
+        ValueError, TypeError
+            For unknown options, a state or target with which the task cannot start, and a seed that is none.
+            The episode in progress, if there is one, is left as it is.
         """
+        seed = None if seed is None else check_seed("seed", seed)
         state, target = start_options(options)
         given_state = None if state is None else self.task.check_start(state)
         given_target = None if target is None else self.task.check_target(target)
         super().reset(seed=seed)
         if seed is not None:
-            self._ids[:2] = int(seed) % 2**64, 0
+            self._ids[:2] = key_of(seed), 0
         elif not self._started:
             self._ids[:2] = self.np_random.integers(2**63), 0
         self._started = True
@@ -310,25 +314,52 @@ def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
 
 def check_render_mode(mode: str | None) -> None:
     """Raise ValueError for an unknown render mode."""
-    if mode is not None and mode not in RENDER_MODES:
-        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)} or None, got {mode!r}")
+    if mode is not None and not (isinstance(mode, str) and mode in RENDER_MODES):
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)} or None, got {shown(mode)}")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raise ValueError for what is neither true nor false: any string would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+
+
+def check_seed(name: str, seed: Any) -> int:
+    """Return a seed as int; TypeError where it is no whole number, ValueError where it is below 0."""
+    if isinstance(seed, bool | np.timedelta64) or not isinstance(seed, int | np.integer):
+        raise TypeError(f"{name} must be an int or None, got {shown(seed)}")
+    if seed < 0:
+        raise ValueError(f"{name} must be at least 0, got {shown(seed)}")
+    return int(seed)
+
+
+def key_of(seed: int) -> int:
+    """Return the key of 64 bits that a seed stands for: itself, or a digest of one that has more bits."""
+    return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
 
 
 def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("state", "target")) -> list[Any]:
     """Return the values of the known options of `reset`, None where one is missing."""
-    unknown = sorted(set(options or ()) - set(known))
-    if unknown:
-        raise ValueError(f"unknown reset option {unknown[0]!r}; known are {', '.join(known)}")
-    return [(options or {}).get(name) for name in known]
+    if options is None:
+        options = {}
+    if not isinstance(options, Mapping):
+        raise TypeError(f"options must be a dict or None, got {shown(options)}")
+    for name in options:
+        if name not in known:
+            raise ValueError(f"unknown reset option {shown(name)}; known are {', '.join(known)}")
+    return [options.get(name) for name in known]
 
 
 def one_action(action: Any) -> float:
     """Return an action of any real type as float, or raise a ValueError."""
-    array = np.asarray(action)
+    try:
+        array = np.asarray(action)
+    except ValueError as error:  # rows of different lengths
+        raise ValueError(f"the action must have shape (1,), got {shown(action)}") from error
     if array.shape != (1,):
-        raise ValueError(f"the action must have shape (1,), got shape {array.shape}: {action!r}")
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"the action must be a real number, got {action!r} of type {array.dtype}")
+        raise ValueError(f"the action must have shape (1,), got shape {array.shape}: {shown(action)}")
+    if array.dtype.kind not in "fiub" or is_masked(action):
+        raise ValueError(f"the action must be a real number, got {shown(action)} of type {array.dtype}")
     return float(array[0])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -18,14 +18,17 @@ from lag_envs.envs.single import (
     FLOAT32,
     absent,
     action_space,
+    check_flag,
     check_render_mode,
+    check_seed,
     diagnostics,
+    key_of,
     observation_space,
     start_options,
     true_spec,
 )
 from lag_envs.scenes import StepRefused
-from lag_envs.scenes.base import real_array
+from lag_envs.scenes.base import is_masked, real_array, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -86,9 +89,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if render_mode == "human":
             raise ValueError("render_mode must be 'rgb_array' or None for a vector environment, got 'human'")
         check_render_mode(render_mode)
-        if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
-            raise ValueError(f"num_envs must be a whole number of at least 1, got {num_envs!r}")
-        self.num_envs = int(num_envs)
+        check_flag("diagnostics", diagnostics)
+        self.num_envs = check_count("num_envs", num_envs)
         self.render_mode = render_mode
         self.diagnostics = diagnostics
         #: TorchRL asks for it under this name, as Gymnasium's own vector environments have it.
@@ -108,17 +110,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
         self._constants = [constants_of(task) for task in self._tasks]
-        if max_episode_steps is not None and max_episode_steps != -1:
-            if (
-                type(max_episode_steps) is bool
-                or not isinstance(max_episode_steps, int)
-                or not max_episode_steps >= 1
-            ):
-                raise ValueError(
-                    f"max_episode_steps must be a whole number of at least 1, got {max_episode_steps!r}"
-                )
+        endless = type(max_episode_steps) is int and max_episode_steps == -1  # Gymnasium's word for it
+        if max_episode_steps is not None and not endless:
+            steps = float(check_count("max_episode_steps", max_episode_steps))
             for constants in self._constants:
-                constants["limit"] = min(constants["limit"], float(max_episode_steps))
+                constants["limit"] = min(constants["limit"], steps)
         self._compile()
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
@@ -152,7 +148,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         Parameters
         ----------
         seed : int or sequence of int, optional
-            A seed s seeds environment i with s + i; a sequence seeds each with its own, None leaves it alone.
+            A seed s seeds environment i with s + i; a list, tuple, range or array seeds each with its own,
+            None leaves it alone.
         options : dict, optional
             ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool.
             Rows that the mask leaves out are ignored.
@@ -169,26 +166,26 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ValueError, TypeError
             For unknown options, and arrays of the wrong shape, type or content; nothing is reset then.
         """
+        seeds = self._check_seeds(seed)
         state, target, mask = start_options(options, ("state", "target", "reset_mask"))
         mask = self._check_mask(mask)
         lanes = self._lanes[mask]
-        seeds = self._check_seeds(seed)
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([self._tasks[i].check_start(state[i]) for i in lanes])
+            state = np.array([named(i, self._tasks[i].check_start, state[i]) for i in lanes])
         if target is not None:
             target = self._check_rows("target", target, (self.num_envs,))
-            target = np.array([self._tasks[i].check_target(target[i]) for i in lanes])
+            target = np.array([named(i, self._tasks[i].check_target, target[i]) for i in lanes])
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
             )
-        super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
+        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         if not self._started:
             self._ids[: self.num_envs] = self.np_random.integers(2**63, size=self.num_envs)
         for i, s in seeds:
             if mask[i]:
-                self._ids[i], self._ids[self.num_envs + i] = s % 2**64, 0
+                self._ids[i], self._ids[self.num_envs + i] = key_of(s), 0
         if state is not None:
             for j, column in enumerate(state.T):
                 self._write(f"y{j}", lanes, column)
@@ -371,11 +368,16 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return error
 
     def _check_actions(self, actions: Any) -> NDArray[np.floating]:
-        array = np.asarray(actions)
+        try:
+            array = np.asarray(actions)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {shown(actions)}") from error
         if array.shape != (self.num_envs, 1):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {array.shape}")
-        if array.dtype.kind not in "fiub":
-            raise ValueError(f"actions must be real numbers, got an array of type {array.dtype}")
+            raise ValueError(
+                f"actions must have shape ({self.num_envs}, 1), got shape {array.shape}: {shown(actions)}"
+            )
+        if array.dtype.kind not in "fiub" or is_masked(actions):
+            raise ValueError(f"actions must be real numbers, got {shown(actions)} of type {array.dtype}")
         if (
             array.dtype.char not in "fd" or not array.dtype.isnative or not array.flags.writeable
         ):  # what the compiled step takes as it is
@@ -385,31 +387,36 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
-        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-            raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {mask!r}")
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or is_masked(mask):
+            raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {shown(mask)}")
         if mask.shape != (self.num_envs,):
-            raise ValueError(f"options['reset_mask'] must have shape ({self.num_envs},), got {mask.shape}")
+            raise ValueError(
+                f"options['reset_mask'] must have shape ({self.num_envs},), "
+                f"got shape {mask.shape}: {shown(mask)}"
+            )
         if not mask.any():
-            raise ValueError("options['reset_mask'] must select at least one environment")
+            raise ValueError(f"options['reset_mask'] must select at least one environment, got {shown(mask)}")
         return mask
 
     def _check_seeds(self, seed: Any) -> list[tuple[int, int]]:
+        """Return (environment, seed) for each that is to be seeded."""
         if seed is None:
             return []
-        if isinstance(seed, int | np.integer):
-            seed = range(int(seed), int(seed) + self.num_envs)
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must be one number or {self.num_envs}, got {len(seed)}")
-        pairs = [(i, int(s)) for i, s in enumerate(seed) if s is not None]
-        for _, s in pairs:
-            if s < 0:
-                raise ValueError(f"a seed must be at least 0, got {s}")
-        return pairs
+        if isinstance(seed, list | tuple | range) or (type(seed) is np.ndarray and seed.ndim == 1):
+            if len(seed) != self.num_envs:
+                raise ValueError(
+                    f"seed must be one number or {self.num_envs}, got {len(seed)}: {shown(seed)}"
+                )
+            return [(i, check_seed(f"seed[{i}]", s)) for i, s in enumerate(seed) if s is not None]
+        first = check_seed("seed", seed)
+        return [(i, first + i) for i in range(self.num_envs)]
 
     def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
         array = real_array(f"options[{name!r}]", values)
         if array.shape != shape:
-            raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
+            raise ValueError(
+                f"options[{name!r}] must have shape {shape}, got shape {array.shape}: {shown(values)}"
+            )
         return array
 
     def __getstate__(self) -> dict[str, Any]:
@@ -422,31 +429,57 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._compile()
 
 
+def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
+    """Call a function; where it raises a ValueError, say that it did for environment i."""
+    try:
+        return function(*arguments, **keywords)
+    except ValueError as error:
+        raise ValueError(f"environment {i}: {error}") from error
+
+
 def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
     """Return the autoreset mode named by a string or the enum itself."""
     for known in AutoresetMode:
-        if mode == known or (
+        if mode is known or (
             isinstance(mode, str) and mode.replace("_", "").lower() == known.value.replace("_", "").lower()
         ):
             return known
     raise ValueError(
-        f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {mode!r}"
+        f"autoreset_mode must be one of {', '.join(m.value for m in AutoresetMode)}, got {shown(mode)}"
     )
+
+
+def check_count(name: str, value: Any) -> int:
+    """Return a whole number of at least 1 as int, or raise a ValueError."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+    if not whole or not 1 <= value < 2**63:
+        raise ValueError(f"{name} must be a whole number of at least 1 and below 2**63, got {shown(value)}")
+    return int(value)
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     """Return one task per environment; all are the same object where no option varies."""
-    many = {k: v for k, v in options.items() if isinstance(v, list | tuple | np.ndarray) and np.ndim(v) > 0}
+    many = {
+        name: values
+        for name, values in options.items()
+        if isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim > 0)
+    }
     for name, values in many.items():
+        if is_masked(values):
+            raise ValueError(f"{name} must be real numbers, got {shown(values)}")
         if len(values) != n:
-            raise ValueError(f"{name} must be one value or {n}, one per environment, got {len(values)}")
+            raise ValueError(
+                f"{name} must be one value or {n}, one per environment, got {len(values)}: {shown(values)}"
+            )
         if name in ("control", "dt", "duration"):
-            raise ValueError(f"{name} must be the same for all environments, got {values!r}")
+            raise ValueError(f"{name} must be the same for all environments, got {shown(values)}")
     if not many:
         return [kind(**options)] * n
-    tasks = [kind(**(options | {name: values[i] for name, values in many.items()})) for i in range(n)]
+    own = [options | {name: values[i] for name, values in many.items()} for i in range(n)]
+    tasks = [named(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            f"the environments of a batch must agree in having a finite track, or a fixed target; got {many}"
+            "the environments of a batch must agree in having a finite track, or a fixed target; "
+            f"got {shown(many)}"
         )
     return tasks

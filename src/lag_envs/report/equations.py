@@ -43,7 +43,9 @@ class Equation(ABC):
         """Return y'; where `y` is lifted, no function of `xp` is called."""
 
     def stepper(self, method: str, carried: bool) -> Callable:
-        """Return ``step(y, p, t, h, xp)`` of one of `METHODS`, on lifted unknowns if they are carried.
+        """Return ``step(y, p, t, h, xp)`` of one of `METHODS`.
+
+        It takes and returns lifted unknowns; if they are not carried, cosines and sines are left as they are.
 
         Raises
         ------
@@ -55,7 +57,9 @@ class Equation(ABC):
             raise ValueError(f"{method} needs more than the rate of {type(self).__name__}")
 
         def step(y: Sequence, p: Sequence, t: Any, h: Any, xp: Any) -> Sequence:
-            return explicit(tableau(), lambda s, y: self.rate(t + s, y, p, xp), y, h)
+            moving = y if carried else y[: self.size]
+            moved = explicit(tableau(), lambda s, y: self.rate(t + s, y, p, xp), moving, h)
+            return [*moved, *y[len(moved) :]]
 
         return step
 

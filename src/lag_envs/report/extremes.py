@@ -18,7 +18,7 @@ from lag_envs.scenes.base import Scene, StepRefused
 
 EPS = 2.0**-53
 #: What README calls exact, as a share of the scales; and how many roundings of the state are allowed beside.
-EXACT, ROUNDINGS = 1e-12, 100.0
+EXACT, ROUNDINGS = 1e-12, 10.0
 
 FULL, AMPLIFIED, REFUSED = "full accuracy", "amplified rounding", "refused with an error"
 

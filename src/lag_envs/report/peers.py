@@ -79,7 +79,7 @@ class SciPy(Peer):
         start = np.ascontiguousarray(problems.y[:size].T)  # one state after the other: a matrix has a band
         parameters = [tuple(row) for row in problems.p.T.tolist()]
         ends = np.empty_like(start)
-        solve = self._solver(equation, count if together else 1)
+        solve = self._solver(equation, count if together else 1, together)
 
         def run() -> None:
             if together:
@@ -90,11 +90,11 @@ class SciPy(Peer):
 
         return Sample(run, count * steps, ends=lambda: problems.states(ends.T, span))
 
-    def _solver(self, equation: Equation, count: int) -> Callable:
+    def _solver(self, equation: Equation, count: int, together: bool) -> Callable:
         """Return ``solve(y, span, p)``, NaN where it gives up."""
         from scipy.integrate import ode, solve_ivp
 
-        rate = _rate_of_many(equation) if count > 1 else _rate(equation)
+        rate = _rate_of_many(equation) if together else _rate(equation)
         lost = np.full(count * equation.size, np.nan)
         if self.method == "Radau":
             tolerance = {"rtol": self.setting, "atol": self.setting}

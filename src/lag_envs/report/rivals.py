@@ -68,8 +68,8 @@ class Rival(ABC):
         together : bool
             Take the states at once; else one after the other.
         changes : int, default 1
-            For timing single steps alone: how many controls follow one another, each problem going on with
-            the next one's. What it ends in is then of no use.
+            For timing single steps: how many of them follow one another in the call. Alone each problem goes
+            on with the next one's control, in a batch with its own. What it ends in is then of no use.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Ours(Rival):
         parts = []
         for some in alike.values():
             if together:
-                parts.append(at_once(kernels, some, count, length))
+                parts.append(at_once(kernels, some, count * changes, length))
             else:
                 given = np.array([case.control for case in some])
                 turns = np.arange(len(some))[:, None] + np.arange(changes)
@@ -177,8 +177,8 @@ class Compiled(Rival):
             rows = start.copy()
             flat = rows.reshape(-1)
             return Sample(
-                lambda: loop(flat, len(rows), n, h),
-                count * steps,
+                lambda: loop(flat, len(rows), n * changes, h),
+                count * steps * changes,
                 lambda: np.copyto(rows, start),
                 lambda: problems.states(unblocked(rows, count)[:size], dt * steps),
             )

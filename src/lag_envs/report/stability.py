@@ -294,9 +294,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
             f"can have that, {extremes.ROUNDINGS:g} times the effect of such a rounding is allowed on top. "
             "That effect is measured, by moving every entry of the start by 2^-53 of its size in the "
             "reference. A case is met if it does what was expected, or is more accurate.",
-            "Every substep rounds once more, and what that does to the energy adds up like a random walk, so "
-            "steps with hundreds of thousands of substeps come off worst. A step that would need more than a "
-            "million is refused.",
+            "Where a step is divided, substeps are computed with twice the digits, so that nothing adds up "
+            "over hundreds of thousands of them. A step that would need more than a million is refused.",
         ],
         tables=[t for t in (verdicts, shares, _amplified(cells), _problem_table(problems, rows)) if t],
         pictures=_pictures(maps, found),

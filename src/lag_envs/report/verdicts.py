@@ -114,7 +114,7 @@ def floors(rows: Sequence[Row]) -> dict[tuple, float]:
     }
 
 
-class Duel(NamedTuple):
+class Comparison(NamedTuple):
     """The fastest of ours and the fastest rival that reach an error, on one variant, horizon and mode."""
 
     variant: str
@@ -140,7 +140,7 @@ class Duel(NamedTuple):
         return f"{self.variant} {MODES[self.mode]}"
 
 
-def duels(points: Sequence[Point], floor: dict[tuple, float]) -> list[Duel]:
+def compared(points: Sequence[Point], floor: dict[tuple, float]) -> list[Comparison]:
     """Return all comparisons, with errors up to `ROUNDINGS` amplified roundings counting as none."""
     found = []
     for variant in VARIANTS:
@@ -151,7 +151,7 @@ def duels(points: Sequence[Point], floor: dict[tuple, float]) -> list[Duel]:
                 for target in TARGETS if here else ():
                     reached = [p for p in here if p.worst <= max(target, least)]
                     found.append(
-                        Duel(
+                        Comparison(
                             variant, horizon, mode, target,
                             min((p for p in reached if p.ours), key=lambda p: p.ns, default=None),
                             min((p for p in reached if not p.ours), key=lambda p: p.ns, default=None),
@@ -164,7 +164,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     """Return the section."""
     points = gathered(rows)
     floor = floors(rows)
-    found = duels(points, floor)
+    found = compared(points, floor)
     variants = [name for name in VARIANTS if any(p.variant == name for p in points)]
     return Content(
         title="Error against time",
@@ -208,11 +208,12 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "batch, so that theirs is one state after the other. What would take longer than some seconds is not "
         "run.",
         "Times are those of one control step. Everything in a job is timed in turn with ours, and the median "
-        "is taken; jobs are brought to one scale by the time that ours took in each.",
+        "is taken; jobs are brought to one scale by the time that ours took in each. What takes long over "
+        "10 s or 1,000 s is timed over a part of that, in one call too.",
     ]
 
 
-def findings(found: Sequence[Duel]) -> list[str]:
+def findings(found: Sequence[Comparison]) -> list[str]:
     """Return, for every horizon, a paragraph on who is faster at which error, and by how much."""
     paragraphs = []
     for horizon in HORIZONS:
@@ -223,7 +224,7 @@ def findings(found: Sequence[Duel]) -> list[str]:
     return paragraphs
 
 
-def _finding(found: Sequence[Duel]) -> str:
+def _finding(found: Sequence[Comparison]) -> str:
     """Return who is faster at one error, as a clause; every comparison is in one of its counts."""
     settled = sorted((d for d in found if d.ratio is not None), key=lambda d: d.ratio or 0.0)
     lost = [d for d in settled if d.lost]
@@ -258,7 +259,7 @@ def _listed(parts: Iterable[str]) -> str:
 # --- tables ---
 
 
-def _targets(found: Sequence[Duel]) -> Table:
+def _targets(found: Sequence[Comparison]) -> Table:
     return Table(
         "work_precision_targets",
         "The fastest of ours and the fastest of everybody else's that reach an error; below 1 the other is "
@@ -318,7 +319,7 @@ def _default(points: Sequence[Point], variant: str, mode: str) -> Point | None:
     return next((p for p in points if (p.variant, p.horizon, p.mode, p.method) == key), None)
 
 
-def _summary(points: Sequence[Point], found: Sequence[Duel]) -> Table:
+def _summary(points: Sequence[Point], found: Sequence[Comparison]) -> Table:
     rows = []
     for name in VARIANTS:
         for mode, words in MODES.items():
@@ -341,8 +342,12 @@ def _summary(points: Sequence[Point], found: Sequence[Duel]) -> Table:
     )
 
 
-def _rival(duel: Duel) -> str:
-    return f"{duel.rival.label}: {duel.ratio:.2g} ×" if duel.rival and duel.ratio else "none"
+def _rival(comparison: Comparison) -> str:
+    return (
+        f"{comparison.rival.label}: {comparison.ratio:.2g} ×"
+        if comparison.rival and comparison.ratio
+        else "none"
+    )
 
 
 def _orders(rows: Sequence[Row]) -> Table:
@@ -411,7 +416,7 @@ def _all(points: Sequence[Point]) -> Table:
 # --- claims ---
 
 
-def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Duel]) -> list[Claim]:
+def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Comparison]) -> list[Claim]:
     """Return what is claimed; whether it holds is measured, and what does not hold is told in the README."""
     made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
     steps = [p for p in points if p.ours and p.method == OURS and p.horizon == "one step"]
@@ -463,7 +468,7 @@ def _claim(text: str, measured: Any, holds: Callable[[], bool], evidence: Callab
     return Claim(text, holds(), evidence()) if measured else Claim(text, None, "not measured")
 
 
-def _fastest(found: Sequence[Duel], horizon: str, target: float) -> Claim:
+def _fastest(found: Sequence[Comparison], horizon: str, target: float) -> Claim:
     here = [d for d in found if d.horizon == horizon and d.target == target and (d.ours or d.rival)]
     lost = [d for d in here if d.lost]
 

@@ -68,7 +68,7 @@ COVERED = {
 #: Seconds that the errors of one point may take; what would take longer is not run.
 LIMIT = 2.0
 #: Seconds that one sample of its time may take, about.
-SAMPLE = 0.01
+SAMPLE = 0.02
 
 
 def control_step(variant: str) -> float:
@@ -257,7 +257,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
                         at_rounding = row["error"] < 4.0 * ROUNDING
                         no_better = row["error"] > 0.7 * done.get(rival.method, math.inf)
                         done[rival.method] = -1.0 if at_rounding or no_better else row["error"]
-            clock = timed(Ours(Ours.METHOD, 1), base, dt, 1, together)
+            clock = timed(Ours(Ours.METHOD, 1), base, dt, steps, together)
             times = interleaved(dict(enumerate([clock, *samples])), 5 if quick else 9)
             for i, row in enumerate(found):
                 yield row | {"ns": times[i + 1], "clock": times[0]}
@@ -271,49 +271,52 @@ def point(
     Raises
     ------
     TimeoutError
-        Where a hundredth of the work tells that the whole would take too long.
+        Where it would take too long.
     """
     members = [t.case for t in some]
     # Where states share their steps, the errors are those of a batch as large as the one that is timed.
     cases = [*members, *base[len(members) :]] if together and rival.shared else members
     if rival.family != "ours":
-        _guard(rival, cases, dt, steps, together)
+        few = cases if together else cases[:1]
+        expected = _seconds(rival, few, dt, steps, together) * len(cases) / len(few)
+        if expected > LIMIT:
+            raise TimeoutError(f"not run, it would take {expected:.0f} s")
     ends = rival.build(Problems(cases), dt, steps, together).end()[: len(some)]
     known = np.where(np.isnan(ends), np.nan, ends)  # there are many bit patterns that are no number
     row = errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
     return row, timed(rival, base, dt, steps, together)
 
 
-def _guard(rival: Rival, cases: Sequence[Case], dt: float, steps: int, together: bool) -> None:
-    """Raise TimeoutError where the errors would take longer than the limit; compile on the way."""
-    few = cases if together else cases[:1]
+def _seconds(rival: Rival, cases: Sequence[Case], dt: float, steps: int, together: bool) -> float:
+    """Return how long a call takes, about, from one for a hundredth of the time; compile on the way."""
     part = max(1, steps // 100)
-    sample = rival.build(Problems(few), dt, part, together)
+    sample = rival.build(Problems(cases), dt, part, together)
     sample.end()
     begin = time.process_time()  # whatever else the machine does
     sample.end()
-    expected = (time.process_time() - begin) * steps / part * len(cases) / len(few)
-    if expected > LIMIT:
-        raise TimeoutError(f"not run, it would take {expected:.0f} s")
+    return max(time.process_time() - begin, 1e-7) * steps / part
 
 
 def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: bool) -> Sample:
-    """Return a sample of some milliseconds, all in compiled loops where the rival has them."""
-    if rival.fixed and steps > 1:
-        steps = min(steps, max(16, 512 // rival.substeps(1)))
-    if together:
-        sample = rival.build(Problems(base), dt, steps, True)
-        return repeated(sample, 8) if steps == 1 else sample
+    """Return a sample of some milliseconds, in one call, all in compiled loops where the rival has them.
+
+    Over a long time a step costs what it does over a shorter one, so a slow rival is timed over a part of it.
+    """
     if steps == 1 and rival.changing:
-        per_control = rival.substeps(1) if rival.fixed else 1
-        return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // per_control))
-    one = rival.build(Problems(base[:1]), dt, steps, False)
-    one.end()
-    begin = time.perf_counter()
-    one.end()
-    spent = max(time.perf_counter() - begin, 1e-7)
-    count = min(64 if steps == 1 else 4, max(1, int(SAMPLE / spent)))
-    return rival.build(Problems(base[:count]), dt, steps, False) if count > 1 else one
+        each = rival.substeps(1) if rival.fixed else 1
+        if together:  # few, for a control that is held drives states afar
+            return rival.build(Problems(base), dt, 1, True, max(1, 4 // each))
+        return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // each))
+    some = base if together else base[:1]
+    if rival.fixed:
+        steps = min(steps, max(16, 512 // rival.substeps(1)))
+    spent = _seconds(rival, some, dt, steps, together)
+    if spent > SAMPLE:
+        steps = max(1, steps // 100, int(steps * SAMPLE / spent))
+    elif not together:
+        some = base[: min(64 if steps == 1 else 4, max(1, int(SAMPLE / spent)))]
+    sample = rival.build(Problems(some), dt, steps, together)
+    return repeated(sample, 8) if steps == 1 and together and 8.0 * spent < SAMPLE else sample
 
 
 def mirrored(cases: Sequence[Case], low: float, high: float) -> list[Case]:

@@ -60,22 +60,34 @@ def parameter(
     least: float | None = None,
     below: float | None = None,
     most: float | None = None,
+    usable: tuple[float, float] = (-math.inf, math.inf),
 ) -> Any:
-    """Declare a physical parameter: default, unit, and the range that it must lie in."""
+    """Declare a physical parameter: default, unit, and the range that it must lie in.
+
+    In the narrower range `usable` an environment can be used, whatever its other parameters, see
+    `Task.usable`; a scene alone may be stepped beyond it.
+    """
     limits = {"above": above, "least": least, "below": below, "most": most}
-    return dataclasses.field(default=default, metadata={"unit": unit} | limits)
+    return dataclasses.field(default=default, metadata={"unit": unit, "usable": usable} | limits)
 
 
-def check_number(name: str, value: Any, unit: str = "") -> float:
-    """Return the value as a finite float, or raise a ValueError that names it."""
-    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
-    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
-        raise ValueError(f"{name} must be a real number, got {value!r}")
+def shown(value: Any) -> str:
+    """Return a value as an error shows it, long ones cut short."""
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:150]}... ({len(text)} characters)"
+
+
+def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False) -> float:
+    """Return the value as a finite float, infinity too where it may be `endless`; else raise a ValueError."""
+    if type(value) is np.ndarray and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, numbers.Real):
+        raise ValueError(f"{name} must be a real number, got {shown(value)}")
     try:
         number = float(value)
     except OverflowError:  # an integer may be too large
-        number = math.inf
-    if not math.isfinite(number):
+        number = math.nan
+    if not math.isfinite(number) and not (endless and value == math.inf):
         raise ValueError(f"{name} must be finite, got {value!s:.40}{unit and ' ' + unit}")
     return number
 
@@ -85,10 +97,17 @@ def real_array(name: str, values: ArrayLike) -> Array:
     try:
         array = np.array(values)
     except ValueError as error:  # rows of different lengths
-        raise ValueError(f"{name} must be real numbers, got {values!r}") from error
-    if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must be real numbers, got {values!r}")
+        raise ValueError(f"{name} must be real numbers, got {shown(values)}") from error
+    if array.dtype.kind not in "fiu" or is_masked(values):
+        raise ValueError(f"{name} must be real numbers, got {shown(values)}")
     return array.astype(np.float64)
+
+
+def is_masked(values: Any) -> bool:
+    """Tell whether values are or hold a masked array, whose masked numbers NumPy would take for valid."""
+    if isinstance(values, list | tuple):
+        return any(map(is_masked, values))
+    return isinstance(values, np.ndarray) and hasattr(values, "mask")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -225,7 +244,7 @@ class Scene(ABC):
         array = real_array("state", state)
         if array.shape != (len(self.state_names),):
             raise ValueError(
-                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+                f"state must be ({', '.join(self.state_names)}), got shape {array.shape}: {shown(state)}"
             )
         if not np.isfinite(array).all():
             raise ValueError(
@@ -270,7 +289,9 @@ class Scene(ABC):
         """
         controls = self.check_control(controls)
         if controls.ndim != 1:
-            raise ValueError(f"controls must have shape (T,), got {controls.shape}")
+            raise ValueError(
+                f"controls must have shape (T,), got shape {controls.shape}: {shown(controls.tolist())}"
+            )
         dt = check_step(dt)
         trajectory = np.empty((len(controls) + 1, len(self.state_names)))
         trajectory[0] = self.check_state(state)

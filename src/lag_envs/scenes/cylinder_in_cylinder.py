@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter
+from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter, shown
 from lag_envs.scenes.shapes import (
     Arrow,
     Circle,
@@ -83,18 +83,18 @@ class CylinderInCylinder(Scene):
     9.81
     """
 
-    mass: float = parameter(1.0, "kg", above=0.0)
-    shell_radius: float = parameter(0.5, "m", above=0.0)
-    radius: float = parameter(0.1, "m", above=0.0)
-    inertia: float = parameter(None, "kg m²", least=0.0)
-    damping: float = parameter(0.0, "N m s", least=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
+    shell_radius: float = parameter(0.5, "m", above=0.0, usable=(1e-5, 1e5))
+    radius: float = parameter(0.1, "m", above=0.0, usable=(1e-5, 1e5))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
     control: str = "tilt"
 
     def check(self) -> None:
         """Fill in the solid cylinder's inertia; check the radii and the control."""
-        if self.control not in tuple(CONTROLS):
-            raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
+        if not isinstance(self.control, str) or self.control not in CONTROLS:
+            raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {shown(self.control)}")
         if not self.radius < self.shell_radius:
             raise ValueError(
                 f"radius must be below shell_radius={self.shell_radius:g} m, got {self.radius:g} m"

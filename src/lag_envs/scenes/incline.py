@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lag_envs.scenes import shapes
-from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter
+from lag_envs.scenes.base import Motion, Scene, friction_ratio, parameter, shown
 from lag_envs.scenes.shapes import Arrow, Line, Moment, Point, Polygon, Shape, Window
 from lag_envs.stepping import slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow
@@ -72,18 +72,18 @@ class Incline(Scene):
     [0.326, 0.653]
     """
 
-    mass: float = parameter(1.0, "kg", above=0.0)
-    radius: float = parameter(0.05, "m", above=0.0)
-    inertia: float = parameter(None, "kg m²", least=0.0)
-    damping: float = parameter(0.0, "N s/m", least=0.0)
+    mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
+    radius: float = parameter(0.05, "m", above=0.0, usable=(1e-5, 1e5))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    damping: float = parameter(0.0, "N s/m", least=0.0, usable=(0.0, 1e9))
     tilt: float = parameter(None, "rad", least=-math.pi / 2, most=math.pi / 2)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
     control: str = "damping"
 
     def check(self) -> None:
         """Fill in the solid cylinder's inertia and the tilt, and check the control."""
-        if self.control not in tuple(CONTROLS):
-            raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {self.control!r}")
+        if not isinstance(self.control, str) or self.control not in CONTROLS:
+            raise ValueError(f"control must be one of {', '.join(CONTROLS)}, got {shown(self.control)}")
         if self.control != "damping" and self.tilt is not None:
             raise ValueError(
                 f"tilt={self.tilt:g} rad would be ignored: "

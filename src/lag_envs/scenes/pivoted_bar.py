@@ -67,11 +67,11 @@ class PivotedBar(Scene):
     (51, 2)
     """
 
-    mass: float = parameter(0.2, "kg", above=0.0)
-    com_distance: float = parameter(0.3, "m", above=0.0)
-    inertia: float = parameter(None, "kg m²", least=0.0)
-    damping: float = parameter(0.0, "N m s", least=0.0)
-    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    mass: float = parameter(0.2, "kg", above=0.0, usable=(1e-6, 1e6))
+    com_distance: float = parameter(0.3, "m", above=0.0, usable=(1e-5, 1e5))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
     track: float | None = 0.5
 
     def check(self) -> None:
@@ -79,7 +79,7 @@ class PivotedBar(Scene):
         if self.inertia is None:
             object.__setattr__(self, "inertia", self.mass * self.com_distance * self.com_distance / 3.0)
         if self.track is not None:
-            track = math.inf if self.track == math.inf else check_number("track", self.track, "m")
+            track = check_number("track", self.track, "m", endless=True)
             if not track > 0.0:
                 raise ValueError(f"track must be above 0 m, infinity or None, got {track:g} m")
             object.__setattr__(self, "track", track)

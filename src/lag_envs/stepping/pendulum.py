@@ -33,7 +33,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import compile_python, compile_traced
 from lag_envs.stepping.tracing import pairwise_sum, polynomial, sum_of_products
-from lag_envs.stepping.twofold import Twofold, mixed_polynomial
+from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 ORDER = 16
 TOLERANCE = 1e-12
@@ -393,17 +393,14 @@ def _compile_divided(order: int) -> Callable:
     def scale(xp: Any, omega: Any, *numbers: Any) -> tuple:
         *drive, h, h_low = numbers
         step = Twofold(h, h_low)
-        return parts(step * omega, *scaled(Drive(*map(Twofold, drive)), step))
+        return twofold_parts(step * omega, *scaled(Drive(*map(Twofold, drive)), step))
 
     def one(xp: Any, *numbers: Any) -> tuple:
         *halves, i = numbers
         w, c, s, turned, *drive = map(Twofold, halves[::2], halves[1::2])
         a, b, gamma, d, r = drive
         w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
-        return parts(w, c, s, turned + angle)
-
-    def parts(*numbers: Twofold) -> tuple:
-        return tuple(part for number in numbers for part in number.parts())
+        return twofold_parts(w, c, s, turned + angle)
 
     return compile_python(
         "divided",

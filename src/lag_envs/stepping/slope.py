@@ -21,14 +21,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lag_envs.stepping.compiling import compile_python, compile_traced
-from lag_envs.stepping.pendulum import rotate
-from lag_envs.stepping.tracing import clip, polynomial
+from lag_envs.stepping.pendulum import TWOFOLD, rotate
+from lag_envs.stepping.tracing import clip, pairwise_sum, polynomial
+from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 SMALL_DECAY = 0.25  # up to here the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
 _PHI2 = [(-1.0) ** k / math.factorial(k + 2) for k in range(12)]
@@ -152,28 +153,52 @@ def rolling(x: Any, v: Any, s: Any, turn: Turn) -> Any:
     return turn.rolling * (turn.gravity * s + x * (turn.rate * turn.rate)) - turn.drag * v
 
 
-def turn_change(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
-    """Return by how much (x, x') change, by the Taylor series; (c, s) are cosφ and sinφ at the start."""
+def turn_coefficients(
+    x: Any, w: Any, c: Any, s: Any, turn: Turn, h: Any, order: int = TURN_ORDER
+) -> tuple[list, list]:
+    """Return the Taylor coefficients of x and hx'; w is hx' at the start, (c, s) are cosφ and sinφ there."""
     rate = turn.rate * h
     carry = turn.rolling * (rate * rate)
     weight = turn.rolling * turn.gravity * (h * h)
     drag = turn.drag * h
-    X, V, S, C = [x], [h * v], [weight * s], [weight * c]
-    for k in range(TURN_ORDER):
+    X, V, S, C = [x], [w], [weight * s], [weight * c]
+    for k in range(order):
         V.append((carry * X[k] + S[k] - drag * V[k]) * (1.0 / (k + 1)))
         X.append(V[k] * (1.0 / (k + 1)))
         S.append(rate * C[k] * (1.0 / (k + 1)))
         C.append(rate * S[k] * (-1.0 / (k + 1)))
-    dx, dv = X[TURN_ORDER], V[TURN_ORDER]
-    for k in range(TURN_ORDER - 1, 0, -1):
-        dx, dv = dx + X[k], dv + V[k]
-    return dx, dv * (1.0 / h)
+    return X, V
+
+
+def turn_change(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+    """Return by how much (x, x') change, by the Taylor series; (c, s) are cosφ and sinφ at the start."""
+    X, V = turn_coefficients(x, h * v, c, s, turn, h)
+    return _sum(X[1:]), _sum(V[1:]) * (1.0 / h)
+
+
+def _sum(terms: list) -> Any:
+    """Add up from the last to the first."""
+    return reduce(lambda total, term: total + term, reversed(terms))
 
 
 def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
     """Advance (x, x') by `turn_change`."""
     dx, dv = turn_change(x, v, c, s, turn, h)
     return x + dx, v + dv
+
+
+def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: Turn, h: Twofold) -> tuple:
+    """Advance (x, hx', cosφ, sinφ) by one of many steps, with twice the digits (see `pendulum.substep`)."""
+    ends = []
+    plain = Turn(*(number.high for number in turn))
+    for large, W in zip(
+        turn_coefficients(x, w, c, s, turn, h, TWOFOLD),
+        turn_coefficients(x.high, w.high, c.high, s.high, plain, h.high),
+        strict=True,
+    ):
+        W[: len(large)] = large
+        ends.append(pairwise_sum(W))
+    return *ends, *rotate(c, s, turn.rate * h, partial(mixed_polynomial, twofold=3))
 
 
 def turns(turn: Turn, h: Any, xp: Any) -> Any:
@@ -187,10 +212,20 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
     growth = dt * (2.0 * drag + 3.0 * abs(rate))
     n = np.ceil(max(1.0, growth / SMALL_TURN))
     if n == 1.0 or (drag <= abs(rate) and n <= 1e5):
-        h = dt / n
-        for _i in range(int(n)):
-            x, v = series(x, v, c, s, rolling, gravity, drag, rate, h)
-            c, s = turn_pair(c, s, rate * h)
+        if n == 1.0:
+            x, v = series(x, v, c, s, rolling, gravity, drag, rate, dt)
+            c, s = turn_pair(c, s, rate * dt)
+        else:
+            h = dt / n
+            h_low = fma(-h, n, dt) / n
+            w, w_low = start(v, h, h_low)
+            x_low = c_low = s_low = 0.0
+            for _i in range(int(n)):
+                x, x_low, w, w_low, c, c_low, s, s_low = substep(
+                    x, x_low, w, w_low, c, c_low, s, s_low, rolling, gravity, drag, rate, h, h_low
+                )
+            v = w / h
+            v += (fma(-v, h, w) + (w_low - v * h_low)) / h
         return x, v, c, s, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
     doublings = 0
     h = dt
@@ -243,4 +278,20 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
         for name, f in (("series", turn_series), ("change", turn_change))
     )
     pair = compile_traced("turn_pair", "c, s, angle", lambda xp, c, s, angle: rotate(c, s, angle))
-    return compile_python("flow", _turn_any, series, change, pair, SMALL_TURN=SMALL_TURN)
+
+    def substep(xp: Any, *numbers: Any) -> tuple:
+        *halves, h, h_low = numbers
+        x, w, c, s = map(Twofold, halves[:8:2], halves[1:8:2])
+        return twofold_parts(*turn_substep(x, w, c, s, Turn(*map(Twofold, halves[8:])), Twofold(h, h_low)))
+
+    names = ", ".join(f"{name}, {name}_low" for name in "xwcs")
+    return compile_python(
+        "flow",
+        _turn_any,
+        series,
+        change,
+        pair,
+        compile_traced("start", "v, h, h_low", lambda xp, v, *h: twofold_parts(Twofold(*h) * v)),
+        compile_traced("substep", f"{names}, rolling, gravity, drag, rate, h, h_low", substep, absent),
+        SMALL_TURN=SMALL_TURN,
+    )

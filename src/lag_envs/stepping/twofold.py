@@ -92,10 +92,15 @@ def mixed_polynomial(coefficients: Sequence[float], x: Twofold, *, twofold: int)
     return value
 
 
+def twofold_parts(*numbers: Twofold) -> tuple:
+    """Return the parts of several numbers, one after the other."""
+    return tuple(part for number in numbers for part in number.parts())
+
+
 def _twofold(value: Any) -> Twofold:
     if isinstance(value, Twofold):
         return value
     if isinstance(value, Number):
         return Twofold(value)
-    fraction = Fraction(value).limit_denominator(1_000_000)
+    fraction = Fraction(value).limit_denominator(1000)
     return Twofold(value, float(fraction - Fraction(value)) if float(fraction) == value else 0.0)

@@ -26,6 +26,9 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def load_task(place: str) -> type[Task]:
-    """Return the task class at "module:Class"."""
-    module, _, name = place.partition(":")
-    return getattr(import_module(module), name)
+    """Return the task class at "module:Class", or raise a ValueError."""
+    try:
+        module, _, name = place.partition(":")
+        return getattr(import_module(module), name)
+    except (AttributeError, ImportError, TypeError, ValueError) as error:
+        raise ValueError(f"task must be given as 'module:Class', got {place!r:.200}: {error}") from error

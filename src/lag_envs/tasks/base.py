@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -53,6 +52,10 @@ class Task(ABC):
     rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
+    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares:
+    #: wherever in these ranges all of them lie, every accepted start and action gives finite observations
+    #: within their space, and steps of any `dt` are taken.
+    usable: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(
         self,
@@ -81,14 +84,30 @@ class Task(ABC):
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
         seconds = self.interval * self.steps if duration is None else duration
-        if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds >= self.dt:
-            raise ValueError(f"duration must be at least dt={self.dt:g} s, got {seconds!r}")
-        self.duration: float = float(seconds)
+        self.duration = check_number("duration", seconds, "s", endless=True)
+        if not self.duration >= self.dt:
+            raise ValueError(f"duration must be at least dt={self.dt:g} s, got {self.duration:g} s")
         self.target: float | None = None if target is None else self.check_target(target)
         self.check()
+        self.check_usable()
 
     def check(self) -> None:
         """Raise ValueError where the parameters do not fit the task."""
+
+    def check_usable(self) -> None:
+        """Raise ValueError where a parameter is outside the range in which the task can be used."""
+        for name, (low, high) in self.usable_ranges().items():
+            value = getattr(self.scene, name)
+            if value is not None and not math.isinf(value) and not low <= value <= high:
+                raise ValueError(
+                    f"{name} must lie between {low:g} and {high:g} in this environment, got {value!r}"
+                )
+
+    @classmethod
+    def usable_ranges(cls) -> dict[str, tuple[float, float]]:
+        """Return the range of each parameter in which the task can be used."""
+        fields = dataclasses.fields(cls.scene_type)
+        return {f.name: f.metadata["usable"] for f in fields if "usable" in f.metadata} | cls.usable
 
     @property
     def variant(self) -> tuple:
@@ -225,7 +244,8 @@ class Task(ABC):
 
 def finite(bound: float) -> float:
     """Return the bound, or the largest float32 where the episode has no end and so no bound exists."""
-    return min(bound, float(np.finfo(np.float32).max))
+    largest = float(np.finfo(np.float32).max)
+    return bound if bound < largest else largest  # no speed times no end is no number
 
 
 def kick_chance(task: Task, chance: float) -> float:

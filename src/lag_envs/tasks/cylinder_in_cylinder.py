@@ -15,6 +15,16 @@ from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 
 
+def _check_gap(scene: CylinderInCylinder) -> None:
+    """Refuse a small cylinder that fills the shell: it would move faster than can be stepped."""
+    largest = min(scene.shell_radius - 1e-5, 0.9999 * scene.shell_radius)
+    if scene.radius > largest:
+        raise ValueError(
+            f"radius must be at most {largest!r} m with shell_radius={scene.shell_radius!r} m, "
+            f"1e-5 m and a ten thousandth below, got {scene.radius!r} m"
+        )
+
+
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
 
@@ -29,6 +39,7 @@ class _Shell(Task):
         """Refuse the damping control."""
         if self.scene.control != "tilt":
             raise ValueError(f"this task is controlled by 'tilt', got control={self.scene.control!r}")
+        _check_gap(self.scene)
 
     @property
     def start(self) -> Sequence[float]:
@@ -134,17 +145,20 @@ class Tilt(_Shell):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | inner radius R of the shell |
-    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0.24 | N m s | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
-    | target | None | rad | an angle for every episode, within ±1.05; None: random |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0.24 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    | target | None | rad | ±1.05 | an angle for every episode; None: random |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -170,17 +184,19 @@ class Tilt(_Shell):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
+    size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 197.67 (a plan by iLQR on the exact model gets it) and about 197.7 at most (finite-horizon value
-    iteration on a grid, extrapolated: an estimate). Over 4,096 episodes (mean ± standard error), the last
-    column being the feedback action = 30.3 (θ* - θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
+    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the feedback is action = 30.3 (θ* - θ) - 3.77 θ'
+    + 0.355 (16.35 sinθ* - ψ'), clipped to ±1:
 
-    | Id | Random actions | Zero control | Feedback |
-    | -- | -------------- | ------------ | -------- |
-    | CylinderInCylinderTilt-v0 | 42.3 ± 0.4 | 61.3 ± 1.1 | 197.6 ± 0.0 |
+    | Id | Random actions | Zero control | Feedback | Best known |
+    | -- | -------------- | ------------ | -------- | ---------- |
+    | CylinderInCylinderTilt-v0 | 42.26 ± 0.36 | 61.3 ± 1.1 | 197.602 ± 0.028 | 197.6717 ± 0.0037 |
 
     ## Version History
 
@@ -270,16 +286,19 @@ class Pump(_Shell):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | inner radius R of the shell |
-    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0.024 | N m s | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | field g, downward, above 0 |
-    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0.024 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
+    | gravity | 9.81 | m/s² | 1e-3 to 1e4 | field g, downward |
+    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -303,18 +322,19 @@ class Pump(_Shell):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Measured against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines.
+    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
+    size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 145.7 (the greedy policy of finite-horizon value iteration gets it) and about 147 at most (the
-    same on a grid without width, extrapolated: an estimate; by the order of convergence seen, 145.5). Over
-    4,096 episodes (mean ± standard error), the last column being the energy pump action = 1.78 (E* - E) θ' -
-    0.932 ψ' + 0.315 θ, clipped to ±1:
+    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the energy pump
+    is action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1:
 
-    | Id | Random actions | Zero control | Energy pump |
-    | -- | -------------- | ------------ | ----------- |
-    | CylinderInCylinderPump-v0 | 6.25 ± 0.01 | 7.22 ± 0.00 | 142.1 ± 0.0 |
+    | Id | Random actions | Zero control | Energy pump | Best known |
+    | -- | -------------- | ------------ | ----------- | ---------- |
+    | CylinderInCylinderPump-v0 | 6.2510 ± 0.0057 | 7.2179 ± 0.0010 | 142.055 ± 0.043 | 145.637 ± 0.043 |
 
     ## Version History
 
@@ -329,16 +349,9 @@ class Pump(_Shell):
         "control": "tilt",
     }
     observation = ("theta", "theta_dot", "psi_dot")
+    usable: ClassVar = {"gravity": (1e-3, 1e4)}  # without a field no energy belongs to the amplitude
     limit_control, fastest_shell, largest_angle = 4.0, 3.0, 1.3
     amplitude = 0.9
-
-    def check(self) -> None:
-        """Ask for a field: without one no energy belongs to the amplitude."""
-        super().check()
-        if self.scene.gravity == 0.0:
-            raise ValueError(
-                "gravity must be above 0 m/s²: the energy to pump to is that of an amplitude of 0.9 rad"
-            )
 
     def numbers(self) -> dict[str, float]:
         """Return the limits and E* of the amplitude 0.9 rad, per inertia [1/s²]."""
@@ -421,16 +434,19 @@ class Damping(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | inner radius R of the shell |
-    | radius | 0.1 | m | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0 | N m s | constant drag; adds to the brake |
-    | gravity | 9.81 | m/s² | field g, downward, above 0 |
-    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
+    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | damping | 0 | N m s | 0 to 1e9 | constant drag; adds to the brake |
+    | gravity | 9.81 | m/s² | 1e-3 to 1e4 | field g, downward |
+    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
     `info`.
@@ -451,18 +467,19 @@ class Damping(Task):
     ## Numerical Accuracy
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound.
+    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
 
     ## Optimal Value
 
-    At least 367.1 ± 0.2 (the greedy policy of finite-horizon value iteration gets it) and about 367.6 at most
-    (extrapolated to a grid without width: an estimate). Full damping all the time gets 305. Over 4,096
-    episodes (mean ± standard error), the last column being full brake away from the bottom, and action = 14.6
-    (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
+    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
+    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum, tells
+    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the switching
+    line is full brake away from the bottom, and action = 14.6 (|θ'| - 6.94 |θ|), clipped to ±1, towards it:
 
-    | Id | Random actions | Zero control | Switching line |
-    | -- | -------------- | ------------ | -------------- |
-    | CylinderInCylinderDamping-v0 | 294.3 ± 1.0 | 13.2 ± 0.4 | 363.8 ± 0.7 |
+    | Id | Random actions | Zero control | Switching line | Best known |
+    | -- | -------------- | ------------ | -------------- | ---------- |
+    | CylinderInCylinderDamping-v0 | 294.34 ± 0.99 | 13.19 ± 0.37 | 363.77 ± 0.73 | 367.050 ± 0.063 |
 
     Zero control is the action -1, no brake.
 
@@ -474,19 +491,17 @@ class Damping(Task):
     scene: CylinderInCylinder
     scene_type = CylinderInCylinder
     defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
+    usable: ClassVar = {"gravity": (1e-3, 1e4)}  # without a field nothing holds the cylinder in the shell
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
     rest_action = -1.0
 
     def check(self) -> None:
-        """Refuse the other control, and a scene without a field."""
+        """Refuse the other control."""
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
-        if self.scene.gravity == 0.0:
-            raise ValueError(
-                "gravity must be above 0 m/s²: without it nothing holds the cylinder in the shell"
-            )
+        _check_gap(self.scene)
 
     @property
     def start(self) -> Sequence[float]:

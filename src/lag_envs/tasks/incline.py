@@ -70,17 +70,20 @@ class Tilt(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m |
-    | radius | 0.05 | m | rolling radius R |
-    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0.03 | N s/m | coefficient c of the drag -cx' at the axis |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | control | tilt_rate | - | what the control is: "tilt_rate", or "tilt" |
-    | dt | 0.05 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
-    | target | None | m | a mark for every episode, within ±0.5; None: random |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
+    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0.03 | N s/m | 0 to 1e9 | coefficient c of the drag -cx' at the axis |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | control | tilt_rate | - | - | what the control is: "tilt_rate", or "tilt" |
+    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    | target | None | m | ±0.5 | a mark for every episode; None: random |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -107,14 +110,14 @@ class Tilt(Task):
 
     ## Optimal Value
 
-    At least 181.6 (a plan by iLQR on the exact model gets it) and about 181.9 at most (finite-horizon value
-    iteration on a grid, extrapolated: an estimate), in the mean over the targets. Over 4,096 episodes (mean ±
-    standard error), the last column being the cascade φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1,
-    action = 43.4 (φ_wanted - φ), clipped to ±1:
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
+    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the cascade is φ_wanted = -1.45 (x - x*) - 1.28
+    w, clipped to ±0.1, and action = 43.4 (φ_wanted - φ), clipped to ±1:
 
-    | Id | Random actions | Zero control | Cascade |
-    | -- | -------------- | ------------ | ------- |
-    | InclineTilt-v0 | 9.5 ± 0.2 | 11.3 ± 0.2 | 179.9 ± 0.3 |
+    | Id | Random actions | Zero control | Cascade | Best known |
+    | -- | -------------- | ------------ | ------- | ---------- |
+    | InclineTilt-v0 | 9.46 ± 0.18 | 11.29 ± 0.23 | 179.88 ± 0.28 | 181.560 ± 0.026 |
 
     ## Version History
 
@@ -272,16 +275,19 @@ class Brake(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 1 | kg | mass m |
-    | radius | 0.05 | m | rolling radius R |
-    | inertia | 0.00125 | kg m² | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0 | N s/m | constant drag; adds to the brake |
-    | tilt | 0.261799 | rad | the slope φ, from 0 to π/2 |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
+    | radius | 0.05 | m | 1e-5 to 1e5 | rolling radius R |
+    | inertia | 0.00125 | kg m² | 0 to 1e18 | moment of inertia I about the axis; None: solid, mR²/2 |
+    | damping | 0 | N s/m | 0 to 1e9 | constant drag; adds to the brake |
+    | tilt | 0.261799 | rad | 0 to 1.57 | the slope φ |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
     `info`.
@@ -306,14 +312,15 @@ class Brake(Task):
 
     ## Optimal Value
 
-    At least -1.724 (a switching line with its turning point computed on the exact model gets it), which is
-    also what finite-horizon value iteration on a grid, extrapolated, gives at most: an estimate. Over 4,096
-    episodes (mean ± standard error), the last column being the switching line action = 14.6 (v - 0.149 - 2.33
-    distance), clipped to ±1:
+    Known: roll freely, then brake fully, from the best moment on. `lag_envs.controllers.optimal_return` is what
+    that returns from any start; no policy exceeds it. The best policy known, which acts at intervals, misses it
+    by 0.0002 in the mean (`python -m agents.scale` measures both, in episodes of their own). Mean returns ±
+    standard errors, of the other policies over 4,096 episodes; the switching line is action = 14.6 (v - 0.149 -
+    2.33 distance), clipped to ±1:
 
-    | Id | Random actions | Zero control | Switching line |
-    | -- | -------------- | ------------ | -------------- |
-    | InclineBrake-v0 | -4.32 ± 0.01 | -11.98 ± 0.03 | -1.740 ± 0.005 |
+    | Id | Random actions | Zero control | Switching line | Best known |
+    | -- | -------------- | ------------ | -------------- | ---------- |
+    | InclineBrake-v0 | -4.318 ± 0.012 | -11.975 ± 0.033 | -1.7435 ± 0.0049 | -1.7241 ± 0.0004 |
 
     Zero control is the action -1, no brake.
 
@@ -325,6 +332,7 @@ class Brake(Task):
     scene: Incline
     scene_type = Incline
     defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
+    usable: ClassVar = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
     observation = ("distance", "v")
     limit_control = 6.0
     rest_action = -1.0
@@ -332,13 +340,9 @@ class Brake(Task):
     gentle, price = 0.5, 5.0
 
     def check(self) -> None:
-        """Refuse the other controls, and a slope on which the cylinder would not roll down."""
+        """Refuse the other controls."""
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
-        if self.scene.tilt < 0.0:
-            raise ValueError(
-                f"tilt must be at least 0 rad for the cylinder to roll down, got {self.scene.tilt:g} rad"
-            )
 
     @property
     def centre(self) -> Sequence[float]:

@@ -80,16 +80,19 @@ class SwingUp(Task):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 0.2 | kg | mass m |
-    | com_distance | 0.3 | m | distance L from pivot to centre of mass, half of the bar's length |
-    | inertia | 0.006 | kg m² | moment of inertia I about the centre of mass; None: mL²/3 |
-    | damping | 0.001 | N m s | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | track | 0.5 | m | travel S to either side; `math.inf`: no limit (s/S is then s/0.5 m); None: no track |
-    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
+    | com_distance | 0.3 | m | 1e-5 to 1e5 | distance L from pivot to centre of mass, half of the length |
+    | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
+    | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; `math.inf`: no end (S = 0.5 m); None: none |
+    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
 
@@ -111,22 +114,22 @@ class SwingUp(Task):
     ## Numerical Accuracy
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 15.0 rad/s, whatever the control; above that the step is divided, by the same bound. Measured
-    against 40 digits: below 2e-16, relative to the size that docs/numerics.md defines. s and s' are exact
-    to rounding.
+    most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
+    s and s' are exact to rounding.
 
     ## Optimal Value
 
-    At least 419.0 with a track and 422.5 without: a plan by iLQR on the exact model gets that, upright after
-    1.9 s. At most about 423 (finite-horizon value iteration without the track, extrapolated to a grid without
-    width: an estimate, not a proof). Over 4,096 episodes (mean ± standard error):
+    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale` measures it,
+    in episodes of its own); what value iteration estimates of the optimum, tells docs/agents.md. Mean returns ±
+    standard errors, of the other policies over 4,096 episodes:
 
-    | Id | Random actions | Zero control |
-    | -- | -------------- | ------------ |
-    | PivotedBar-v0 | -0.78 ± 0.07 | 0.00 ± 0.00 |
-    | PivotedBarFree-v0 | -2.43 ± 0.02 | 0.00 ± 0.00 |
+    | Id | Random actions | Zero control | Best known |
+    | -- | -------------- | ------------ | ---------- |
+    | PivotedBar-v0 | -0.779 ± 0.072 | 0.0002 ± 0.0000 | 418.987 ± 0.012 |
+    | PivotedBarFree-v0 | -2.426 ± 0.025 | 0.0002 ± 0.0000 | 422.490 ± 0.013 |
 
-    (mean ± standard error.) `make demo` trains an agent and shows what it and a classical controller reach.
+    `make demo` trains an agent and shows what it and a classical controller reach.
 
     ## Version History
 
@@ -136,6 +139,7 @@ class SwingUp(Task):
     scene: PivotedBar
     scene_type = PivotedBar
     defaults: ClassVar = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
+    usable: ClassVar = {"track": (1e-3, 1e9)}
     limit_control = 5.0
 
     @property
@@ -278,16 +282,19 @@ class Balance(SwingUp):
 
     ## Arguments
 
-    | Keyword | Default | Unit | Meaning |
-    | ------- | ------- | ---- | ------- |
-    | mass | 0.2 | kg | mass m |
-    | com_distance | 0.3 | m | distance L from pivot to centre of mass, half of the bar's length |
-    | inertia | 0.006 | kg m² | moment of inertia I about the centre of mass; None: mL²/3 |
-    | damping | 0.001 | N m s | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | field g, downward |
-    | track | 0.5 | m | travel S to either side; finite here |
-    | dt | 0.02 | s | control interval, 1e-6 to 1; the episode keeps its seconds |
-    | duration | 10 | s | length of an episode, `math.inf` for one without an end |
+    | Keyword | Default | Unit | Range | Meaning |
+    | ------- | ------- | ---- | ----- | ------- |
+    | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
+    | com_distance | 0.3 | m | 1e-5 to 1e5 | distance L from pivot to centre of mass, half of the length |
+    | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
+    | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
+    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; finite here |
+    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
+    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+
+    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
 
@@ -309,19 +316,20 @@ class Balance(SwingUp):
     ## Numerical Accuracy
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 15.0 rad/s, whatever the control; above that the step is divided, by the same bound. s and s' are
-    exact to rounding.
+    most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
+    s and s' are exact to rounding.
 
     ## Optimal Value
 
-    At least 452 (a linear-quadratic regulator gets it) and about 498 at most: that estimate is of
-    finite-horizon value iteration without ends of the track, which is far easier. The range is too wide to
-    tell how good a policy is in percent of the optimum. Over 4,096 episodes (mean ± standard error), the last
-    column being the feedback action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
+    Not known. The best policy known is a linear-quadratic regulator (`python -m agents.scale` measures it, in
+    episodes of its own); what value iteration estimates of a far easier task, tells docs/agents.md. Mean
+    returns ± standard errors, of the other policies over 4,096 episodes; the linear feedback is action = 1.83 s
+    + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1:
 
-    | Id | Random actions | Zero control | Linear feedback |
-    | -- | -------------- | ------------ | --------------- |
-    | PivotedBarBalance-v0 | 21.3 ± 0.2 | 21.8 ± 0.2 | 445.7 ± 1.7 |
+    | Id | Random actions | Zero control | Linear feedback | Best known |
+    | -- | -------------- | ------------ | --------------- | ---------- |
+    | PivotedBarBalance-v0 | 21.25 ± 0.15 | 21.78 ± 0.16 | 445.7 ± 1.7 | 452.70 ± 0.14 |
 
     Kicks that no control survives keep the optimum below 500.
 
