@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -24,6 +25,7 @@ from lag_envs.envs.single import (
     key_of,
     observation_space,
     start_options,
+    true_spec,
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.base import is_masked, real_array, shown
@@ -311,6 +313,17 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return single_number(
             np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
         )
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How the environments were made; its step limit is the one that they enforce."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = None if value is None else true_spec(value, self._constants[0]["limit"])
+
+    _spec: EnvSpec | None = None
 
     # --- the rest ------------------------------------------------------------------------------------------
 
