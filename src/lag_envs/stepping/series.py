@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, Node, SeriesRecord
-from lag_envs.stepping.tracing import Operation, evaluate
+from lag_envs.stepping.tracing import MAGIC, Operation, evaluate
 
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
@@ -44,16 +44,35 @@ TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
-TRIES = 8
+TRIES = 4
 #: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its registers.
 GROUP = 8
+
+
+def _rough_log2(x: Any, xp: Any) -> Any:
+    """Return the logarithm of x to the base 2, to 0.01."""
+    n = xp.exponent(x)
+    rest = x * xp.pow2(-n) - 1.0
+    return n + rest * (1.3465 - 0.3465 * rest)
+
+
+def _rough_exp2(x: Any, xp: Any) -> Any:
+    """Return 2**x, to 0.3 %."""
+    n = (x - 0.5 + MAGIC) - MAGIC
+    rest = x - n
+    return xp.pow2(n) * (1.0 + rest * (0.6565 + 0.3435 * rest))
+
+
+_OTHERS = {"rough log2": _rough_log2, "rough exp2": _rough_exp2}
 
 
 @cache
 def elementary(name: str, fused: bool) -> tuple[tuple[Operation, ...], str]:
     """Return the operations of an elementary function of ``x``, and the name of their result."""
     trace = ElementaryTrace()
-    operations, (result,) = trace.operations([getattr(trace, name)(*trace.inputs("x"))], fused=fused)
+    (x,) = trace.inputs("x")
+    value = _OTHERS[name](x, trace) if name in _OTHERS else getattr(trace, name)(x)
+    operations, (result,) = trace.operations([value], fused=fused)
     assert isinstance(result, str)
     return tuple(operations), result
 
@@ -500,7 +519,7 @@ class Series:
         done : condition
             Whether a step was certified.
         h : number
-            Its length.
+            Its length, or that of the shortest that was tried.
         q, v : list of number
             Places and velocities at its end; meaningless where there was none.
         bounds : list of number
@@ -548,11 +567,11 @@ class Series:
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
         wanted = t.less(zero, lane.left)
-        done, used, q, v, bounds = self.attempt(
+        done, tried, q, v, bounds = self.attempt(
             t, inputs, lane.q, lane.v, lane.wish, order, tolerance, wanted
         )
         done = t.both(done, wanted)
-        used = t.select(done, used, zero)
+        used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
         # What is nearly a step more is taken as one.
         longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
@@ -561,7 +580,7 @@ class Series:
             [t.select(done, x, before) for x, before in zip(v, lane.v, strict=True)],
             t.add(lane.status, t.select(wanted, t.number(1.0), zero)),
             left,
-            t.select(done, longer, t.mul(t.number(0.0625), lane.wish)),
+            t.select(done, longer, tried),
         )
         per = t.mul(used, t.reciprocal(t.plus(order, 2)))
         bounds = [*(t.mul(per, bound) for bound in bounds), *bounds]
@@ -705,15 +724,17 @@ class Certificate:
         t = self._t
         # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
         bounds = terms = t.number(0.0)
-        for i, (bound, rest) in enumerate(zip(self._bounds, self._rest, strict=True)):
-            per, slot = t.div(t.number(1.0), rest), self._series._slots["v", i]
+        for i, (bound, root) in enumerate(zip(self._bounds, self._roots, strict=True)):
+            slot = self._series._slots["v", i]
             last = t.add(self._size(slot, self._order), t.mul(t.number(0.1), self._last_but_one(slot)))
-            bounds = self._larger(bounds, t.mul(bound, per))
-            terms = self._larger(terms, t.mul(t.mul(power, last), per))
-        root = t.mul(self._per_next, t.elementary("log", t.select(self._fine, bounds, terms)))
-        safety = t.select(self._fine, t.number(0.95), t.number(0.8))
-        found = t.mul(safety, t.elementary("exp", t.neg(root)))
-        found = t.select(t.less(found, t.number(0.5)), found, t.number(0.5))
+            bounds, terms = self._larger(bounds, t.mul(bound, root)), self._larger(terms, t.mul(last, root))
+        excess = t.select(self._fine, bounds, t.mul(power, terms))
+        excess = t.div(excess, t.mul(self._tolerance, self._largest))
+        logarithm = t.mul(self._per_next, t.elementary("rough log2", excess))
+        safety = t.select(self._fine, t.number(0.98), t.number(0.9))
+        found = t.mul(safety, t.elementary("rough exp2", t.neg(logarithm)))
+        largest = t.number(0.85)
+        found = t.select(t.less(found, largest), found, largest)
         found = t.select(t.less(t.number(0.02), found), found, t.number(0.02))
         found = t.select(passed, t.number(1.0), found)
         (raised,) = t.loop(t.index(0), self._order, [power], lambda k, carried: [t.mul(found, carried[0])])
@@ -734,6 +755,7 @@ class Certificate:
         total = t.number(SMALLEST_SIZE)
         for i, root in enumerate(self._roots):
             total = self._larger(total, t.mul(root, self._all[self._series._slots["v", i]]))
+        self._largest = total
         return [t.mul(total, per) for per in self._per_root]
 
     def _measure(self) -> None:
