@@ -119,7 +119,7 @@ def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE) -> Calla
 def lanes(record: SeriesRecord) -> int:
     """Return how many lanes are stepped at once: as many as find room in the nearest cache."""
     slots = Series(record).slots
-    return 16 if slots < 5 else 8 if slots < 24 else 4
+    return 16 if slots < 8 else 8 if slots < 24 else 4
 
 
 @cache

@@ -4,18 +4,18 @@ The algorithm stands here once, written for a `Target`: something that adds and 
 numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out
 on Python numbers (`Plain`).
 
-**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by
-order (sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
+**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by order
+(sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
 v_{k+1} = h a_k/(k+1), and the accelerations from::
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
 with one factorisation M_0 = L D Lᵀ.
 
-**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
-above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
-up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after
-N - 1, the step is accepted if for some E_a > 0::
+**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and above.
+Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum up to E_v
+at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after N - 1, the
+step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, Node, SeriesRecord
-from lag_envs.stepping.tracing import Operation, evaluate
+from lag_envs.stepping.tracing import MAGIC, Operation, evaluate
 
 #: The orders that a series may have.
 SMALLEST_ORDER, LARGEST_ORDER = 4, 24
@@ -44,17 +44,36 @@ TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
 #: How often a step is shortened before it counts as failed.
-TRIES = 8
+TRIES = 4
 #: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
 #: registers.
 GROUP = 8
+
+
+def _rough_log2(x: Any, xp: Any) -> Any:
+    """Return the logarithm of x to the base 2, to 0.01."""
+    n = xp.exponent(x)
+    rest = x * xp.pow2(-n) - 1.0
+    return n + rest * (1.3465 - 0.3465 * rest)
+
+
+def _rough_exp2(x: Any, xp: Any) -> Any:
+    """Return 2**x, to 0.3 %."""
+    n = (x - 0.5 + MAGIC) - MAGIC
+    rest = x - n
+    return xp.pow2(n) * (1.0 + rest * (0.6565 + 0.3435 * rest))
+
+
+_OTHERS = {"rough log2": _rough_log2, "rough exp2": _rough_exp2}
 
 
 @cache
 def elementary(name: str, fused: bool) -> tuple[tuple[Operation, ...], str]:
     """Return the operations of an elementary function of ``x``, and the name of their result."""
     trace = ElementaryTrace()
-    operations, (result,) = trace.operations([getattr(trace, name)(*trace.inputs("x"))], fused=fused)
+    (x,) = trace.inputs("x")
+    value = _OTHERS[name](x, trace) if name in _OTHERS else getattr(trace, name)(x)
+    operations, (result,) = trace.operations([value], fused=fused)
     assert isinstance(result, str)
     return tuple(operations), result
 
@@ -187,7 +206,7 @@ class Series:
         return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
     def _slope(self, n: int) -> Factor:
-        """Return where D_k = k x_k of a function's argument x is: a slot, or 1/h times its rate's."""
+        """Return where D_k = k x_k of a function's argument x is: a slot, or its rate's, of which it is h times."""
         args = self.record.nodes[n].args
         if len(args) > 2:
             return Factor(self._factor(args[2]).slot, back=1)
@@ -502,7 +521,7 @@ class Series:
         done : condition
             Whether a step was certified.
         h : number
-            Its length.
+            Its length, or that of the shortest that was tried.
         q, v : list of number
             Places and velocities at its end; meaningless where there was none.
         bounds : list of number
@@ -550,11 +569,11 @@ class Series:
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
         wanted = t.less(zero, lane.left)
-        done, used, q, v, bounds = self.attempt(
+        done, tried, q, v, bounds = self.attempt(
             t, inputs, lane.q, lane.v, lane.wish, order, tolerance, wanted
         )
         done = t.both(done, wanted)
-        used = t.select(done, used, zero)
+        used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
         # What is nearly a step more is taken as one.
         longer = t.select(t.less(left, t.mul(t.number(3.0), used)), left, t.add(used, used))
@@ -563,7 +582,7 @@ class Series:
             [t.select(done, x, before) for x, before in zip(v, lane.v, strict=True)],
             t.add(lane.status, t.select(wanted, t.number(1.0), zero)),
             left,
-            t.select(done, longer, t.mul(t.number(0.0625), lane.wish)),
+            t.select(done, longer, tried),
         )
         per = t.mul(used, t.reciprocal(t.plus(order, 2)))
         bounds = [*(t.mul(per, bound) for bound in bounds), *bounds]
@@ -632,7 +651,7 @@ class Certificate:
     * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
     * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
-    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R, |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
+    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
       p = |z_0| - Σ'|z|; it needs p² > R.
     * functions, z' = w x' with D_j = j x_j: k z_k = Σ_j D_j w_{k-j} leaves E_z = A + B E_w, with
       A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is
@@ -708,15 +727,17 @@ class Certificate:
         t = self._t
         # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
         bounds = terms = t.number(0.0)
-        for i, (bound, rest) in enumerate(zip(self._bounds, self._rest, strict=True)):
-            per, slot = t.div(t.number(1.0), rest), self._series._slots["v", i]
+        for i, (bound, root) in enumerate(zip(self._bounds, self._roots, strict=True)):
+            slot = self._series._slots["v", i]
             last = t.add(self._size(slot, self._order), t.mul(t.number(0.1), self._last_but_one(slot)))
-            bounds = self._larger(bounds, t.mul(bound, per))
-            terms = self._larger(terms, t.mul(t.mul(power, last), per))
-        root = t.mul(self._per_next, t.elementary("log", t.select(self._fine, bounds, terms)))
-        safety = t.select(self._fine, t.number(0.95), t.number(0.8))
-        found = t.mul(safety, t.elementary("exp", t.neg(root)))
-        found = t.select(t.less(found, t.number(0.5)), found, t.number(0.5))
+            bounds, terms = self._larger(bounds, t.mul(bound, root)), self._larger(terms, t.mul(last, root))
+        excess = t.select(self._fine, bounds, t.mul(power, terms))
+        excess = t.div(excess, t.mul(self._tolerance, self._largest))
+        logarithm = t.mul(self._per_next, t.elementary("rough log2", excess))
+        safety = t.select(self._fine, t.number(0.98), t.number(0.9))
+        found = t.mul(safety, t.elementary("rough exp2", t.neg(logarithm)))
+        largest = t.number(0.85)
+        found = t.select(t.less(found, largest), found, largest)
         found = t.select(t.less(t.number(0.02), found), found, t.number(0.02))
         found = t.select(passed, t.number(1.0), found)
         (raised,) = t.loop(t.index(0), self._order, [power], lambda k, carried: [t.mul(found, carried[0])])
@@ -737,6 +758,7 @@ class Certificate:
         total = t.number(SMALLEST_SIZE)
         for i, root in enumerate(self._roots):
             total = self._larger(total, t.mul(root, self._all[self._series._slots["v", i]]))
+        self._largest = total
         return [t.mul(total, per) for per in self._per_root]
 
     def _measure(self) -> None:
