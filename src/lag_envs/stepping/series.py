@@ -4,18 +4,18 @@ The algorithm stands here once, written for a `Target`: something that adds and 
 numbered slots and runs loops. Targets print it to machine code (`lag_envs.stepping.machine`) or carry it out
 on Python numbers (`Plain`).
 
-**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by order
-(sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1),
-v_{k+1} = h a_k/(k+1), and the accelerations from::
+**Series.** Let h be the step and t = hτ. The coefficients in τ of all nodes of the record follow order by
+order (sums termwise, products by convolution, functions by z' = w x'), with q_{k+1} = h v_k/(k+1), v_{k+1}
+= h a_k/(k+1), and the accelerations from::
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
 with one factorisation M_0 = L D Lᵀ.
 
-**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and above.
-Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum up to E_v
-at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after N - 1, the
-step is accepted if for some E_a > 0::
+**Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
+above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
+up to E_v at most. Then tails follow node by node, see `Certificate`. With R the tail of r - Ma, a cut after
+N - 1, the step is accepted if for some E_a > 0::
 
     |M_0⁻¹| (R + |M - M_0| E_a) < E_a  (strictly, in every row)     and     hE_a/(N+1) <= E_v.
 
@@ -651,7 +651,7 @@ class Certificate:
     * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
     * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
-    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R with |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
+    * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R, |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
       p = |z_0| - Σ'|z|; it needs p² > R.
     * functions, z' = w x' with D_j = j x_j: k z_k = Σ_j D_j w_{k-j} leaves E_z = A + B E_w, with
       A = H(D, w)/N + L |w| and B = Σ'|D|/(N+1) + L. Here L bounds Σ_{j>=N} |D_j|/j: it is E_x, or what is
