@@ -207,7 +207,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
 
 def _submissions(board: Board, found: Cheap) -> Finding:
     """Hold each submission's files against what the log says of them."""
-    from lag_envs.leaderboard.submission import Refused, about, read_files
+    from lag_envs.leaderboard.submission import Refused, about, digest_of, read_files
 
     finding = Finding("submissions")
     entries = {entry.id: entry for entry in found.state.all}
@@ -215,17 +215,20 @@ def _submissions(board: Board, found: Cheap) -> Finding:
         folder = board.submission(entry.id)
         where = f"{board.log}, line {entry.line}: {folder}"
         try:
-            told = about(read_files(folder))
+            files = read_files(folder)
         except Refused as error:
             finding.wrong.append(f"{where} is not what was added: {error}; {REMEDY}")
             continue
-        if told.digest != entry.digest:
-            ours, theirs = entry.digest[:8], told.digest[:8]
+        if (digest := digest_of(files)) != entry.digest:
+            ours, theirs = entry.digest[:8], digest[:8]
             finding.wrong.append(
                 f"{where} is not what was added: its digest is {theirs}..., not {ours}...; {REMEDY}"
             )
             continue
-        found.abouts[entry.id] = told
+        try:
+            told = found.abouts[entry.id] = about(files)
+        except Refused:
+            continue  # it was accepted once: its environment, say, is gone since
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
                 finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")
