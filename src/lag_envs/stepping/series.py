@@ -206,7 +206,7 @@ class Series:
         return Factor(self._slot("v", node.index) if node.op == "velocity" else self._slot("x", n))
 
     def _slope(self, n: int) -> Factor:
-        """Return where D_k = k x_k of a function's argument x is: a slot, or its rate's, of which it is h times."""
+        """Return where D_k = k x_k of a function's argument x is."""
         args = self.record.nodes[n].args
         if len(args) > 2:
             return Factor(self._factor(args[2]).slot, back=1)
