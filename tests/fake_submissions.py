@@ -32,6 +32,10 @@ def read_files(folder):
         raise Refused("submission.toml: cannot be read") from error
 
 
+def digest_of(files):
+    return hashlib.sha256(b"".join(name.encode() + content for name, content in files.items())).hexdigest()
+
+
 def about(files):
     try:
         told = json.loads(files["submission.toml"])
@@ -39,11 +43,10 @@ def about(files):
         raise Refused("submission.toml: cannot be read") from error
     if "refuse" in told:
         raise Refused(told["refuse"])
-    digest = hashlib.sha256(b"".join(name.encode() + content for name, content in files.items())).hexdigest()
     curves = [{"seed": 0, "steps": [0, 1000], "returns": [0.0, 100.0]}]
     return About(
         env=told["env"], name=told["name"], authors=tuple(told["authors"]), license="MIT", kind=told["kind"],
-        seeds=tuple(range(5 if told["kind"] == "learned" else 1)), architecture=None, digest=digest,
+        seeds=tuple(range(5 if told["kind"] == "learned" else 1)), architecture=None, digest=digest_of(files),
         code="https://example.org/code",
         training={"env_steps": 1000, "seconds": 2.0, "hardware": "a laptop", "curves": curves},
     )  # fmt: skip
@@ -114,7 +117,7 @@ class Likeness(alike.Likeness):
 def install(put=setattr):
     """Take the place of the real ones; `put` is monkeypatch's setattr in a test."""
     put(protocol, "EPISODES", EPISODES)
-    for name in ("read_files", "about", "load"):
+    for name in ("read_files", "digest_of", "about", "load"):
         put(submission, name, globals()[name])
     put(verify, "verify", recompute)
     put(verify, "replay", replay)

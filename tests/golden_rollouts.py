@@ -65,7 +65,7 @@ class Run(NamedTuple):
 
     keywords: dict[str, Any]
     steps: int
-    start: dict[str, Any] = {}  # noqa: RUF012
+    start: dict[str, Any] = {}
     mode: str = ""
 
     @property

@@ -16,7 +16,7 @@ import pytest
 from fake_submissions import ENV, write
 
 from lag_envs.leaderboard import board as module
-from lag_envs.leaderboard import protocol, submission
+from lag_envs.leaderboard import protocol, ranking, submission
 from lag_envs.leaderboard.board import Board, BoardError, board_data, closed, finish, id_of
 from lag_envs.leaderboard.log import fold, parse
 from lag_envs.leaderboard.protocol import first_seed
@@ -384,6 +384,27 @@ def test_a_new_version_of_an_environment_freezes_the_board_of_the_old(board, mon
     finish(board)
     assert states(board) == {old: "verified", waiting: "rejected"}
     board.withdraw(old, "this is still possible")
+
+
+def test_the_board_of_an_environment_that_is_gone_is_still_shown(board, monkeypatch):
+    id = add(board, nonce="1")
+    other = add(board, env="PivotedBarFree-v0", nonce="2")
+    before = board_data(board, "today")["environments"][0]
+    tasks = {name: task for name, task in module.TASKS.items() if name != ENV}
+    for place in (module, ranking):
+        monkeypatch.setattr(place, "TASKS", tasks)
+    real = fake_submissions.about
+
+    def about(files):
+        if real(files).env == ENV:
+            raise Refused("submission.toml: env must be one of ...")
+        return real(files)
+
+    monkeypatch.setattr(submission, "about", about)
+    frozen = board_data(board, "today")["environments"][-1]
+    assert frozen["frozen"] and frozen["rows"] == before["rows"] and frozen["rows"][0]["id"] == id
+    assert board.open() == 2
+    assert states(board) == {other: "pending"}
 
 
 # --- the log ---

@@ -222,7 +222,7 @@ def test_unknown_names_get_hints():
         make_controller(INCLINE, "casc")
     with pytest.raises(ValueError, match="there are zero, random, LQR"):
         make_controller(BALANCE, "xyz")
-    with pytest.raises(TypeError, match="unknown keyword 'weight'"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'weight'"):
         make_controller(BALANCE, "LQR", weight=1.0)
 
 

@@ -210,8 +210,9 @@ def test_compact_form(written, tmp_path, monkeypatch):
     (tmp_path / "docs" / "speed.json").write_text(
         (PROJECT / "docs" / "speed.json").read_text(encoding="utf-8")
     )
-    marks = "a <!-- accuracy:begin --><!-- accuracy:end --> b <!-- bench:begin --> <!-- bench:end --> c"
-    (tmp_path / "README.md").write_text(marks)
+    names = ("accuracy", "bench", "fast")
+    marks = " b ".join(f"<!-- {name}:begin --> <!-- {name}:end -->" for name in names)
+    (tmp_path / "README.md").write_text(f"a {marks} c")
     assert docs.main([str(written), str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
     assert "| There are five. | **holds** | 5 found |" in text

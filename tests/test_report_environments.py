@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from rollouts import actions
 
 from lag_envs import TASKS
 from lag_envs.report import environments, reference
@@ -118,8 +119,51 @@ def test_one_second_of_every_environment(id):
     (row,) = environments.ours(id, seed=0, duration=1.0)
     assert row["seconds"] > 0.2
     assert row["error"]["the end"] <= ONE_SECOND
+    assert 0.0 < row["error"]["one step"] < environments.LARGEST_STEP
     assert row["error"]["the end"] <= environments.ROUNDINGS * row["amplified"]["the end"]
     assert row["disagreement"] < 1e-25
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("id", TASKS)
+def test_every_step_of_whole_episodes(id, seed):
+    """What README says of random actions; beside it stubborn ones, that spin a bar round and round."""
+    (row,) = environments.ours(id, seed)
+    assert row["error"]["one step"] < environments.LARGEST_STEP
+    env = gym.make(id, disable_env_checker=True)
+    env.reset(seed=seed)
+    episode = environments.play(env, iter(actions(10_000, 1, seed=seed + 9)))
+    row = environments.against_exact(env.unwrapped.task, episode, seed)
+    assert row["error"]["one step"] < 1e-14
+
+
+def test_one_step_is_the_worst_of_all_steps():
+    """A single wrong step late in the episode shows, in its own entry, and nowhere else."""
+    env = gym.make("PivotedBarFree-v0", duration=1.0)
+    env.reset(seed=0)
+    episode = environments.play(env, environments.random_actions(env, 0))
+    task, late = env.unwrapped.task, len(episode.controls) - 3
+    right = environments.against_exact(task, episode, 0)
+    assert right["error"]["one step"] < environments.LARGEST_STEP
+    states = episode.states.copy()
+    states[late:, 1] += 1e-10  # the step that ends there is off, those that follow start from it
+    wrong = environments.against_exact(task, episode._replace(states=states), 0)
+    theta, theta_dot = wrong["entries"]
+    assert theta_dot["one step"] == pytest.approx(1e-10, rel=0.2)
+    assert theta["one step"] < 3e-12  # what the next steps make of the other speed
+    assert wrong["error"]["one step"] == pytest.approx(1e-10 / theta_dot["size"], rel=0.2)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_one_step_of_peers_is_the_worst_of_all_steps():
+    """Explicit Euler's error of a step is h²/2 of the second derivative: larger once the pole falls."""
+    env, peer, episode = short_episode("CartPole-v1")
+    row = environments.measure(env, peer, episode)
+    first = environments.measure(
+        env, peer, environments.Episode(episode.states[:2], episode.controls[:1], False)
+    )
+    assert row["error"]["one step"] > first["error"]["one step"] > 1e-6
 
 
 def test_kicks_are_part_of_the_exact_states(monkeypatch):

@@ -1,4 +1,4 @@
-"""The worked example of CONTRIBUTING.md: a scene of one's own and a task on it, in one file.
+"""A scene with a hand-made flow and a task on it, in one file, as the first three scenes are written.
 
 A pendulum on a fixed pivot, driven by a torque u::
 
@@ -17,8 +17,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lag_envs.scenes import Motion, Scene
-from lag_envs.scenes.base import parameter
+from lag_envs.scenes.base import Motion, Scene, parameter
 from lag_envs.scenes.shapes import Circle, Line, Window, polar
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import pendulum_flow

@@ -3,18 +3,11 @@
 Importing the package registers its environments; ``gym.make("PivotedBar-v0")`` and its siblings then work.
 """
 
-from gymnasium.envs.registration import register
-
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.registration import register
 
 __version__ = "0.1.0"
-__all__ = ["TASKS", "__version__"]
+__all__ = ["TASKS", "__version__", "register"]
 
 for _id, (_task, _fixed) in TASKS.items():
-    register(
-        _id,
-        entry_point="lag_envs.envs.single:LagrangianEnv",
-        vector_entry_point="lag_envs.envs.vector:LagrangianVectorEnv",
-        order_enforce=False,  # the environment itself refuses a step before its reset
-        kwargs={"task": _task, **_fixed},
-    )
+    register(_task, id=_id, **_fixed)

@@ -89,10 +89,12 @@ class Model:
                 row = int(np.argwhere(~np.isfinite(values))[0, 0])
                 raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
         ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
-        refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
+        refused = self._step(states, actions[:, None], targets[:, None], self._numbers, ends, rewards, ended)
         if refused:
             state, action = states[refused - 1], float(actions[refused - 1])
-            raise self.task.scene.refusal(state, action, self.task.dt, None, f"the step of row {refused - 1}")
+            raise self.task.formulas.refusal(
+                state, action, self.task.dt, None, f"the step of row {refused - 1}"
+            )
         return ends, rewards, ended
 
     def kicked(self, states: ArrayLike, draws: ArrayLike) -> Array:

@@ -17,8 +17,6 @@ blocks and so stay in the processor's nearest cache.
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -26,38 +24,27 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.stepping.compiling import compile_function
-from lag_envs.stepping.flows import Stepper, lift_lines, section, split
-from lag_envs.tasks.base import Task
+from lag_envs.stepping.flows import section, split
+from lag_envs.stepping.tracing import Trace
 
 BLOCK = 64
 DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
 SLOW = -3  #: status of a step that the fast formula does not cover
 
 
-def constants_of(task: Task) -> dict[str, float]:
+def constants_of(task: Any) -> dict[str, float]:
     """Return every number that a task's compiled functions take, by name."""
-    start = {f"centre{i}": c for i, c in enumerate(task.centre)} | {
-        f"half{i}": h for i, h in enumerate(task.start)
-    }
-    return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+    return task.formulas.constants()
 
 
-def program_for(task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
+def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
     """Return the program of a task: one for all tasks that differ in `constants_of` only."""
-    scene = task.scene
-    values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
-    choices = [math.isinf(v) if isinstance(v, float) else repr(v) for v in values]
-    # Formulas may also name attributes of the task, which somebody may have set by hand.
-    own = [(name, repr(v)) for name, v in vars(task).items() if name not in _NUMBERS]
-    shared = [v for c in type(task).__mro__ for v in vars(c).values() if isinstance(v, int | float)]
-    parts = (type(task), type(scene), task.variant, absent, varying, *choices, *own, *shared)
-    if parts not in _programs:
-        _programs[parts] = Program(task, absent, varying)
-    return _programs[parts]
+    key = (type(task), type(task.scene), task.formulas.key, absent, varying)
+    if key not in _programs:
+        _programs[key] = Program(task, absent, varying)
+    return _programs[key]
 
 
-#: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = {"scene", "dt", "duration", "target"}
 _programs: dict[tuple, Program] = {}
 
 
@@ -74,107 +61,135 @@ class Program:
         Constants that differ within a batch; they become rows.
     """
 
-    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> None:
-        scene = task.scene
-        names = constants_of(task)
-        self._stepper = Stepper(scene, absent)
-        if max(task.draws, len(scene.state_names) + 1) > DRAWS:
-            raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={task.draws}")
+    def __init__(self, task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> None:
+        formulas = task.formulas
+        names = formulas.constants()
+        self._stepper = formulas.stepper(absent)
+        #: Whether steps are taken by the general series, block by block, and not lane by lane.
+        self.general = not hasattr(self._stepper, "fast")
+        if max(formulas.draws, len(formulas.state) + formulas.targets) > DRAWS:
+            raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={formulas.draws}")
         self.y, self.z = self._stepper.start, self._stepper.end
-        self.o = [f"o{i}" for i in range(len(task.observation))]
-        self.g = ["g"] if task.target_range is not None else []
-        self._record(task, {name: 0.0 if name in absent else f"k_{name}" for name in names})
+        self.o = [f"o{i}" for i in range(len(formulas.observation))]
+        self.a = [f"a{i}" for i in range(formulas.actions)]
+        self.u = [f"u{i}" for i in range(formulas.controls)]
+        self.g = [f"g{i}" for i in range(formulas.targets)]
+        self._record(formulas, {name: 0.0 if name in absent else f"k_{name}" for name in names})
         lines = [*self.control, *self.fast, *self.judge, *self.last, *self.kick, *self.observe, *self.sample]
-        used = {"k_limit", *self._stepper.constants, *re.findall(r"\bk_\w+", " ".join(lines))}
+        used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", " ".join(lines))}
         #: Names of the constants that are carried: those that are not zero, and that something uses.
         self.constants = [name for name in names if f"k_{name}" in used]
         self.uniform = [name for name in self.constants if name not in varying]
         self.varying = [name for name in self.constants if name in varying]
-        #: Names of the rows that are kept from step to step, and of those that are needed within one.
-        self.kept = [*self.y, *self.g, "u", "n", *(f"k_{name}" for name in self.varying)]
-        self.scratch = [*self.z, "a", "r", "over", "ordinary", *self.o]
+        #: Names of the rows that are kept from step to step, and of those that are needed within one. Those
+        #: of the series come first, one behind the other.
+        self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying)]
+        self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
+        self.held = [f"held{i}" for i in range(len(self.u))]
+        self.scratch = [*self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held]
 
-    def _record(self, task: Task, constants: dict[str, Any]) -> None:
-        scene, width = task.scene, task.scene.width
-        self.n_state = states = len(scene.state_names)
+    def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
+        width, actions, controls, targets = len(self.y), len(self.a), len(self.u), len(self.g)
+        self.n_state = states = len(formulas.state)
         given = list(constants.values())
-        g: list[Any] = self.g or [0.0]
 
         def k(values: Sequence) -> SimpleNamespace:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
 
-        def control(xp: Any, a: Any, *values: Any) -> list:
-            y, rest = split(values, width)
-            return [task.control(a, y, k(rest), k(rest).dt, xp)]
+        def control(xp: Any, *values: Any) -> Sequence:
+            a, y, g, rest = split(values, actions, width, targets)
+            return formulas.control(xp, a, y, g, k(rest))
 
-        def judge(xp: Any, u: Any, g: Any, *values: Any) -> list:
-            y, z, rest = split(values, width, width)
-            reward = task.reward(y, z, u, g, k(rest), k(rest).dt, xp)
-            return [reward, xp.where(task.terminated(z, k(rest), xp), 1.0, 0.0)]
+        def judge(xp: Any, *values: Any) -> list:
+            u, g, y, z, rest = split(values, controls, targets, width, width)
+            reward, ended = formulas.judge(xp, y, z, u, g, k(rest))
+            return [reward, xp.where(ended, 1.0, 0.0)]
 
-        def last(xp: Any, u: Any, g: Any, *values: Any) -> list:
-            y, z, rest = split(values, width, width)
-            return [task.last_reward(y, z, u, g, k(rest), k(rest).dt, xp)]
+        def last(xp: Any, *values: Any) -> list:
+            u, g, y, z, rest = split(values, controls, targets, width, width)
+            return [formulas.last(xp, y, z, u, g, k(rest))]
 
         def kick(xp: Any, *values: Any) -> Sequence:
-            draws, z, rest = split(values, task.draws, width)
-            return task.kick(z, draws, k(rest), xp)
+            draws, z, rest = split(values, formulas.draws, width)
+            return formulas.kick(xp, draws, z, k(rest))
 
-        def observe(xp: Any, g: Any, *values: Any) -> Sequence:
-            y, rest = split(values, width)
-            return task.observe(y, g, k(rest))
+        def observe(xp: Any, *values: Any) -> Sequence:
+            g, y, rest = split(values, targets, width)
+            return formulas.observe(xp, y, g, k(rest))
 
         def start(xp: Any, *values: Any) -> list:
-            draws, rest = split(values, states + len(self.g))
+            draws, rest = split(values, states + targets)
             numbers = vars(k(rest))
             state = [
                 numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(states)
             ]
-            if not self.g:
-                return state
-            if task.target is not None:
-                return [*state, k(rest).goal]
-            return [*state, task.target_range * (2.0 * draws[states] - 1.0)]
+            return state + formulas.sample_targets(draws[states:], numbers)
 
-        clip = ["a = select(a < -1.0, -1.0, select(a > 1.0, 1.0, a))"]
-        self.control = clip + _lines(control, ["a", *self.y, *given], ["u"])
-        self.fast = [f"dt = {constants['dt']}", *self._stepper.fast]
+        def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
+            return _lines(formula, inputs, outputs, formulas.trace)
+
+        clip = [
+            f"{a} = select({a} < -1.0, -1.0, select({a} > 1.0, 1.0, {a}))" for a in self.a if formulas.clipped
+        ]
+        self.control = clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
+        step = [*self.u, *self.g, *self.y, *self.z, *given]
+        self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._stepper.fast)]
         #: What closed forms do without.
-        self._x = constants["x"] if scene.order else 0.0
-        if scene.order:
+        self._x = constants["x"] if formulas.bounded else 0.0
+        if formulas.bounded:
             self.fast.insert(0, f"x = {self._x}")
-        self.judge = _lines(judge, ["u", *g, *self.y, *self.z, *given], ["r", "over"])
-        has_last = type(task).last_reward is not Task.last_reward
-        self.last = _lines(last, ["u", *g, *self.y, *self.z, *given], ["r"]) if has_last else []
-        draws, kicked = [f"draw{i}" for i in range(task.draws)], [f"e{i}" for i in range(width)]
+        self.judge = lines(judge, step, ["r", "over"])
+        self.last = lines(last, step, ["r"]) if formulas.has_last else []
+        draws, kicked = [f"draw{i}" for i in range(formulas.draws)], [f"e{i}" for i in range(width)]
         self.kick = (
-            _draw(draws, "np.uint64(n)") + _lines(kick, [*draws, *self.z, *given], kicked) if draws else []
+            _draw(draws, "np.uint64(n)") + lines(kick, [*draws, *self.z, *given], kicked) if draws else []
         )
         self.moved = kicked if draws else self.z
         self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
-        self.observe = _lines(observe, [*g, *self.y, *given], self.o)
-        draws, names = ([f"{name}{i}" for i in range(states + len(self.g))] for name in ("draw", "s"))
-        self.sample = _draw(draws, "np.uint64(0)") + _lines(start, [*draws, *given], names)
-        self.lift = lift_lines(states, scene.angle, "y")
+        self.observe = lines(observe, [*self.g, *self.y, *given], self.o)
+        draws, names = ([f"{name}{i}" for i in range(states + targets)] for name in ("draw", "s"))
+        self.sample = _draw(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
+        self.lift = formulas.lift("y")
 
     # --- one environment: rows, then constants, in one array -----------------------------------------------
 
     @cached_property
     def step_one(self) -> Callable:
-        """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the control stored."""
+        """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the rows `held` written.
+
+        These are the controls of a step that the fast formula does not cover, or that was refused. The action
+        is a number where there is one, else an array.
+        """
         at = self._at_one
         body = [
             *self._constants_one(), *_load(at, [*self.y, *self.g, "n"]),
-            *self.control, *_store(at, ["u"]), *self.fast,
-            "if not within:", f"    return 0.0, {SLOW}",
+            *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
+            *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
+            *self.control, *self.fast, *self._advance_one, *_store(at, self.u),
             *self._finish_one(),
         ]  # fmt: skip
-        return _function("step_one", "f, obs, a, ids", body)
+        helpers = [self.advance] if self.general else []
+        return _function("step_one", "f, obs, a, ids", body, *helpers)
+
+    @property
+    def _advance_one(self) -> list[str]:
+        slow = [
+            *(f"{self._at_one(h)} = {u}" for h, u in zip(self.held, self.u, strict=True)),
+            f"return 0.0, {SLOW}",
+        ]
+        if not self.general:
+            return ["if not within:", *_indent(slow)]
+        call = ", ".join([*self.y, *self.u, "dt", str(self._x), *self._stepper.constants])
+        first = len(self.kept + self.scratch) + len(self.uniform)
+        return [
+            f"{', '.join(self.z)}, status = advance(f[{first}:], {call})",
+            "if status < 0:", *_indent(slow),
+        ]  # fmt: skip
 
     @cached_property
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step whose rows ``z`` were filled in by `advance`."""
-        rows = _load(self._at_one, [*self.y, *self.z, *self.g, "u", "n"])
+        rows = _load(self._at_one, [*self.y, *self.z, *self.g, *self.u, "n"])
         return _function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
 
     @cached_property
@@ -184,19 +199,19 @@ class Program:
         body = [
             *self._constants_one(), *_load(self._at_one, rows),
             *_next_episode("0", "1", "2"), *self._start, *self.observe,
-            *_store(self._at_one, [*self.y, *self.g, "u", "n"]),
+            *_store(self._at_one, [*self.y, *self.g, *self.u, "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return _function("start_one", "f, obs, ids, state_given, target_given", body)
 
     @cached_property
     def advance(self) -> Callable:
-        """The scalar function for any step; see `Stepper.compile`."""
+        """The scalar function for any step; see `Stepper.compile` and `StepCode.compile`."""
         return self._stepper.compile()
 
     @property
     def advance_constants(self) -> list[str]:
-        """Names of the constants that `advance` takes after ``y..., u, dt, x``."""
+        """Names of the constants that `advance` takes after ``y..., u..., dt, x``."""
         return [name.removeprefix("k_") for name in self._stepper.constants]
 
     @cached_property
@@ -206,26 +221,35 @@ class Program:
         Returns 0, or i + 1 where the step of row i was refused.
         """
         n = self.n_state
-        call = ", ".join([*self.y, "u", "k_dt", str(self._x), *self._stepper.constants])
+        call = ", ".join([*self._rows, *self.y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
+        step = [f"{', '.join(self.z)}, status = advance({call})", "if status < 0:", "    return i + 1"]
         row = [
             *(f"y{j} = states[i, {j}]" for j in range(n)), *self.lift,
-            "a = actions[i]", *(["g = targets[i]"] if self.g else []),
+            *(f"{a} = actions[i, {j}]" for j, a in enumerate(self.a)),
+            *(f"{g} = targets[i, {j}]" for j, g in enumerate(self.g)),
             *self.control, *self.fast,
-            "if not within:",
-            *_indent([
-                f"{', '.join(self.z)}, status = advance({call})",
-                "if status < 0:", "    return i + 1",
-            ]),
+            *(step if self.general else ["if not within:", *_indent(step)]),
             *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
             *(f"ends[i, {j}] = z{j}" for j in range(n)),
             "rewards[i] = r", "ended[i] = over > 0.0",
         ]  # fmt: skip
         body = [
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
+            *([f"rows = np.zeros({self._stepper.scratch})"] if self.general else []),
             "for i in range(states.shape[0]):", *_indent(row),
             "return 0",
         ]  # fmt: skip
         return _function("model", "states, actions, targets, par, ends, rewards, ended", body, self.advance)
+
+    @property
+    def _rows(self) -> list[str]:
+        """The argument that the series' `advance` has before the others."""
+        return ["rows"] if self.general else []
+
+    @property
+    def room(self) -> int:
+        """Numbers that `step_one` needs behind the constants."""
+        return self._stepper.scratch if self.general else 0
 
     def _at_one(self, row: str) -> str:
         return f"f[{(self.kept + self.scratch).index(row)}]"
@@ -249,8 +273,12 @@ class Program:
         return [
             *self.sample,
             "if not state_given:", *_indent([f"y{i} = s{i}" for i in range(self.n_state)]),
-            *(["if not target_given:", f"    g = s{self.n_state}"] if self.g else []),
-            *self.lift, "u = 0.0", "n = 0.0",
+            *(
+                ["if not target_given:", *(f"    {g} = s{self.n_state + i}" for i, g in enumerate(self.g))]
+                if self.g
+                else []
+            ),
+            *self.lift, *(f"{u} = 0.0" for u in self.u), "n = 0.0",
         ]  # fmt: skip
 
     # --- a batch: blocks of rows of 64 environments --------------------------------------------------------
@@ -268,23 +296,41 @@ class Program:
         inputs = _load(_at, [*varying, *y, *self.g, "n"])
         results = ["n", "over", "r", "ordinary", *self.o]
         key = ["key = ids[last + first + i]"] if self.kick else []
+        controls = [*_load(_at, self.a), *self.control]
+        if self.general:
+            rows = dict(zip(self._stepper.rows, self.flow, strict=True))
+            # The status of a lane that is to be restarted tells that it is not to be stepped.
+            before = [
+                *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
+                *_store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
+            ]  # fmt: skip
+            after = [f"{name} = {_at(rows[name])}" for name in self._stepper.results]
+            start, dt = f"np.int64({len(self.uniform)})", "k_dt"
+            call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
+            moving = [*_block(lane, before), call]
+            move = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
+            again = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish]
+            helpers = [self._stepper.compile_block()]
+        else:
+            moving, move = [], [*controls, *self.fast]
+            call = ", ".join([*y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
+            again = [*_load(_at, self.u), f"{', '.join(z)}, status = advance({call})"]
+            helpers = [self.advance]
         # Where the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
         special = " and not over > 0.0" if self.last else ""
         main = [
-            *inputs, f"a = {_at('a')}", *self.control, *self.fast,
+            *inputs, *move,
             "again = n < 0.0", *self.judge,
             f"plain = within{special}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
-            *self.observe, *_store(_at, [*y, "u", *results]),
+            *self.observe, *_store(_at, [*y, *([] if self.general else self.u), *results]),
         ]  # fmt: skip
-        call = ", ".join([*y, "u", "k_dt", str(self._x), *self._stepper.constants])
         redo = [
             f"if {_at('ordinary')} == 0.0:",
             *_indent([
-                *inputs, f"u = {_at('u')}",
-                f"{', '.join(z)}, status = advance({call})",
+                *inputs, *again,
                 "if status < 0:",
                 "    refused = first + i + np.uint64(1)",
                 f"    {_at('over')} = 0.0",
@@ -306,7 +352,7 @@ class Program:
                 *_next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
                 *self.observe,
-                *_store(_at, [*y, *self.g, "u", "n", "over", "r", *self.o]),
+                *_store(_at, [*y, *self.g, *self.u, "n", "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
@@ -321,17 +367,17 @@ class Program:
             "wide_vectors()",
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            "bad = 0",
-            "for i in range(second):", "    bad += not (abs(action[i]) < math.inf)",
-            "if bad > 0:",
-            "    for i in range(count):",
-            f"        if not (abs(action[i]) < math.inf) and {running}:",
-            "            return -(i + 1), 0",
+            *(self._check_finite(running) if self.a else []),
             "overs, refused = 0, np.uint64(0)",
             *self._each_block,
             *_indent([
                 "slow, restarts = 0, 0",
-                *_block(lane, [f"{_at('a')} = action[first + i]"]),
+                *(
+                    line
+                    for j, a in enumerate(self.a)
+                    for line in _block(lane, [f"{_at(a)} = action[{self._action(j)}]"])
+                ),
+                *moving,
                 *_block(lane, main),
                 *_block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
                 "if slow > 0:", *_indent(_block(lane, redo)),
@@ -343,7 +389,24 @@ class Program:
             "return np.int64(refused), overs",
         ]  # fmt: skip
         arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
-        return self._batch("step_all", arguments, body, self.advance)
+        return self._batch("step_all", arguments, body, *helpers)
+
+    def _check_finite(self, running: str) -> list[str]:
+        """Return the lines that look for actions that are not finite, before anything is stepped."""
+        n = len(self.a)
+        found = (f"        if not (abs(action[i * {n} + {j}]) < math.inf) and {running}:" for j in range(n))
+        return [
+            "bad = 0",
+            f"for i in range(second * np.uint64({n})):", "    bad += not (abs(action[i]) < math.inf)",
+            "if bad > 0:",
+            "    for i in range(count):",
+            *(line for test in found for line in (test, "            return -(i + 1), 0")),
+        ]  # fmt: skip
+
+    def _action(self, j: int) -> str:
+        """Return where action j of the environment at hand lies in the batch's array."""
+        n = len(self.a)
+        return "first + i" if n == 1 else f"np.uint64({n}) * (first + i) + np.uint64({j})"
 
     @cached_property
     def start_all(self) -> Callable:
@@ -355,12 +418,12 @@ class Program:
         start = [
             "if mask[first + i] or whole:",
             *_indent([
-                *_load(_at, [*varying, *self.y, *self.g, "u", "n"]),
+                *_load(_at, [*varying, *self.y, *self.g, *self.u, "n"]),
                 "if mask[first + i]:",
                 *_indent([
                     *_next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
                 ]),
-                *self.observe, *_store(_at, [*self.y, *self.g, "u", "n"]), *_observations(self.o, "{}"),
+                *self.observe, *_store(_at, [*self.y, *self.g, *self.u, "n"]), *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip
         body = [
@@ -417,9 +480,9 @@ def _block(head: str, body: Sequence[str]) -> list[str]:
     return [head, *_indent(body)]
 
 
-def _lines(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> list[str]:
+def _lines(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], trace: type[Trace]) -> list[str]:
     """Record a formula; outputs that turned out constant are assigned as well."""
-    lines, values = section(formula, inputs, outputs)
+    lines, values = section(formula, inputs, outputs, trace)
     return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
 
 

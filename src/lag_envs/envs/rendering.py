@@ -95,7 +95,7 @@ class Viewer:
     def __init__(self, task: Task, mode: str) -> None:
         pygame = _pygame()
         self._task = task
-        self._turned = 0.0
+        self._turned: Any = 0.0
         self._before: tuple[list[float], float] | None = None
         self._clock = pygame.time.Clock()
         self._rate = max(1, round(1.0 / task.dt))
@@ -126,7 +126,7 @@ class Viewer:
             return None
         values = state.tolist()
         self._turn(values)
-        share = control / self._task.limit_control
+        share = self._task.share(control)
         picture = paint(self._task, Moment(values, control, share, target, self._turned))
         if self._human:
             _desk.show(self, picture)
@@ -141,7 +141,7 @@ class Viewer:
 
     def _turn(self, state: list[float]) -> None:
         """Integrate what turns but is not in the state; exact if its rate is linear and each step drawn."""
-        rate = self._task.scene.turning(state)
+        rate = self._task.turning(state)
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
         self._before = (state, rate)
@@ -159,9 +159,8 @@ def paint(task: Task, now: Moment) -> pygame.Surface:
     pygame.transform.smoothscale(scene, size, picture.subsurface((0, 0), size))
     picture.fill(STRIP_PAPER, (0, HEIGHT - STRIP, WIDTH, STRIP))
     names = zip(task.scene.state_names, now.state, task.scene.state_units, strict=True)
-    name, _, unit = task.scene.control_unit.rstrip("]").partition(" [")
     _write_row(picture, 0, [Reading(*entry) for entry in names])
-    _write_row(picture, 1, [Reading(name, now.control, unit, "action"), *task.readings(now)])
+    _write_row(picture, 1, [*task.control_readings(now), *task.readings(now)])
     _draw_scale(picture, pen.scale / FINE)
     return picture
 

@@ -14,8 +14,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import SLOW, constants_of, program_for
-from lag_envs.scenes.base import is_masked, shown
+from lag_envs.scenes.base import shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -66,17 +67,20 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = render_mode
         self.diagnostics = diagnostics
         self.metadata = {"render_modes": RENDER_MODES, "render_fps": max(1, round(1.0 / self.task.dt))}
-        self.action_space = action_space()
+        self._actions = Actions(self.task.formulas.actions, self.task.formulas.choices)
+        self.action_space = self._actions.space
+        self._plain = not self._actions.values and self._actions.count == 1
         self.observation_space = observation_space([self.task])
 
         constants = constants_of(self.task)
         self._program = program = program_for(self.task, absent([constants]))
         rows = program.kept + program.scratch
-        self._rows = np.array([0.0] * len(rows) + [constants[name] for name in program.uniform])
+        numbers = [constants[name] for name in program.uniform]
+        self._rows = np.array([0.0] * len(rows) + numbers + [0.0] * program.room)
         #: Key of the seed, number of the episode, key of the episode.
         self._ids = np.zeros(3, dtype=np.uint64)
         self._row = {name: j for j, name in enumerate(rows)}
-        self._size, self._u = len(self.task.observation), self._row["u"]
+        self._size = len(program.o)
         self._ready = False
         self._started = False
         self._bind()
@@ -114,8 +118,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """
         seed = None if seed is None else check_seed("seed", seed)
         state, target = start_options(options)
-        given_state = None if state is None else self.task.check_start(state)
-        given_target = None if target is None else self.task.check_target(target)
+        given_state = None if state is None else self.task.start_state(state)
+        given_target = None if target is None else np.atleast_1d(self.task.check_target(target))
         super().reset(seed=seed)
         if seed is not None:
             self._ids[:2] = key_of(seed), 0
@@ -125,7 +129,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if given_state is not None:
             self._rows[: len(given_state)] = given_state
         if given_target is not None:
-            self._rows[self._row["g"]] = given_target
+            self._rows[[self._row[name] for name in self._program.g]] = given_target
         observation = np.empty(self._size, dtype=np.float32)
         self._program.start_one(
             self._rows, observation, self._ids, given_state is not None, given_target is not None
@@ -159,23 +163,22 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         StepRefused
             Where the step cannot be taken to full accuracy. In each case the environment stays as it was.
         """
-        if type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
+        if self._plain and type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
             a = action.item()
+            if not -math.inf < a < math.inf:
+                raise ValueError(f"the action must be finite, got {action!r}")
         else:
-            a = one_action(action)
-        if not -math.inf < a < math.inf:
-            raise ValueError(f"the action must be finite, got {action!r}")
+            a = self._actions.one(action)
         if not self._ready:
             raise ResetNeeded(
                 "call reset() before step(): "
                 + ("the episode has terminated" if self._started else "no episode has begun")
             )
         observation = np.empty(self._size, FLOAT32)
-        before = self._rows[self._u]
         reward, over = self._step(self._rows, observation, a, self._ids)
         if over:
             if over == SLOW:
-                reward, over = self._slow_step(observation, before)
+                reward, over = self._slow_step(observation)
             self._ready = over % 2 == 0
         if self.render_mode == "human":
             self.render()
@@ -216,14 +219,17 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return self._rows[: len(self.scene.state_names)].copy()
 
     @property
-    def target(self) -> float | None:
-        """The episode's target; None for a task without one."""
-        return None if self.task.target_range is None else float(self._rows[self._row["g"]])
+    def target(self) -> Any:
+        """The episode's target; an array where there are several, None for a task without one."""
+        return single_number(self._read(self._program.g)) if self._program.g else None
 
     @property
-    def control(self) -> float:
-        """The control applied last, in SI units; 0 after a reset."""
-        return float(self._rows[self._row["u"]])
+    def control(self) -> Any:
+        """The control applied last, in SI units; an array where there are several; 0 after a reset."""
+        return single_number(self._read(self._program.u))
+
+    def _read(self, names: list[str]) -> NDArray[np.float64]:
+        return self._rows[[self._row[name] for name in names]]
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -238,18 +244,19 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     # --- the rest ------------------------------------------------------------------------------------------
 
-    def _slow_step(self, observation: NDArray[np.float32], control_before: float) -> tuple[float, int]:
+    def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
-        start = [rows[self._row[name]] for name in [*program.y, "u"]]
         constants = constants_of(self.task)
+        held = self._read(program.held)
+        start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
         *end, status = program.advance(
-            *start, self.task.dt, self.task.largest_x, *(constants[n] for n in program.advance_constants)
+            *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
         )
         if status < 0:
-            refusal = self.scene.refusal(self.state, self.control, self.task.dt, None, "the step")
-            rows[self._u] = control_before
-            raise refusal
+            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+        for name, value in zip(program.u, held, strict=True):
+            rows[self._row[name]] = value
         for name, value in zip(program.z, end, strict=True):
             rows[self._row[name]] = value
         return program.finish_one(rows, observation, self._ids)
@@ -301,15 +308,12 @@ def absent(constants: list[dict[str, float]]) -> frozenset[str]:
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
-def action_space() -> gym.spaces.Box[np.float32]:
-    """Return the space of actions, the same for every task."""
-    return gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that holds the observations of all the tasks."""
-    high = np.max([np.asarray(task.bounds()) for task in tasks], axis=0).astype(np.float32)
-    return gym.spaces.Box(-high, high, dtype=np.float32)
+    boxes = [task.formulas.box() for task in {id(task): task for task in tasks}.values()]
+    low = np.min([low for low, _ in boxes], axis=0).astype(np.float32)
+    high = np.max([high for _, high in boxes], axis=0).astype(np.float32)
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def check_render_mode(mode: str | None) -> None:
@@ -348,19 +352,6 @@ def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("sta
         if name not in known:
             raise ValueError(f"unknown reset option {shown(name)}; known are {', '.join(known)}")
     return [options.get(name) for name in known]
-
-
-def one_action(action: Any) -> float:
-    """Return an action of any real type as float, or raise a ValueError."""
-    try:
-        array = np.asarray(action)
-    except ValueError as error:  # rows of different lengths
-        raise ValueError(f"the action must have shape (1,), got {shown(action)}") from error
-    if array.shape != (1,):
-        raise ValueError(f"the action must have shape (1,), got shape {array.shape}: {shown(action)}")
-    if array.dtype.kind not in "fiub" or is_masked(action):
-        raise ValueError(f"the action must be a real number, got {shown(action)} of type {array.dtype}")
-    return float(array[0])
 
 
 def diagnostics(scene: Any, state: NDArray[np.float64], control: Any) -> dict[str, Any]:

@@ -13,11 +13,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import BLOCK, constants_of, program_for
 from lag_envs.envs.single import (
     FLOAT32,
     absent,
-    action_space,
     check_flag,
     check_render_mode,
     check_seed,
@@ -104,7 +104,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             "render_fps": max(1, round(1.0 / self.task.dt)),
             "autoreset_mode": self.autoreset_mode,
         }
-        self.single_action_space = action_space()
+        self._actions = Actions(self.task.formulas.actions, self.task.formulas.choices)
+        self.single_action_space = self._actions.space
         self.single_observation_space = observation_space(self._tasks)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -172,10 +173,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         lanes = self._lanes[mask]
         if state is not None:
             state = self._check_rows("state", state, (self.num_envs, len(self.scene.state_names)))
-            state = np.array([named(i, self._tasks[i].check_start, state[i]) for i in lanes])
+            state = np.array([named(i, self._tasks[i].start_state, state[i]) for i in lanes])
         if target is not None:
-            target = self._check_rows("target", target, (self.num_envs,))
-            target = np.array([named(i, self._tasks[i].check_target, target[i]) for i in lanes])
+            many = self.task.formulas.targets
+            target = self._check_rows("target", target, (self.num_envs, *([many] if many > 1 else [])))
+            target = np.array(
+                [np.atleast_1d(named(i, self._tasks[i].check_target, target[i])) for i in lanes]
+            )
         if not self._started and not mask.all():
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
@@ -190,7 +194,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             for j, column in enumerate(state.T):
                 self._write(f"y{j}", lanes, column)
         if target is not None:
-            self._write("g", lanes, target)
+            for name, column in zip(self._program.g, target.T, strict=True):
+                self._write(name, lanes, column)
         observations = np.empty((len(self._program.o), self.num_envs), dtype=FLOAT32).T
         self._start(observations, mask, True, state is not None, target is not None)
         self._started = True
@@ -224,7 +229,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             Where an environment's step cannot be taken to full accuracy. That environment keeps its state,
             the others have been stepped.
         """
-        actions = self._check_actions(actions)
+        actions = self._actions.many(actions, self.num_envs)
         if not self._started:
             raise ResetNeeded("call reset() before step(): no episode has begun")
         if self._over and self.autoreset_mode == AutoresetMode.DISABLED:
@@ -250,7 +255,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         )
         if status < 0:
             raise ValueError(
-                f"actions must be finite, got {actions[-status - 1]} for environment {-status - 1}"
+                f"actions must be finite, got {actions.reshape(n, -1)[-status - 1]} "
+                f"for environment {-status - 1}"
             )
         self._over = over
         observations = observations.T
@@ -294,13 +300,19 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def target(self) -> NDArray[np.float64] | None:
-        """The targets, shape (num_envs,); None for a task without one."""
-        return None if self.task.target_range is None else self._read("g")
+        """The targets, shape (num_envs,), or (num_envs, n) where there are several; None without one."""
+        names = self._program.g
+        return single_number(np.stack([self._read(name) for name in names], axis=1)) if names else None
 
     @property
     def control(self) -> NDArray[np.float64]:
-        """The controls applied last, shape (num_envs,), in SI units; 0 after a reset."""
-        return self._read("u")
+        """The controls applied last [SI], shape (num_envs,), or (num_envs, n) where there are several.
+
+        They are 0 after a reset.
+        """
+        return single_number(
+            np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
+        )
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -362,27 +374,10 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
-        control = float(self.control[i])
-        error = self._tasks[i].scene.refusal(self.state[i], control, self.task.dt, None, where)
+        control = self.control[i]
+        error = self._tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
         error.results = results
         return error
-
-    def _check_actions(self, actions: Any) -> NDArray[np.floating]:
-        try:
-            array = np.asarray(actions)
-        except ValueError as error:  # rows of different lengths
-            raise ValueError(f"actions must have shape ({self.num_envs}, 1), got {shown(actions)}") from error
-        if array.shape != (self.num_envs, 1):
-            raise ValueError(
-                f"actions must have shape ({self.num_envs}, 1), got shape {array.shape}: {shown(actions)}"
-            )
-        if array.dtype.kind not in "fiub" or is_masked(actions):
-            raise ValueError(f"actions must be real numbers, got {shown(actions)} of type {array.dtype}")
-        if (
-            array.dtype.char not in "fd" or not array.dtype.isnative or not array.flags.writeable
-        ):  # what the compiled step takes as it is
-            array = array.astype(np.float64)
-        return array.ravel()
 
     def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
         if mask is None:
@@ -479,7 +474,8 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     tasks = [named(i, kind, **own[i]) for i in range(n)]
     if len({t.variant for t in tasks}) > 1:
         raise ValueError(
-            "the environments of a batch must agree in having a finite track, or a fixed target; "
+            "the environments of a batch may differ in numbers only: they must agree in structural options, "
+            "in having a finite track or a fixed target, and in zeros that a formula divides by; "
             f"got {shown(many)}"
         )
     return tasks

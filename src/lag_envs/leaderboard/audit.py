@@ -101,7 +101,9 @@ def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
         For the first thing that does not; the text names the line and the remedy.
     """
     found = cheap(board, pin)
-    wrong = [text for finding in found.findings for text in finding.wrong]
+    # What history tells names the line that was changed, and not only the next that does not follow.
+    findings = sorted(found.findings, key=lambda finding: finding.name != "history")
+    wrong = [text for finding in findings for text in finding.wrong]
     if wrong:
         more = f" ({len(wrong) - 1} more: `lag-envs leaderboard audit` tells all)" if wrong[1:] else ""
         raise BoardError(wrong[0] + more)
@@ -135,6 +137,7 @@ def cheap(board: Board, pin: Path | None = None) -> Cheap:
         found.state = fold(found.lines)
     except BoardError as error:
         chain.wrong.append(f"{board.folder}: {error}")
+        found.findings.append(_history(board, found.log))
         return found
     whole = found.log[: len(found.log) - len(torn)]
     chained = [line.number for line in found.lines if line.event.prev is not None]
@@ -204,7 +207,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
 
 def _submissions(board: Board, found: Cheap) -> Finding:
     """Hold each submission's files against what the log says of them."""
-    from lag_envs.leaderboard.submission import Refused, about, read_files
+    from lag_envs.leaderboard.submission import Refused, about, digest_of, read_files
 
     finding = Finding("submissions")
     entries = {entry.id: entry for entry in found.state.all}
@@ -212,17 +215,20 @@ def _submissions(board: Board, found: Cheap) -> Finding:
         folder = board.submission(entry.id)
         where = f"{board.log}, line {entry.line}: {folder}"
         try:
-            told = about(read_files(folder))
+            files = read_files(folder)
         except Refused as error:
             finding.wrong.append(f"{where} is not what was added: {error}; {REMEDY}")
             continue
-        if told.digest != entry.digest:
-            ours, theirs = entry.digest[:8], told.digest[:8]
+        if (digest := digest_of(files)) != entry.digest:
+            ours, theirs = entry.digest[:8], digest[:8]
             finding.wrong.append(
                 f"{where} is not what was added: its digest is {theirs}..., not {ours}...; {REMEDY}"
             )
             continue
-        found.abouts[entry.id] = told
+        try:
+            told = found.abouts[entry.id] = about(files)
+        except Refused:
+            continue  # it was accepted once: its environment, say, is gone since
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
                 finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")

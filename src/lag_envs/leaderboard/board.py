@@ -172,7 +172,7 @@ class Board:
         scales = {
             env_id: {name: getattr(scale, name) for name in ("random", "best", "policy")}
             for env_id, scale in KNOWN_RETURNS.items()
-            if env_id in protocol.GOALS
+            if env_id in protocol.GOALS and not closed(env_id, number, number)
         }
         references = {env_id: reference._asdict() for env_id, reference in protocol.REFERENCES.items()}
         append("protocol", number=number, rules=protocol.rules(), scales=scales, references=references)

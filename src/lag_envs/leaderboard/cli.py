@@ -247,7 +247,13 @@ def _remark(row: dict[str, Any]) -> str:
 
 def _some(board: Board) -> State:
     """Return the board's state, or raise a BoardError where there is nothing on it."""
-    state = board.read()
+    from lag_envs.leaderboard.audit import sound
+
+    try:
+        state = board.read()
+    except BoardError:
+        sound(board)  # which may know more
+        raise
     if not state.entries:
         raise BoardError(f"{board.folder} has no submissions; `lag-envs leaderboard add FOLDER` adds one")
     return state

@@ -56,7 +56,7 @@ def _line(environment: str, row: dict[str, Any]) -> list[str]:
     low, high = row["interval"]
     success = "" if row["success"] is None else f"{100.0 * row['success']['rate']:.1f} %"
     often = "" if row["often"] is None else f"{row['often']:.3f}"
-    score = f"{row['score']:.3f} ({low:.3f} to {high:.3f})"
+    score = f"{row['score']:.4f} ({low:.4f} to {high:.4f})"
     return [environment, str(row["rank"]), f"{_text(row['name'])}, {row['kind']}", score, success, often]
 
 

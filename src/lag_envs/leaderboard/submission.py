@@ -29,7 +29,7 @@ from lag_envs.leaderboard.names import wordless
 from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, Table, architecture
 from lag_envs.leaderboard.protocol import Refused
 
-__all__ = ["About", "Refused", "Submission", "about", "load", "read_files", "write"]
+__all__ = ["About", "Refused", "Submission", "about", "digest_of", "load", "read_files", "write"]
 
 TOML = "submission.toml"
 #: Training seeds lie below this.
@@ -175,7 +175,7 @@ def about(files: Mapping[str, bytes]) -> About:
     if made.arrays and len(found) < least:
         raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
     return About(
-        env=env, **told, kind=kind, digest=_digest(files), seeds=tuple(found) if made.arrays else (0,),
+        env=env, **told, kind=kind, digest=digest_of(files), seeds=tuple(found) if made.arrays else (0,),
         architecture=made, training=training,
     )  # fmt: skip
 
@@ -313,7 +313,8 @@ def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
             )
 
 
-def _digest(files: Mapping[str, bytes]) -> str:
+def digest_of(files: Mapping[str, bytes]) -> str:
+    """Return the digest of a submission's files: the SHA-256 of their names and contents."""
     total = hashlib.sha256()
     for name in sorted(files):
         total.update(f"{name}\n{len(files[name])}\n".encode() + files[name])

@@ -103,7 +103,7 @@ def march(scene: Scene) -> Callable:
     lines = [
         f"def march(out, marks, dt, x{''.join(f', {name}' for name in code.constants)}):",
         f"{', '.join(code.start)}, = {', '.join(f'out[-1, {i}]' for i in range(width))},",
-        "u = 0.0",
+        "u0 = 0.0",
         "done = 0",
         "for j in range(marks.shape[0]):",
         "    for i in range(marks[j] - done):",

@@ -101,7 +101,8 @@ def carried(task: Task) -> Row:
     lines += program.observe
     ends = [*program.moved, "r", "over", "within", *program.o]
     needed = live(lines, ends) | live(program.sample, [f"s{i}" for i in range(program.n_state)])
-    given = [*program.y, *program.g, "a", *(f"k_{name}" for name in program.constants if name != "limit")]
+    constants = (f"k_{name}" for name in program.constants if name != "limit")
+    given = [*program.y, *program.g, *program.a, *constants]
     return {
         "scene": type(scene).__name__,
         "state": list(scene.state_names) + (["cos", "sin"] if scene.angle is not None else []),

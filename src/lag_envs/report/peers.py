@@ -313,7 +313,7 @@ def _loop() -> Callable:
 
 
 class Diffrax(Peer):
-    """diffrax in one call compiled by XLA: a scan over the states alone, a map over them in a batch.
+    """diffrax in one call compiled by XLA: a loop over the states alone, a map over them in a batch.
 
     Steps are chosen by its controller, each state its own, or are all alike ("fixed").
     """
@@ -330,20 +330,24 @@ class Diffrax(Peer):
         solve = _diffrax(problems.equation, self.method.partition(",")[0], self.fixed, together)
         import jax
 
-        span, size = dt * steps, problems.equation.size
-        y, p = (jax.numpy.asarray(x) for x in (problems.y[:size].T, problems.p.T))
+        span, size, count = dt * steps, problems.equation.size, len(problems)
+        # XLA compiles anew for every shape, which takes seconds: so there are few.
+        shape = next((n for n in ((128, 1024) if together else (64,)) if n >= count), count)
+        y, p = (
+            jax.numpy.asarray(blocks(x, shape).swapaxes(1, 2)[0]) for x in (problems.y[:size], problems.p)
+        )
         setting = span / self.substeps(steps) if self.fixed else self.setting
         found: list[Any] = []
 
         def run() -> None:
-            found[:] = [jax.block_until_ready(solve(y, p, span, setting))]
+            found[:] = [jax.block_until_ready(solve(y, p, count, span, setting))]
 
-        return Sample(run, len(problems) * steps, ends=lambda: problems.states(np.asarray(found[0]).T, span))
+        return Sample(run, count * steps, ends=lambda: problems.states(np.asarray(found[0])[:count].T, span))
 
 
 @cache
 def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Callable:
-    """Compile ``solve(y, p, span, setting)``; tolerance or step are arguments, so one compilation does."""
+    """Compile ``solve(y, p, count, span, setting)``, where the setting is tolerance or step."""
     # Read when JAX starts: one core, as all others.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     import diffrax
@@ -367,10 +371,10 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
         )  # fmt: skip
         return jnp.stack([value[0] for value in end.ys])
 
-    def several(y: Any, p: Any, span: Any, setting: Any) -> Any:
+    def several(y: Any, p: Any, count: Any, span: Any, setting: Any) -> Any:
         if together:
             return jax.vmap(one, (0, 0, None, None))(y, p, span, setting)
-        return jax.lax.map(lambda given: one(given[0], given[1], span, setting), (y, p))
+        return jax.lax.fori_loop(0, count, lambda j, out: out.at[j].set(one(y[j], p[j], span, setting)), y)
 
     return jax.jit(several)
 

@@ -94,12 +94,12 @@ class Kernels:
         Returns how many steps were refused. `fill` and `states` tell what lies where.
         """
         code = self._code
-        names = [*code.start, "u", "ordinary"]
+        names = [*code.start, "u0", "ordinary"]
 
         def at(name: str) -> str:
             return f"rows[base + np.uint64({BLOCK * names.index(name)}) + i]"
 
-        load = [f"{name} = {at(name)}" for name in [*code.start, "u"]]
+        load = [f"{name} = {at(name)}" for name in [*code.start, "u0"]]
         fast = [*load, *code.fast]
         if self.plain:
             fast += [f"{at(y)} = {z}" for y, z in zip(code.start, code.end, strict=True)]

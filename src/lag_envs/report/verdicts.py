@@ -193,7 +193,8 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
         "there is no control, and pendulums have no damping.",
         "Ours is what the package ships: each scene's own order and tolerance, control step by control step, "
-        "and over 10 s and 1,000 s also with steps of half and of twice that length, and as one step that "
+        "and over 10 s and 1,000 s also with steps of half to eight times that length, and as one step "
+        "that "
         "`simulate` divides ('lag_envs, one call'). The test whether a step is certified is part of it.",
         "Everybody is given the scene's own equation and the fastest form there is, and the errors are those "
         "of the calls that are timed. The usual steppers are compiled by the same compiler at the same "
@@ -203,7 +204,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "are its own machine code called from a compiled loop, longer times one call of propagate_until, a "
         "batch goes in blocks of twice the width that it recommends. SciPy's compiled dopri5, dop853 and "
         "lsoda have a compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is "
-        "compiled as a whole, a scan over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
+        "compiled as a whole, a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
         "runs in its compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no "
         "batch, so that theirs is one state after the other. What would take longer than some seconds is not "
         "run.",

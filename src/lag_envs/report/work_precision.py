@@ -208,7 +208,7 @@ def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
         methods = [m for m in Compiled.methods(equation) if not quick or m in QUICK_METHODS]
         ours = [Ours(Ours.METHOD, 1)]
         if plan.seconds is not None:  # a control that is held may be stepped with any dt
-            ours += [Ours(Ours.METHOD, 0.5), Ours(Ours.METHOD, 2), Ours(Ours.ONE_CALL, 1)]
+            ours += [*(Ours(Ours.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)), Ours(Ours.ONE_CALL, 1)]
         return [
             *ours,
             *(Compiled(method, n) for method in methods for n in plan.substeps),

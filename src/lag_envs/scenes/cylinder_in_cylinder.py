@@ -84,11 +84,11 @@ class CylinderInCylinder(Scene):
     """
 
     mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
-    shell_radius: float = parameter(0.5, "m", above=0.0, usable=(1e-5, 1e5))
-    radius: float = parameter(0.1, "m", above=0.0, usable=(1e-5, 1e5))
-    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    shell_radius: float = parameter(0.5, "m", above=0.0, usable=(1e-9, 1e9))
+    radius: float = parameter(0.1, "m", above=0.0, usable=(1e-9, 1e9))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e27))
     damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
-    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e6))
     control: str = "tilt"
 
     def check(self) -> None:

@@ -73,11 +73,11 @@ class Incline(Scene):
     """
 
     mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
-    radius: float = parameter(0.05, "m", above=0.0, usable=(1e-5, 1e5))
-    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    radius: float = parameter(0.05, "m", above=0.0, usable=(1e-9, 1e9))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e27))
     damping: float = parameter(0.0, "N s/m", least=0.0, usable=(0.0, 1e9))
     tilt: float = parameter(None, "rad", least=-math.pi / 2, most=math.pi / 2)
-    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e6))
     control: str = "damping"
 
     def check(self) -> None:

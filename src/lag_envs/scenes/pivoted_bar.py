@@ -68,10 +68,10 @@ class PivotedBar(Scene):
     """
 
     mass: float = parameter(0.2, "kg", above=0.0, usable=(1e-6, 1e6))
-    com_distance: float = parameter(0.3, "m", above=0.0, usable=(1e-5, 1e5))
-    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e18))
+    com_distance: float = parameter(0.3, "m", above=0.0, usable=(1e-9, 1e9))
+    inertia: float = parameter(None, "kg m²", least=0.0, usable=(0.0, 1e27))
     damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
-    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e6))
     track: float | None = 0.5
 
     def check(self) -> None:

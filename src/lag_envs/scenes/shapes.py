@@ -109,6 +109,34 @@ def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> l
     return [polar(centre, radius, start + (end - start) * i / n) for i in range(n + 1)]
 
 
+def placed(shapes: Sequence[Shape], pose: tuple[float, float, float]) -> list[Shape]:
+    """Return shapes of a body's own frame where the body is: at (x, y) [m], turned by an angle [rad]."""
+    x, y, angle = pose
+    c, s = math.cos(angle), math.sin(angle)
+
+    def move(point: Point) -> Point:
+        return x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]
+
+    moved: list[Shape] = []
+    for shape in shapes:
+        if isinstance(shape, Circle | Lens):
+            moved.append(shape._replace(centre=move(shape.centre)))
+        else:
+            moved.append(shape._replace(points=[move(point) for point in shape.points]))
+    return moved
+
+
+def extent(shapes: Sequence[Shape]) -> float:
+    """Return the largest distance of shapes from the origin of their frame [m]."""
+    sizes = [0.0]
+    for shape in shapes:
+        if isinstance(shape, Circle | Lens):
+            sizes.append(math.hypot(*shape.centre) + shape.radius)
+        else:
+            sizes += [math.hypot(*point) for point in shape.points]
+    return max(sizes)
+
+
 def roller(centre: Point, radius: float, angle: float, ratio: float) -> list[Shape]:
     """Return a rolling cylinder that has turned counter-clockwise by an angle [rad].
 

@@ -4,6 +4,8 @@
     Runs a plain formula once on recording numbers.
 ``primitives``
     Turns a record into compiled code; also the counter-based random generator.
+``elementary``
+    Sine, exponential and their like from plain arithmetic: the same bits on every machine.
 ``compiling``
     Compiles functions that call such blocks, and keeps the result on disk.
 ``pendulum``

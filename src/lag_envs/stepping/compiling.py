@@ -18,10 +18,13 @@ _BLOCK = "block_[0-9a-f]{16}"
 _blocks: dict[str, tuple] = {}
 
 
-def record_block(trace: Trace, outputs: dict[str, Any]) -> tuple[list[str], list[Value]]:
+def record_block(
+    trace: Trace, outputs: dict[str, Any], *, fused: bool = True
+) -> tuple[list[str], list[Value]]:
     """Return the code that computes a trace's outputs, as one call of a straight-line function.
 
     Numba need not infer the types of what happens inside, which is what most of compiling would take.
+    ``fused`` is passed on to `Trace.operations`.
 
     Returns
     -------
@@ -30,7 +33,7 @@ def record_block(trace: Trace, outputs: dict[str, Any]) -> tuple[list[str], list
     values : list of str or float
         For each output its name, or the constant that it turned out to be.
     """
-    operations, results = trace.operations(list(outputs.values()))
+    operations, results = trace.operations(outputs.values(), fused=fused)
     made = {operation.name for operation in operations}
     named = {name: result for name, result in zip(outputs, results, strict=True) if isinstance(result, str)}
     used = [arg for operation in operations for arg in operation.args] + list(named.values())
@@ -99,7 +102,7 @@ def compile_python(name: str, function: Callable, *helpers: Callable, **constant
 
 
 def compile_traced(
-    name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset()
+    name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset(), *, fused: bool = True
 ) -> Callable:
     """Run ``formula(xp, *arguments)`` once on recording numbers and compile what it did.
 
@@ -113,11 +116,13 @@ def compile_traced(
         Takes the `Trace` as namespace and one `Number` per argument; returns a tuple of numbers.
     absent : frozenset of str
         Arguments that are known to be zero.
+    fused : bool
+        Whether to fuse products with sums, see `Trace.operations`.
     """
     trace = Trace()
     names = arguments.split(", ")
     outputs = formula(trace, *(trace.zero() if n in absent else trace.inputs(n)[0] for n in names))
     names = [f"out{i}" for i in range(len(outputs))]
-    lines, values = record_block(trace, dict(zip(names, outputs, strict=True)))
+    lines, values = record_block(trace, dict(zip(names, outputs, strict=True)), fused=fused)
     body = [f"def {name}({arguments}):", *lines, f"return {', '.join(map(str, values))}"]
     return compile_function(name, "\n    ".join(body) + "\n")

@@ -77,7 +77,9 @@ TURN = Flow(
 )
 
 
-def section(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) -> tuple[list[str], list]:
+def section(
+    formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], kind: type[Trace] = Trace
+) -> tuple[list[str], list]:
     """Record ``formula(xp, *inputs)``.
 
     Parameters
@@ -88,6 +90,8 @@ def section(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) ->
         A string names an input; a float is a constant.
     outputs : sequence of str
         Names for the results.
+    kind : type
+        What records, and so which functions the formula has.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def section(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str]) ->
     values : list of str or float
         For each output its name, or the constant that it turned out to be.
     """
-    trace = Trace()
+    trace = kind()
     results = formula(trace, *(_input(trace, i) for i in inputs))
     return record_block(trace, dict(zip(outputs, results, strict=True)))
 
@@ -127,8 +131,9 @@ def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
 class Stepper:
     """One scene's control step as lines of code.
 
-    The lines take the lifted state ``y0, y1, ...``, the control ``u``, the step ``dt``, the bound's ``x`` and
-    the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's end.
+    The lines take the lifted state ``y0, y1, ...``, the control ``u0``, the step ``dt``, the bound's ``x``
+    and the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's
+    end.
 
     Parameters
     ----------
@@ -170,8 +175,8 @@ class Stepper:
 
         given = list(constants.values())
         names = [*before, *flow.coefficients._fields]
-        prepared, values = section(prepare, [*self.start, "u", *given], names)
-        finished, _ = section(finish, [*after, *self.start, "u", "dt", *given], self.end)
+        prepared, values = section(prepare, [*self.start, "u0", *given], names)
+        finished, _ = section(finish, [*after, *self.start, "u0", "dt", *given], self.end)
         moved, _ = section(move, [*values, "dt"], after)
         tested, (condition,) = section(within, [*values, "dt", "x"], ["within"])
         if isinstance(condition, bool):
@@ -194,10 +199,10 @@ class Stepper:
     @property
     def arguments(self) -> str:
         """The arguments of `advance`."""
-        return ", ".join([*self.start, "u", "dt", "x", *self.constants])
+        return ", ".join([*self.start, "u0", "dt", "x", *self.constants])
 
     def compile(self) -> Callable:
-        """Compile ``advance(y..., u, dt, x, constants...)`` to ``(z..., status)``.
+        """Compile ``advance(y..., u0, dt, x, constants...)`` to ``(z..., status)``.
 
         It takes any step. The status is the number of substeps, or negative where the step is refused.
         """
@@ -213,7 +218,7 @@ class Stepper:
         load = [f"y{i} = trajectory[0, {i}]" for i in range(n)]
         load += lift_lines(n, self._angle, "y")
         loop = [
-            "u = controls[i]",
+            "u0 = controls[i]",
             f"{', '.join(self.start)}, status = advance({self.arguments})",
             "if status < 0:",
             "    return i + 1",

@@ -14,7 +14,7 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from llvmlite import ir
 from numba import njit, types
 from numba.extending import intrinsic
 
-from lag_envs.stepping.tracing import BOOLEAN, Operation
+from lag_envs.stepping.tracing import BOOLEAN, MAGIC, Operation
 
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -110,16 +110,9 @@ def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Seque
     result = types.Tuple(kinds)
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        known = dict(zip(inputs, args, strict=True))
-
-        def value(of: Any) -> ir.Value:
-            if isinstance(of, str):
-                return known[of]
-            return ir.Constant(ir.IntType(1), int(of)) if isinstance(of, bool) else ir.Constant(_DOUBLE, of)
-
-        for name, op, arguments in operations:
-            known[name] = _emit(builder, op, [value(a) for a in arguments])
-        return context.make_tuple(builder, signature.return_type, [value(o) for o in outputs])
+        known = emit(builder, operations, dict(zip(inputs, args, strict=True)))
+        results = [known[o] if isinstance(o, str) else _constant(o) for o in outputs]
+        return context.make_tuple(builder, signature.return_type, results)
 
     # Numba wants the arguments by name.
     scope = {"answer": lambda: (result(*[types.float64] * len(inputs)), codegen)}
@@ -131,27 +124,93 @@ _DOUBLE = ir.DoubleType()
 _INT = ir.IntType(64)
 
 
+def emit(
+    builder: ir.IRBuilder, operations: Iterable[Operation], values: dict[str, ir.Value]
+) -> dict[str, ir.Value]:
+    """Write recorded operations where the builder stands.
+
+    Every lane of a vector goes through the same operations as a single number, and gets the same bits.
+
+    Parameters
+    ----------
+    builder : llvmlite.ir.IRBuilder
+        Where to write.
+    operations : iterable of Operation
+        What to do.
+    values : dict of str to llvmlite.ir.Value
+        What the names stand for: doubles (truth values: i1), or vectors of them, all of one length; a
+        single number meets a vector as one whose lanes are all alike. Results are added.
+
+    Returns
+    -------
+    dict of str to llvmlite.ir.Value
+        The values, results included.
+    """
+    for name, op, args in operations:
+        known = [values[a] if isinstance(a, str) else _constant(a) for a in args]
+        lanes = max((v.type.count for v in known if isinstance(v.type, ir.VectorType)), default=0)
+        values[name] = _emit(builder, op, [splat(builder, v, lanes) for v in known] if lanes else known)
+    return values
+
+
+def _constant(value: Any) -> ir.Constant:
+    return ir.Constant(ir.IntType(1), int(value)) if isinstance(value, bool) else ir.Constant(_DOUBLE, value)
+
+
+def splat(b: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
+    """Return the vector whose lanes all are this number; a vector as it is."""
+    if isinstance(value.type, ir.VectorType):
+        return value
+    kind = ir.VectorType(value.type, lanes)
+    if isinstance(value, ir.Constant):
+        return ir.Constant(kind, [value] * lanes)
+    first = b.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [ir.IntType(32)(0)] * lanes)
+    return b.shuffle_vector(first, first, zeros)
+
+
+def _like(kind: ir.Type, value: Any, element: ir.Type = _DOUBLE) -> ir.Constant:
+    """Return a constant of as many lanes as this type has."""
+    if isinstance(kind, ir.VectorType):
+        return ir.Constant(ir.VectorType(element, kind.count), [ir.Constant(element, value)] * kind.count)
+    return ir.Constant(element, value)
+
+
+def call(b: ir.IRBuilder, function: str, *args: ir.Value) -> ir.Value:
+    """Write a call of one of LLVM's own functions, on numbers or on vectors."""
+    kind = args[0].type
+    suffix = f"v{kind.count}f64" if isinstance(kind, ir.VectorType) else "f64"
+    signature = ir.FunctionType(kind, [kind] * len(args))
+    return b.call(b.module.declare_intrinsic(f"llvm.{function}.{suffix}", (), signature), args)
+
+
 def _emit(b: ir.IRBuilder, op: str, args: list[ir.Value]) -> ir.Value:
-    """Write one operation."""
-    if op in ("sqrt", "sin", "cos", "log", "floor", "abs"):
-        name = "llvm.fabs" if op == "abs" else f"llvm.{op}"
-        return b.call(b.module.declare_intrinsic(name, [_DOUBLE]), args)
-    if op in ("<", "<="):
-        return b.fcmp_ordered(op, *args)
+    """Write one operation, on numbers or on vectors."""
     return {
         "+": b.fadd,
         "-": b.fsub,
         "*": b.fmul,
         "/": b.fdiv,
         "neg": b.fneg,
-        "a*b+c": b.fma,
-        "a*b-c": lambda x, y, z: b.fma(x, y, b.fneg(z)),
-        "c-a*b": lambda x, y, z: b.fma(b.fneg(x), y, z),
+        "a*b+c": lambda x, y, z: call(b, "fma", x, y, z),
+        "a*b-c": lambda x, y, z: call(b, "fma", x, y, b.fneg(z)),
+        "c-a*b": lambda x, y, z: call(b, "fma", b.fneg(x), y, z),
+        "<": lambda x, y: b.fcmp_ordered("<", x, y),
+        "<=": lambda x, y: b.fcmp_ordered("<=", x, y),
         "where": b.select,
         "&": b.and_,
         "|": b.or_,
         "~": b.not_,
+        "sqrt": lambda x: call(b, "sqrt", x),
+        "sin": lambda x: call(b, "sin", x),
+        "cos": lambda x: call(b, "cos", x),
+        "log": lambda x: call(b, "log", x),
         "exp": lambda x: _exp(b, x),
+        "abs": lambda x: call(b, "fabs", x),
+        "floor": lambda x: call(b, "floor", x),
+        "pow2": lambda n: _pow2(b, n),
+        "exponent": lambda x: _exponent(b, x),
+        "copysign": lambda x, sign: call(b, "copysign", x, sign),
     }[op](*args)
 
 
@@ -159,19 +218,39 @@ def _exp(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Write e**x to 1 ulp, clipped to |x| <= 700: arithmetic only, so that a loop with it becomes vectors."""
 
     def number(value: float) -> ir.Constant:
-        return ir.Constant(_DOUBLE, value)
+        return _like(x.type, value)
+
+    def fma(x: ir.Value, y: ir.Value, z: ir.Value) -> ir.Value:
+        return call(b, "fma", x, y, z)
 
     for limit, beyond in ((-700.0, "<"), (700.0, ">")):
         x = b.select(b.fcmp_ordered(beyond, x, number(limit)), number(limit), x)
     # x = n log 2 + r with |r| <= log(2)/2; log 2 in two parts.
-    n = _emit(b, "floor", [b.fma(x, number(1.4426950408889634), number(0.5))])
-    r = b.fma(b.fneg(n), number(0.6931471803691238), x)
-    r = b.fma(b.fneg(n), number(1.9082149292705877e-10), r)
+    n = call(b, "floor", fma(x, number(1.4426950408889634), number(0.5)))
+    r = fma(b.fneg(n), number(0.6931471803691238), x)
+    r = fma(b.fneg(n), number(1.9082149292705877e-10), r)
     p = number(1.0 / math.factorial(13))
     for k in range(12, -1, -1):
-        p = b.fma(p, r, number(1.0 / math.factorial(k)))
-    exponent = b.shl(b.add(b.fptosi(n, _INT), ir.Constant(_INT, 1023)), ir.Constant(_INT, 52))
-    return b.fmul(p, b.bitcast(exponent, _DOUBLE))
+        p = fma(p, r, number(1.0 / math.factorial(k)))
+    return b.fmul(p, _pow2(b, n))
+
+
+def _pow2(b: ir.IRBuilder, n: ir.Value) -> ir.Value:
+    """Write 2**n: the sum has n + 1023 in its last bits, from where it is moved into the exponent."""
+    integers = _integers(n.type)
+    biased = b.fadd(n, _like(n.type, MAGIC + 1023.0))
+    return b.bitcast(b.shl(b.bitcast(biased, integers), _like(n.type, 52, _INT)), n.type)
+
+
+def _exponent(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
+    """Write the exponent: its bits, put at the end of 2**52, and the bias taken away."""
+    bits = b.lshr(b.bitcast(x, _integers(x.type)), _like(x.type, 52, _INT))
+    bits = b.or_(b.and_(bits, _like(x.type, 0x7FF, _INT)), _like(x.type, 0x433 << 52, _INT))
+    return b.fsub(b.bitcast(bits, x.type), _like(x.type, 2.0**52 + 1023.0))
+
+
+def _integers(kind: ir.Type) -> ir.Type:
+    return ir.VectorType(_INT, kind.count) if isinstance(kind, ir.VectorType) else _INT
 
 
 #: What the source of a compiled function may name.

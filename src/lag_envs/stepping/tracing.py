@@ -16,8 +16,25 @@ Three things happen on the way:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+import numbers
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from fractions import Fraction
 from typing import Any, NamedTuple
+
+#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
+MAGIC = 1.5 * 2.0**52
+
+
+def _bits(value: float) -> int:
+    return int(struct.unpack("<Q", struct.pack("<d", value))[0])
+
+
+def _pow2(n: float) -> float:
+    # As in machine code: 2^52 and 2^51 ahead of it, a number has n + 1023 in its last bits.
+    bits = _bits(n + (MAGIC + 1023.0)) << 52
+    return float(struct.unpack("<d", struct.pack("<Q", bits % 2**64))[0])
+
 
 _FLOAT: dict[str, Callable] = {
     "+": lambda a, b: a + b,
@@ -38,6 +55,37 @@ _FLOAT: dict[str, Callable] = {
     "cos": math.cos,
     "abs": abs,
     "floor": math.floor,
+    "pow2": _pow2,
+    "exponent": lambda a: (_bits(a) >> 52 & 0x7FF) - 1023.0,
+    "copysign": math.copysign,
+}
+
+
+def _divide(a: Any, b: Any) -> Any:
+    if b == 0.0:
+        return math.nan if a == 0.0 or a != a else math.copysign(math.inf, a) * math.copysign(1.0, b)
+    return a / b
+
+
+def _fma(a: Any, b: Any, c: Any) -> Any:
+    try:
+        exact = Fraction(a) * Fraction(b) + Fraction(c)
+    except (OverflowError, ValueError):  # infinite, not a number
+        return c if math.isfinite(a) and math.isfinite(b) else a * b + c
+    try:
+        return float(exact) if exact else a * b + c
+    except OverflowError:
+        return math.inf if exact > 0 else -math.inf
+
+
+#: Every operation on Python's floats, with the bits of machine code (but for the functions of its own).
+_IEEE: dict[str, Callable] = _FLOAT | {
+    "/": _divide,
+    "sqrt": lambda a: math.nan if a < 0.0 else math.sqrt(a),
+    "floor": lambda a: math.copysign(math.floor(a), a) if math.isfinite(a) else a,
+    "a*b+c": _fma,
+    "a*b-c": lambda a, b, c: _fma(a, b, -c),
+    "c-a*b": lambda a, b, c: _fma(-a, b, c),
 }
 
 #: What a sum becomes when its first or its second term is a product that nobody else uses.
@@ -91,6 +139,24 @@ class Number:
 
     def __neg__(self) -> Any:
         return self.trace.record("neg", self)
+
+    def __pos__(self) -> Any:
+        return self
+
+    def __abs__(self) -> Any:
+        return self.trace.record("abs", self)
+
+    def __pow__(self, exponent: Any) -> Any:
+        whole = not isinstance(exponent, bool) and isinstance(exponent, numbers.Real)
+        if not whole or float(exponent) != int(float(exponent)):
+            raise TypeError(
+                f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others"
+            )
+        power: Any = 1.0
+        for bit in bin(abs(int(float(exponent))))[2:]:
+            power = power * power
+            power = power * self if bit == "1" else power
+        return power if float(exponent) >= 0 else 1.0 / power
 
     def __lt__(self, other: Any) -> Any:
         return self.trace.record("<", self, other)
@@ -176,10 +242,18 @@ class Trace:
         self._zeros.add(number.name)
         return number
 
-    def operations(self, outputs: Iterable[Any]) -> tuple[list[Operation], list[Value]]:
-        """Return what computes the outputs, in order and without detours, and what the outputs are then."""
-        results = [value.name if isinstance(value, Number) else value for value in outputs]
-        operations = _drop_zeros(self._fused(outputs), results, self._zeros)
+    def operations(
+        self, outputs: Iterable[Any], zeros: Iterable[str] = (), *, fused: bool = True
+    ) -> tuple[list[Operation], list[Value]]:
+        """Return what computes the outputs, in order and without detours, and what the outputs are then.
+
+        Inputs named in `zeros` are known to be zero, like the numbers that `zero` returns. With
+        ``fused=False`` no product is fused with a sum: all that is left rounds alike on every machine and in
+        every language (see `evaluate`).
+        """
+        outputs = list(outputs)
+        results = [_name(value) for value in outputs]
+        operations = _drop_zeros(self._collected(outputs, fused), results, self._zeros | set(zeros))
         needed = set(results)
         kept = []
         for operation in reversed(operations):
@@ -188,7 +262,7 @@ class Trace:
                 needed.update(operation.args)
         return kept[::-1], results
 
-    def _fused(self, outputs: Iterable[Any]) -> list[Operation]:
+    def _collected(self, outputs: list, fuse: bool) -> list[Operation]:
         uses: dict[str, int] = {}
         stack = list(outputs)
         while stack:
@@ -200,7 +274,7 @@ class Trace:
         fused: dict[str, Operation] = {}
         swallowed: set[str] = set()
         for node in self._nodes:
-            if node.name in uses and node.op in FUSED:
+            if fuse and node.name in uses and node.op in FUSED:
                 first, second = node.args
                 for op, product, other in zip(FUSED[node.op], (first, second), (second, first), strict=True):
                     if isinstance(product, Number) and product.op == "*" and uses[product.name] == 1:
@@ -214,6 +288,8 @@ class Trace:
         ]
 
     # The functions that a formula may call, named as in NumPy.
+
+    pi = math.pi
 
     def where(self, condition: Any, a: Any, b: Any) -> Any:
         """Select elementwise."""
@@ -254,6 +330,59 @@ class Trace:
     def floor(self, a: Any) -> Any:
         """Return the largest whole number that is not above."""
         return self.record("floor", a)
+
+    # What elementary functions are made of, beside arithmetic; each is exact.
+
+    def pow2(self, n: Any) -> Any:
+        """Return 2**n for a whole number n in [-1022, 1023]."""
+        return self.record("pow2", n)
+
+    def exponent(self, a: Any) -> Any:
+        """Return the whole number n with 2**n <= abs(a) < 2**(n + 1), for normal numbers a."""
+        return self.record("exponent", a)
+
+    def copysign(self, a: Any, sign: Any) -> Any:
+        """Return a with the sign of another number, be it a zero."""
+        return self.record("copysign", a, sign)
+
+
+def evaluate(
+    operations: Iterable[Operation],
+    values: Mapping[str, Any],
+    functions: Mapping[str, Callable] | None = None,
+) -> dict[str, Any]:
+    """Carry out recorded operations on Python's floats, or on other numbers.
+
+    Unfused operations without sin, cos, exp and log give the bits that compiled code gives; fused ones
+    too, though slowly.
+
+    Parameters
+    ----------
+    operations : iterable of Operation
+        What to do.
+    values : mapping of str to number
+        The inputs by name.
+    functions : mapping of str to callable, optional
+        What to do instead for some operations, such as ``{"sqrt": mpmath.sqrt}``.
+
+    Returns
+    -------
+    dict of str to number
+        The inputs and all results by name.
+
+    Examples
+    --------
+    >>> trace = Trace()
+    >>> a, b = trace.inputs("a", "b")
+    >>> operations, results = trace.operations([a / b + 1.0], fused=False)
+    >>> evaluate(operations, {"a": 1.0, "b": -0.0})[results[0]]
+    -inf
+    """
+    table = _IEEE | dict(functions or {})
+    known = dict(values)
+    for name, op, args in operations:
+        known[name] = table[op](*(known[a] if isinstance(a, str) else a for a in args))
+    return known
 
 
 def sum_of_products(factors: Iterable[tuple[Any, Any]]) -> Any:

@@ -7,11 +7,7 @@ add an environment, write its task and add a line here.
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from lag_envs.tasks.base import Task
-
+from typing import Any
 
 TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "PivotedBar-v0": ("lag_envs.tasks.pivoted_bar:SwingUp", {}),
@@ -25,10 +21,24 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def load_task(place: str) -> type[Task]:
-    """Return the task class at "module:Class", or raise a ValueError."""
+def __getattr__(name: str) -> Any:
+    """Return `Task`, from which a task of one's own derives; it is loaded when it is asked for."""
+    if name == "Task":
+        from lag_envs.tasks.contract import Task
+
+        return Task
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def load_task(place: str | type[Any]) -> type[Any]:
+    """Return the task class at "module:Class", or raise a ValueError; a class as it is."""
+    if isinstance(place, type):
+        return place
     try:
         module, _, name = place.partition(":")
-        return getattr(import_module(module), name)
+        found: Any = import_module(module)
+        for part in name.split("."):
+            found = getattr(found, part)
+        return found
     except (AttributeError, ImportError, TypeError, ValueError) as error:
         raise ValueError(f"task must be given as 'module:Class', got {place!r:.200}: {error}") from error

@@ -12,11 +12,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.scenes.base import Scene, check_number
+from lag_envs.scenes.base import Scene, StepRefused, check_number
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
+from lag_envs.stepping.flows import Stepper, lift_lines
+from lag_envs.stepping.tracing import Trace
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
+#: Angle [rad] through which `Task.fastest` may turn in a step. It then needs far fewer substeps than are
+#: allowed, also after many steps have added to the speed.
+LONGEST_TURN = 5000.0
 
 
 class Task(ABC):
@@ -52,9 +57,9 @@ class Task(ABC):
     rest_action: ClassVar[float] = 0.0
     #: Random numbers that one step's kick uses, at most 16.
     draws: ClassVar[int] = 0
-    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares:
-    #: wherever in these ranges all of them lie, every accepted start and action gives finite observations
-    #: within their space, and steps of any `dt` are taken.
+    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares.
+    #: Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
+    #: gives finite observations within their space, and every step is taken.
     usable: ClassVar[dict[str, tuple[float, float]]] = {}
 
     def __init__(
@@ -102,6 +107,17 @@ class Task(ABC):
                 raise ValueError(
                     f"{name} must lie between {low:g} and {high:g} in this environment, got {value!r}"
                 )
+        fastest = self.fastest
+        if fastest * self.dt > LONGEST_TURN:
+            raise ValueError(
+                f"dt must be at most {LONGEST_TURN / fastest:.3g} s where speeds reach {fastest:.3g} rad/s, "
+                f"got {self.dt!r} s with {self.scene}"
+            )
+
+    @property
+    def fastest(self) -> float:
+        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
+        return 0.0
 
     @classmethod
     def usable_ranges(cls) -> dict[str, tuple[float, float]]:
@@ -176,6 +192,15 @@ class Task(ABC):
     def check_safe(self, state: NDArray[np.float64]) -> None:
         """Raise ValueError for a start outside the set in which the episode goes on."""
 
+    def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
+        """Return a given start, checked; see `check_start`."""
+        return self.check_start(state)
+
+    @property
+    def formulas(self) -> FlowFormulas:
+        """What compiled functions are made of."""
+        return FlowFormulas(self)
+
     # --- the picture ---------------------------------------------------------------------------------------
 
     def shapes(self, now: Moment) -> list[Shape]:
@@ -185,6 +210,19 @@ class Task(ABC):
     def window(self, now: Moment) -> Window:
         """Return the part of the plane to look at [m]."""
         return self.scene.window(now)
+
+    def share(self, control: float) -> float:
+        """Return the control as a share of the largest one."""
+        return control / self.limit_control
+
+    def turning(self, state: Sequence[float]) -> float:
+        """Return the rate of a coordinate that the picture shows and the state leaves out."""
+        return self.scene.turning(state)
+
+    def control_readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells of the control."""
+        name, _, unit = self.scene.control_unit.rstrip("]").partition(" [")
+        return [Reading(name, now.control, unit, "action")]
 
     def readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells besides state and control."""
@@ -240,6 +278,92 @@ class Task(ABC):
     @abstractmethod
     def bounds(self) -> Sequence[float]:
         """Return a bound on the size of each observation entry, proved for every start that is accepted."""
+
+
+#: Attributes of a task whose numbers reach its code as constants, if at all.
+_NUMBERS = {"scene", "dt", "duration", "target"}
+
+
+class FlowFormulas:
+    """The formulas of a task on a scene with a flow of its own, as `lag_envs.envs.program` asks for them."""
+
+    clipped = True
+    actions = controls = 1
+    choices = ()
+    trace = Trace
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self.state = task.scene.state_names
+        self.observation = task.observation
+        self.draws = task.draws
+        self.targets = 0 if task.target_range is None else 1
+        self.bounded = bool(task.scene.order)
+        self.has_last = type(task).last_reward is not Task.last_reward
+
+    @property
+    def key(self) -> tuple:
+        """What decides the code: tasks of a class that agree in it differ in their numbers only."""
+        task, scene = self._task, self._task.scene
+        values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
+        choices = [math.isinf(v) if isinstance(v, float) else repr(v) for v in values]
+        # Formulas may also name attributes of the task, which somebody may have set by hand.
+        own = [(name, repr(v)) for name, v in vars(task).items() if name not in _NUMBERS]
+        shared = [v for c in type(task).__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+        return task.variant, *choices, *own, *shared
+
+    def refusal(self, *arguments: Any) -> StepRefused:
+        """Return the error for a step that was refused."""
+        return self._task.scene.refusal(*arguments)
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return the lowest and highest values of the observation's entries."""
+        high = list(self._task.bounds())
+        return [-b for b in high], high
+
+    def constants(self) -> dict[str, float]:
+        """Return every number that compiled functions take, by name."""
+        task = self._task
+        start = {f"centre{i}": c for i, c in enumerate(task.centre)}
+        start |= {f"half{i}": h for i, h in enumerate(task.start)}
+        return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
+
+    def stepper(self, absent: frozenset[str]) -> Stepper:
+        """Return the code of a control step."""
+        return Stepper(self._task.scene, absent)
+
+    def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the controls that are applied."""
+        return [self._task.control(a[0], y, k, k.dt, xp)]
+
+    def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
+        """Return the reward, and whether the episode is over."""
+        reward = self._task.reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
+        return reward, self._task.terminated(z, k, xp)
+
+    def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that terminates."""
+        return self._task.last_reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
+
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> Sequence:
+        """Return the lifted state after a kick."""
+        return self._task.kick(z, draws, k, xp)
+
+    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> Sequence:
+        """Return the observation."""
+        return self._task.observe(y, g[0] if g else 0.0, k)
+
+    def sample_targets(self, draws: Sequence, k: Any) -> list:
+        """Return targets from draws in [0, 1)."""
+        if not self.targets:
+            return []
+        if self._task.target is not None:
+            return [k["goal"]]
+        return [self._task.target_range * (2.0 * draws[0] - 1.0)]
+
+    def lift(self, y: str) -> list[str]:
+        """Return the lines that complete the lifted state."""
+        return lift_lines(len(self.state), self._task.scene.angle, y)
 
 
 def finite(bound: float) -> float:

@@ -15,16 +15,6 @@ from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
 
 
-def _check_gap(scene: CylinderInCylinder) -> None:
-    """Refuse a small cylinder that fills the shell: it would move faster than can be stepped."""
-    largest = min(scene.shell_radius - 1e-5, 0.9999 * scene.shell_radius)
-    if scene.radius > largest:
-        raise ValueError(
-            f"radius must be at most {largest!r} m with shell_radius={scene.shell_radius!r} m, "
-            f"1e-5 m and a ten thousandth below, got {scene.radius!r} m"
-        )
-
-
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
 
@@ -39,7 +29,6 @@ class _Shell(Task):
         """Refuse the damping control."""
         if self.scene.control != "tilt":
             raise ValueError(f"this task is controlled by 'tilt', got control={self.scene.control!r}")
-        _check_gap(self.scene)
 
     @property
     def start(self) -> Sequence[float]:
@@ -59,6 +48,12 @@ class _Shell(Task):
         """Return U·a, cut back so that the shell's rate stays within its limit at the step's end."""
         wanted = k.limit_control * a
         return clip(wanted, (-k.fastest_shell - y[2]) * (1.0 / dt), (k.fastest_shell - y[2]) * (1.0 / dt), xp)
+
+    @property
+    def fastest(self) -> float:
+        """Speed of a fall, of a push from one limit of the shell's rate to the other, and of drag [rad/s]."""
+        k = self.scene.constants()
+        return 2.0 * math.sqrt(k["weight"]) + (2.0 * k["push"] + 1.0) * self.fastest_shell
 
     def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
         """Tell whether the cylinder has been carried too high."""
@@ -148,17 +143,18 @@ class Tilt(_Shell):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0.24 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
     | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
     | target | None | rad | ±1.05 | an angle for every episode; None: random |
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
-    their space. Outside, an error names it.
+    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
+    (2 √(k g/a) + (2 k I R/(mr²a) + 1) 6 rad/s) dt is at most 5,000 rad. Then every step is taken, and
+    observations stay within their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -291,16 +287,17 @@ class Pump(_Shell):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0.024 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | 1e-3 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
     | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
-    their space. Outside, an error names it.
+    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
+    (2 √(k g/a) + (2 k I R/(mr²a) + 1) 3 rad/s) dt is at most 5,000 rad. Then every step is taken, and
+    observations stay within their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
     drive torque in `info`.
@@ -353,7 +350,7 @@ class Pump(_Shell):
         "control": "tilt",
     }
     observation = ("theta", "theta_dot", "psi_dot")
-    usable: ClassVar = {"gravity": (1e-3, 1e4)}  # without a field no energy belongs to the amplitude
+    usable: ClassVar = {"gravity": (1e-3, 1e6)}  # without a field no energy belongs to the amplitude
     limit_control, fastest_shell, largest_angle = 4.0, 3.0, 1.3
     amplitude = 0.9
 
@@ -441,16 +438,17 @@ class Damping(Task):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-5 to 1e5 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-5 to 1e5 | its radius r; 1e-5 m and a ten thousandth below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e18 | its moment of inertia I about its axis; None: solid, mr²/2 |
+    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
+    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
+    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
     | damping | 0 | N m s | 0 to 1e9 | constant drag; adds to the brake |
-    | gravity | 9.81 | m/s² | 1e-3 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
-    their space. Outside, an error names it.
+    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
+    2 √(k g/a) dt is at most 5,000 rad. Then every step is taken, and observations stay within their space.
+    Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
     `info`.
@@ -472,7 +470,8 @@ class Damping(Task):
 
     Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md).
 
     ## Optimal Value
 
@@ -497,7 +496,7 @@ class Damping(Task):
     scene: CylinderInCylinder
     scene_type = CylinderInCylinder
     defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
-    usable: ClassVar = {"gravity": (1e-3, 1e4)}  # without a field nothing holds the cylinder in the shell
+    usable: ClassVar = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
     observation = ("theta", "theta_dot")
     draws = 2
     limit_control = 2.4
@@ -507,12 +506,16 @@ class Damping(Task):
         """Refuse the other control."""
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
-        _check_gap(self.scene)
 
     @property
     def start(self) -> Sequence[float]:
         """Well up the wall, moving."""
         return [0.8, 1.0]
+
+    @property
+    def fastest(self) -> float:
+        """Speed of a fall [rad/s]."""
+        return 2.0 * math.sqrt(self.scene.constants()["weight"])
 
     def numbers(self) -> dict[str, float]:
         """Return the strongest brake, g/a for the contact, and the chance of a kick."""

@@ -83,15 +83,16 @@ class SwingUp(Task):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
-    | com_distance | 0.3 | m | 1e-5 to 1e5 | distance L from pivot to centre of mass, half of the length |
-    | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
+    | com_distance | 0.3 | m | 1e-9 to 1e9 | distance L from pivot to centre of mass, half of the length |
+    | inertia | 0.006 | kg m² | 0 to 1e27 | moment of inertia I about the centre of mass; None: mL²/3 |
     | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
     | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; `math.inf`: no end (S = 0.5 m); None: none |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
+    2 √((g + 5 m/s²) m L/J) dt is at most 5,000 rad. Then every step is taken, and observations stay within
     their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
@@ -115,8 +116,8 @@ class SwingUp(Task):
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
-    s and s' are exact to rounding.
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md). s and s' are exact to rounding.
 
     ## Optimal Value
 
@@ -161,6 +162,12 @@ class SwingUp(Task):
     def start(self) -> Sequence[float]:
         """Hanging, nearly at rest, near the middle of the track."""
         return [*([0.1 * self.numbers()["track"], 0.02] if self.has_track else []), 0.1, 0.1]
+
+    @property
+    def fastest(self) -> float:
+        """Speed of a fall in the field that the support makes stronger [rad/s]."""
+        k = self.scene.constants()
+        return 2.0 * math.sqrt(k["weight"] + k["pull"] * self.limit_control)
 
     def numbers(self) -> dict[str, float]:
         """Return the limit U of the control and the track's half length S."""
@@ -285,15 +292,16 @@ class Balance(SwingUp):
     | Keyword | Default | Unit | Range | Meaning |
     | ------- | ------- | ---- | ----- | ------- |
     | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
-    | com_distance | 0.3 | m | 1e-5 to 1e5 | distance L from pivot to centre of mass, half of the length |
-    | inertia | 0.006 | kg m² | 0 to 1e18 | moment of inertia I about the centre of mass; None: mL²/3 |
+    | com_distance | 0.3 | m | 1e-9 to 1e9 | distance L from pivot to centre of mass, half of the length |
+    | inertia | 0.006 | kg m² | 0 to 1e27 | moment of inertia I about the centre of mass; None: mL²/3 |
     | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | 0 to 1e4 | field g, downward |
+    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
     | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; finite here |
     | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
     | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
+    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
+    2 √((g + 3 m/s²) m L/J) dt is at most 5,000 rad. Then every step is taken, and observations stay within
     their space. Outside, an error names it.
 
     Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
@@ -317,8 +325,8 @@ class Balance(SwingUp):
 
     Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
     most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
-    s and s' are exact to rounding.
+    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
+    (docs/numerics.md). s and s' are exact to rounding.
 
     ## Optimal Value
 

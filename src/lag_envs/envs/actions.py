@@ -1,0 +1,85 @@
+"""Spaces of actions, and actions as compiled code takes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.scenes.base import is_masked, shown
+
+
+class Actions:
+    """The actions of one task.
+
+    Parameters
+    ----------
+    count : int
+        How many numbers an action has.
+    values : tuple of int
+        For actions that are chosen from lists the length of each list; empty where they lie in [-1, 1].
+    """
+
+    def __init__(self, count: int, values: tuple[int, ...]) -> None:
+        self.count, self.values = count, values
+        self.space: gym.Space[Any]
+        if len(values) == 1:
+            self.space = gym.spaces.Discrete(values[0])
+        elif values:
+            self.space = gym.spaces.MultiDiscrete(list(values))
+        else:
+            self.space = gym.spaces.Box(-1.0, 1.0, (count,), np.float32)
+        #: Shape of one action.
+        self.shape = () if len(values) == 1 else (count,)
+
+    def one(self, action: Any) -> Any:
+        """Return an action as a float, or as an array where it has several numbers; or raise a ValueError."""
+        array = self._array(action, "the action", self.shape)
+        if self.values:
+            self._check_choices(array, "the action")
+        elif not np.isfinite(array).all():
+            raise ValueError(f"the action must be finite, got {shown(action)}")
+        numbers = np.ascontiguousarray(array, np.float64).reshape(-1)
+        return float(numbers[0]) if self.count == 1 else numbers
+
+    def many(self, actions: Any, n: int) -> NDArray[np.floating]:
+        """Return the actions of n environments, one behind the other; or raise a ValueError."""
+        array = self._array(actions, "actions", (n, *self.shape))
+        if self.values:
+            self._check_choices(array, "actions")
+        if (
+            array.dtype.char not in "fd" or not array.dtype.isnative or not array.flags.writeable
+        ):  # what the compiled step takes as it is
+            array = array.astype(np.float64)
+        return array.reshape(-1)
+
+    def _array(self, given: Any, what: str, shape: tuple[int, ...]) -> NDArray:
+        """Return real or whole numbers of this shape as an array, or raise a ValueError."""
+        try:
+            array = np.asarray(given)
+        except ValueError as error:  # rows of different lengths
+            raise ValueError(f"{what} must have shape {shape}, got {shown(given)}") from error
+        if array.shape != shape:
+            raise ValueError(f"{what} must have shape {shape}, got shape {array.shape}: {shown(given)}")
+        if array.dtype.kind not in ("iu" if self.values else "fiub") or is_masked(given):
+            one = what.startswith("the")
+            kind = ("whole" if self.values else "real") + (" number" if one else " numbers")
+            raise ValueError(
+                f"{what} must be {'a ' if one else ''}{kind}, got {shown(given)} of type {array.dtype}"
+            )
+        return array
+
+    def _check_choices(self, array: NDArray, what: str) -> None:
+        bad = (array < 0) | (array >= np.array(self.values).reshape(self.shape))
+        if bad.any():
+            choices = ", ".join(f"0 to {n - 1}" for n in self.values)
+            raise ValueError(f"{what} must be {choices}, got {array[bad].flat[0]}")
+
+
+def single_number(values: NDArray[np.float64]) -> Any:
+    """Return a copy of an array, or its number where it has only one along the last axis."""
+    if values.shape[-1] != 1:
+        return values.copy()
+    return float(values[0]) if values.ndim == 1 else values[..., 0].copy()

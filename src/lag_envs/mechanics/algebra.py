@@ -1,0 +1,632 @@
+"""Exact algebra on recorded formulas: sums of products of symbols and of functions of such sums.
+
+Energies are run once on `Expr` objects. An `Expr` is kept expanded, as a map from monomials to rational
+coefficients, so that equal terms meet and what cancels leaves nothing behind: the whole derivation of an
+equation of motion is sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
+an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Two rules are
+added to those of sums and products: √x² = x, and cos² + sin² = 1, which is applied where two terms agree in
+all else (`collect`).
+
+Everything is ordered by the text of what it is, never by when it was made: the same formulas give the same
+code and the same bits in every process.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+from collections.abc import Callable, Iterable, Mapping
+from fractions import Fraction
+from typing import Any, ClassVar, NoReturn
+
+Monomial = tuple[tuple["Atom", int], ...]
+
+#: A product of two sums that would have more terms than this is kept as a product.
+LARGEST_PRODUCT = 4096
+
+
+class FormulaError(TypeError, ValueError):
+    """A formula does what recorded numbers cannot follow, or a name is wrong."""
+
+
+class Atom:
+    """A symbol, or a function of an expression. Atoms with the same text are the same object."""
+
+    __slots__ = ("argument", "function", "kind", "name", "text")
+    _all: ClassVar[dict[str, Atom]] = {}
+
+    kind: str
+    name: str
+    function: str
+    argument: Expr | None
+    text: str
+
+    def __new__(cls, kind: str, name: str, argument: Expr | None = None) -> Atom:
+        """Return the atom of this kind and name.
+
+        Parameters
+        ----------
+        kind : str
+            ``"function"``, or what the symbol stands for: ``"parameter"``, ``"place"``, ``"velocity"``,
+            ``"control"``, ...
+        name : str
+            The symbol's or the function's name; the function ``"sum"`` is its argument itself.
+        argument : Expr, optional
+            What the function is taken of.
+        """
+        text = f"{kind} {name}" if argument is None else f"{name}({argument.text})"
+        found = cls._all.get(text)
+        if found is None:
+            found = object.__new__(cls)
+            found.kind, found.name, found.argument, found.text = kind, name, argument, text
+            found.function = name if argument is not None else ""
+            found = cls._all.setdefault(text, found)
+        return found
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def __reduce__(self) -> tuple:
+        return Atom, (self.kind, self.name, self.argument)
+
+
+def _exact(value: float) -> int | Fraction:
+    number = float(value)
+    if not math.isfinite(number):
+        raise FormulaError(f"a formula uses the number {number}")
+    return int(number) if number.is_integer() else Fraction(number)
+
+
+class Expr:
+    """A recorded number. It can be added, multiplied, divided and raised to whole powers."""
+
+    __slots__ = ("_text", "terms")
+
+    def __init__(self, terms: Mapping[Monomial, int | Fraction]) -> None:
+        self.terms = dict(terms)
+        self._text: str | None = None
+
+    @staticmethod
+    def of(value: Any) -> Expr:
+        """Return a number, an atom or an expression as an expression."""
+        if isinstance(value, Expr):
+            return value
+        if isinstance(value, Atom):
+            return Expr({((value, 1),): 1})
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            raise FormulaError(
+                f"a formula combines a recorded number with {value!r}; it must be a real number"
+            )
+        exact = value if isinstance(value, int | Fraction) else _exact(float(value))
+        return Expr({(): exact} if exact else {})
+
+    # --- what it is -----------------------------------------------------------------------------------------
+
+    @property
+    def text(self) -> str:
+        """The expression as text; equal expressions have equal texts."""
+        if self._text is None:
+            parts = []
+            for monomial, c in self.sorted_terms():
+                factors = [a.text if n == 1 else f"{a.text}^{n}" for a, n in monomial]
+                parts.append("*".join([str(c), *factors] if c != 1 or not factors else factors))
+            self._text = " + ".join(parts) or "0"
+        return self._text
+
+    def sorted_terms(self) -> list[tuple[Monomial, int | Fraction]]:
+        """Return the terms, in an order that does not depend on how they came about."""
+        return sorted(self.terms.items(), key=lambda term: [(a.text, n) for a, n in term[0]])
+
+    def __repr__(self) -> str:
+        return f"Expr({self.text})"
+
+    def __hash__(self) -> int:
+        return hash(self.text)
+
+    def same(self, other: Expr) -> bool:
+        """Tell whether two expressions have the same terms."""
+        return self.terms == other.terms
+
+    @property
+    def number(self) -> float | None:
+        """The expression as a number, or None where it has symbols."""
+        if not self.terms:
+            return 0.0
+        if len(self.terms) == 1 and () in self.terms:
+            return float(self.terms[()])
+        return None
+
+    def atoms(self) -> set[Atom]:
+        """Return the atoms of all monomials, without those inside functions."""
+        return {a for monomial in self.terms for a, _ in monomial}
+
+    def symbols(self) -> set[Atom]:
+        """Return all symbols, also those inside functions."""
+        found: set[Atom] = set()
+        for atom in self.atoms():
+            found |= {atom} if atom.argument is None else atom.argument.symbols()
+        return found
+
+    # --- arithmetic -----------------------------------------------------------------------------------------
+
+    def __add__(self, other: Any) -> Expr:
+        other = Expr.of(other)
+        terms = dict(self.terms)
+        for monomial, c in other.terms.items():
+            total = terms.get(monomial, 0) + c
+            if total:
+                terms[monomial] = total
+            else:
+                del terms[monomial]
+        return Expr(terms)
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Expr:
+        return Expr({m: -c for m, c in self.terms.items()})
+
+    def __pos__(self) -> Expr:
+        return self
+
+    def __sub__(self, other: Any) -> Expr:
+        return self + -Expr.of(other)
+
+    def __rsub__(self, other: Any) -> Expr:
+        return -self + other
+
+    def __mul__(self, other: Any) -> Expr:
+        first, second = self, Expr.of(other)
+        if len(first.terms) * len(second.terms) > LARGEST_PRODUCT:
+            first, second = (_closed(e) for e in (first, second))
+        result: dict[Monomial, int | Fraction] = {}
+        rest: list[Expr] = []
+        for m, c in first.terms.items():
+            for n, d in second.terms.items():
+                monomial, more = _product(m, n)
+                if more is not None:
+                    rest.append(Expr({monomial: c * d}) * more)
+                    continue
+                total = result.get(monomial, 0) + c * d
+                if total:
+                    result[monomial] = total
+                else:
+                    del result[monomial]
+        value = Expr(result)
+        for more in rest:
+            value = value + more
+        return value
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Any) -> Expr:
+        return self * Expr.of(other).reciprocal()
+
+    def __rtruediv__(self, other: Any) -> Expr:
+        return self.reciprocal() * other
+
+    def __pow__(self, exponent: Any, modulo: Any = None) -> Expr:
+        if isinstance(exponent, Expr):
+            number = exponent.number
+            exponent = exponent if number is None else number
+        whole = isinstance(exponent, numbers.Real) and float(exponent).is_integer()
+        if not whole or modulo is not None:
+            if isinstance(exponent, numbers.Real) and float(exponent) in (0.5, -0.5):
+                root = function("sqrt", self)
+                return root if float(exponent) > 0 else root.reciprocal()
+            raise FormulaError(
+                f"a recorded number is raised to the power {exponent!r}; only whole numbers and ±0.5 can be "
+                "powers: write xp.exp(p * xp.log(x)) for others"
+            )
+        n = int(exponent)
+        base = self if n >= 0 else self.reciprocal()
+        result = Expr.of(1)
+        for bit in bin(abs(n))[2:]:
+            result = result * result
+            if bit == "1":
+                result = result * base
+        return result
+
+    def __rpow__(self, base: Any) -> NoReturn:
+        raise FormulaError(f"{base!r} is raised to a recorded power; write xp.exp(x * {base!r}'s logarithm)")
+
+    def reciprocal(self) -> Expr:
+        """Return one over the expression."""
+        if not self.terms:
+            raise FormulaError("a formula divides by zero")
+        if len(self.terms) == 1:
+            ((monomial, c),) = self.terms.items()
+            inverse = Fraction(1) / c
+            exact = int(inverse) if inverse.denominator == 1 else inverse
+            return Expr({(): exact}) * Expr({tuple((a, -n) for a, n in monomial): 1})
+        return Expr({((Atom("function", "sum", self), -1),): 1})
+
+    # --- what is refused ------------------------------------------------------------------------------------
+
+    def _refuse(self, what: str, remedy: str) -> NoReturn:
+        raise FormulaError(f"{what} of a recorded number; {remedy}")
+
+    def __float__(self) -> float:
+        self._refuse(
+            "float(), or a function of math or NumPy,", "use + - * /, whole powers and functions of xp"
+        )
+
+    def __int__(self) -> int:
+        self._refuse("int()", "a formula must be smooth")
+
+    def __index__(self) -> int:
+        self._refuse("an index or range", "only structural fields may count")
+
+    def __complex__(self) -> complex:
+        self._refuse("complex()", "formulas are real")
+
+    def __bool__(self) -> bool:
+        self._refuse("`if`, `and`, `or`, `not` or `in`", "a formula cannot branch on its numbers")
+
+    def _compare(self, other: Any) -> NoReturn:
+        self._refuse("a comparison, min or max", "an energy must be smooth and cannot branch on its numbers")
+
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = _compare
+
+    def __abs__(self) -> Expr:
+        self._refuse("abs()", "an energy must be smooth: xp.sqrt(x * x + eps * eps) rounds the corner")
+
+    def __mod__(self, other: Any) -> Expr:
+        self._refuse("%", "a formula must be smooth")
+
+    __rmod__ = __floordiv__ = __rfloordiv__ = __divmod__ = __rdivmod__ = __mod__
+
+    def __round__(self, digits: Any = None) -> Expr:
+        self._refuse("round()", "a formula must be smooth")
+
+    __floor__ = __ceil__ = __trunc__ = __round__
+
+    def __iter__(self) -> Any:
+        self._refuse("a loop over the entries", "it is a single number")
+
+    __array_priority__ = 1000.0
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        """Let NumPy's numbers be added and multiplied; refuse its functions and arrays."""
+        operators: dict[str, Callable] = {
+            "add": lambda a, b: a + b,
+            "subtract": lambda a, b: a - b,
+            "multiply": lambda a, b: a * b,
+            "divide": lambda a, b: a / b,
+            "true_divide": lambda a, b: a / b,
+            "negative": lambda a: -a,
+        }
+        name = ufunc.__name__
+        if method != "__call__" or name not in operators or options:
+            self._refuse(f"np.{name}", f"use xp.{name} where there is one")
+        operands = [Expr.of(i if isinstance(i, Expr) else _scalar(i)) for i in inputs]
+        return operators[name](*operands)
+
+
+def _scalar(value: Any) -> float:
+    if getattr(value, "ndim", 0):
+        raise FormulaError(
+            "a formula combines a recorded number with an array; it must return single numbers"
+        )
+    return float(value)
+
+
+def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
+    """Return the product of two monomials, and what squares of roots and of sums add to it as a factor."""
+    if not first:
+        return second, None
+    if not second:
+        return first, None
+    powers = dict(first)
+    for atom, n in second:
+        powers[atom] = powers.get(atom, 0) + n
+    more: Expr | None = None
+    for atom, n in list(powers.items()):
+        if atom.function == "sqrt" and abs(n) > 1:
+            assert atom.argument is not None
+            half = int(n / 2)
+            powers[atom] = n - 2 * half
+            factor = atom.argument**half
+            more = factor if more is None else more * factor
+    return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text)), more
+
+
+def _closed(expr: Expr) -> Expr:
+    """Return a long sum without velocities as one atom, so that products with it stay short."""
+    if len(expr.terms) <= 8 or any(s.kind == "velocity" for s in expr.symbols()):
+        return expr
+    return Expr({((Atom("function", "sum", expr), 1),): 1})
+
+
+FUNCTIONS = ("sin", "cos", "exp", "log", "sqrt", "atan", "tanh")
+
+
+def function(name: str, argument: Any) -> Expr:
+    """Return a function of an expression."""
+    argument = Expr.of(argument)
+    if name == "sqrt":
+        _check_root(argument)
+    number = argument.number
+    if number is not None:
+        try:
+            return Expr.of(getattr(math, name)(number))
+        except ValueError as error:
+            raise FormulaError(f"a formula takes xp.{name} of {number:g}") from error
+    if name in ("sin", "cos", "atan", "tanh") and _leads_negative(argument):
+        # One atom for an angle and its opposite.
+        opposite = function(name, -argument)
+        return opposite if name == "cos" else -opposite
+    return Expr({((Atom("function", name, argument), 1),): 1})
+
+
+def _check_root(argument: Expr) -> None:
+    """Refuse √x² of what moves: it is |x|, and not smooth."""
+    root = _root(argument)
+    moving = root is not None and any(s.kind != "parameter" for s in root.symbols())
+    if not moving and len(argument.terms) == 1:  # a square times something
+        squares = (a for a, n in next(iter(argument.terms)) if n % 4 == 2)
+        moving = any(s.kind != "parameter" for a in squares for s in Expr.of(a).symbols())
+    if moving:
+        raise FormulaError(
+            f"xp.sqrt of the square {argument.text:.60} is an absolute value; an energy must be smooth: "
+            "write the number itself where it is positive, or xp.sqrt(x * x + eps * eps) to round the corner"
+        )
+
+
+def _root(square: Expr) -> Expr | None:
+    """Return an expression whose square is given, or None where none is seen."""
+    parts: dict[Monomial, Fraction] = {}
+    for monomial, c in square.sorted_terms():
+        whole = Fraction(c)
+        roots = [math.isqrt(n) if n > 0 else 0 for n in (whole.numerator, whole.denominator)]
+        if all(n % 2 == 0 for _, n in monomial) and [r * r for r in roots] == [
+            whole.numerator,
+            whole.denominator,
+        ]:
+            parts[tuple((a, n // 2) for a, n in monomial)] = Fraction(*roots)
+    root = Expr({})
+    for monomial, c in parts.items():
+        term = Expr({monomial: c})
+        mixed = 2 * root * term
+        opposite = any(square.terms.get(m, 0) == -d for m, d in mixed.terms.items())
+        root = root - term if opposite else root + term
+    # An even power is kept apart from a square that comes by chance: only the whole decides.
+    odd = any(n % 2 for monomial in root.terms for _, n in monomial) or len(root.terms) > 1
+    return root if odd and (root * root).same(square) else None
+
+
+def _leads_negative(expr: Expr) -> bool:
+    return expr.sorted_terms()[0][1] < 0
+
+
+class Functions:
+    """The namespace ``xp`` of a formula that is recorded."""
+
+    pi = math.pi
+
+    def sin(self, x: Any) -> Any:
+        """Return the sine."""
+        return function("sin", x)
+
+    def cos(self, x: Any) -> Any:
+        """Return the cosine."""
+        return function("cos", x)
+
+    def tan(self, x: Any) -> Any:
+        """Return the tangent."""
+        return function("sin", x) / function("cos", x)
+
+    def exp(self, x: Any) -> Any:
+        """Return the exponential."""
+        return function("exp", x)
+
+    def log(self, x: Any) -> Any:
+        """Return the natural logarithm."""
+        return function("log", x)
+
+    def sqrt(self, x: Any) -> Any:
+        """Return the square root."""
+        return function("sqrt", x)
+
+    def atan(self, x: Any) -> Any:
+        """Return the inverse tangent."""
+        return function("atan", x)
+
+    def tanh(self, x: Any) -> Any:
+        """Return the hyperbolic tangent."""
+        return function("tanh", x)
+
+    arctan = atan
+
+    def __getattr__(self, name: str) -> Any:
+        raise FormulaError(
+            f"a formula uses xp.{name}; an energy has xp.sin, cos, tan, atan, tanh, sqrt, exp, log and pi"
+            + (
+                ": it must be smooth"
+                if name in ("where", "abs", "sign", "minimum", "maximum", "floor")
+                else ""
+            )
+        )
+
+
+# --- calculus -----------------------------------------------------------------------------------------------
+
+
+def _slope(atom: Atom) -> Expr:
+    """Return the derivative of a function by its argument."""
+    x = atom.argument
+    assert x is not None
+    if atom.function == "sin":
+        return function("cos", x)
+    if atom.function == "cos":
+        return -function("sin", x)
+    if atom.function == "exp":
+        return Expr.of(atom)
+    if atom.function == "log":
+        return x.reciprocal()
+    if atom.function == "sqrt":
+        return Fraction(1, 2) * Expr.of(atom).reciprocal()
+    if atom.function == "atan":
+        return (1 + x * x).reciprocal()
+    if atom.function == "tanh":
+        return 1 - Expr.of(atom) * Expr.of(atom)
+    return Expr.of(1)  # a sum
+
+
+def derivative(expr: Expr, symbol: Atom) -> Expr:
+    """Return the partial derivative of an expression by a symbol."""
+    chain: dict[Atom, Expr] = {}
+    total = Expr({})
+    for monomial, c in expr.terms.items():
+        for i, (atom, n) in enumerate(monomial):
+            if atom is symbol:
+                inner = Expr.of(1)
+            elif atom.argument is None:
+                continue
+            else:
+                if atom not in chain:
+                    slope = derivative(atom.argument, symbol)
+                    chain[atom] = _slope(atom) * slope if slope.terms else slope
+                inner = chain[atom]
+                if not inner.terms:
+                    continue
+            lower = ((atom, n - 1),) if n != 1 else ()
+            rest = Expr({monomial[:i] + lower + monomial[i + 1 :]: c * n})
+            total = total + rest * inner
+    return total
+
+
+def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
+    """Return the expression with symbols replaced."""
+    if not expr.symbols() & set(values):
+        return expr
+    total = Expr({})
+    for monomial, c in expr.terms.items():
+        product = Expr.of(c)
+        for atom, n in monomial:
+            if atom in values:
+                factor = values[atom]
+            elif atom.argument is None:
+                factor = Expr.of(atom)
+            else:
+                inner = substitute(atom.argument, values)
+                factor = inner if atom.function == "sum" else function(atom.function, inner)
+            product = product * factor**n
+        total = total + product
+    return total
+
+
+def collect(expr: Expr) -> Expr:
+    """Apply cos² + sin² = 1, and the rules for cosine and sine of a sum, wherever terms meet.
+
+    Two terms meet where they agree in all but a pair of factors and have coefficients of one size. So
+    energies that are written in Cartesian velocities become as short as those that are written in angles.
+    """
+    terms = dict(expr.terms)
+    while True:
+        found = _meeting(terms)
+        if found is None:
+            return Expr(terms)
+        for change in found:
+            for monomial, c in change.items():
+                total = terms.get(monomial, 0) + c
+                if total:
+                    terms[monomial] = total
+                else:
+                    terms.pop(monomial, None)
+
+
+def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:
+    """Return changes of terms that one rule asks for, or None where none applies."""
+    for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
+        c = terms[monomial]
+        waves = [(a, n) for a, n in monomial if a.function in ("sin", "cos")]
+        for a, n in waves:
+            if a.function == "sin" and n >= 2:
+                partner = _exchange(monomial, {a: -2, _twin(a): 2})
+                d = terms.get(partner)
+                if d is not None and (c > 0) == (d > 0):
+                    common: Any = c if abs(Fraction(c)) < abs(Fraction(d)) else d
+                    return [{monomial: -common}, {partner: -common}, {_exchange(monomial, {a: -2}): common}]
+        for x, (a, _) in enumerate(waves):
+            for b, _ in waves[x + 1 :]:
+                if a.argument is b.argument or a.argument.same(b.argument):  # type: ignore[union-attr, arg-type]
+                    continue
+                partner = _exchange(monomial, {a: -1, b: -1, _twin(a): 1, _twin(b): 1})
+                d = terms.get(partner)
+                if d is None or abs(c) != abs(d) or partner == monomial:
+                    continue
+                rest = Expr({_exchange(monomial, {a: -1, b: -1}): c})
+                return [{monomial: -c}, {partner: -d}, (rest * _of_sum(a, b, c == d)).terms]
+    return None
+
+
+def _of_sum(a: Atom, b: Atom, alike: bool) -> Expr:
+    """Return a b ± (twin of a)(twin of b) as one function of a sum of angles."""
+    x, y = a.argument, b.argument
+    assert x is not None and y is not None
+    if a.function == b.function == "cos":
+        return function("cos", x - y if alike else x + y)
+    if a.function == b.function == "sin":
+        return function("cos", x - y) if alike else -function("cos", x + y)
+    if a.function == "cos":  # sin y cos x ± sin x cos y
+        return function("sin", y + x if alike else y - x)
+    return function("sin", x + y if alike else x - y)
+
+
+def _twin(atom: Atom) -> Atom:
+    return Atom("function", "cos" if atom.function == "sin" else "sin", atom.argument)
+
+
+def _exchange(monomial: Monomial, change: Mapping[Atom, int]) -> Monomial:
+    """Return the monomial with powers of some atoms changed."""
+    powers = dict(monomial)
+    for atom, n in change.items():
+        powers[atom] = powers.get(atom, 0) + n
+    return tuple(sorted(((a, n) for a, n in powers.items() if n), key=lambda p: p[0].text))
+
+
+def evaluate(exprs: Iterable[Expr], values: Mapping[Atom, Any], xp: Any) -> list:
+    """Evaluate expressions on numbers of any kind.
+
+    Parameters
+    ----------
+    exprs : iterable of Expr
+        What to evaluate.
+    values : mapping from Atom to number
+        A number for every symbol: floats, arrays, mpmath's or SymPy's.
+    xp : namespace
+        Functions for these numbers, named as in NumPy or as here (``arctan`` or ``atan``).
+    """
+    known: dict[Atom, Any] = dict(values)
+
+    def of(expr: Expr) -> Any:
+        total: Any = None
+        for monomial, c in expr.sorted_terms():
+            product: Any = None
+            for atom, n in monomial:
+                if atom not in known:
+                    assert atom.argument is not None, f"no value for {atom.text}"
+                    inner = of(atom.argument)
+                    known[atom] = inner if atom.function == "sum" else _call(xp, atom.function, inner)
+                power = known[atom] if n > 0 else 1 / known[atom]
+                for _ in range(abs(n)):
+                    product = power if product is None else product * power
+            value = c if isinstance(c, int) else xp_fraction(c)
+            term = value if product is None else (product if c == 1 else product * value)
+            total = term if total is None else total + term
+        return 0 if total is None else total
+
+    def xp_fraction(c: Fraction) -> Any:
+        exact = getattr(xp, "mpf", None)
+        if exact is not None:
+            return exact(c.numerator) / c.denominator
+        rational = getattr(xp, "Rational", None)
+        return rational(c.numerator, c.denominator) if rational is not None else float(c)
+
+    return [of(expr) for expr in exprs]
+
+
+def _call(xp: Any, name: str, x: Any) -> Any:
+    if name == "atan" and not hasattr(xp, "atan"):
+        name = "arctan"
+    return getattr(xp, name)(x)

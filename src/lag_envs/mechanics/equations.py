@@ -1,0 +1,160 @@
+"""Lagrange's equations of a recorded scene.
+
+With T = ½ Σ G_bc v_b v_c + Σ b_c v_c + T₀, over the free and the prescribed coordinates together, p_i =
+∂T/∂v_i and Rayleigh's function D, Lagrange's equation of coordinate i is::
+
+    Σ_j G_ij a_j + Σ_c ∂p_i/∂q_c v_c − ∂T/∂q_i + ∂V/∂q_i + ∂D/∂v_i − Q_i = F_i
+
+For a free coordinate F_i = 0, and the equation gives the accelerations; for a prescribed one F_i is the force
+that moves or holds it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative
+
+
+def place(name: str) -> Atom:
+    """Return the symbol of a coordinate."""
+    return Atom("place", name)
+
+
+def velocity(name: str) -> Atom:
+    """Return the symbol of a coordinate's rate."""
+    return Atom("velocity", name)
+
+
+def acceleration(name: str) -> Atom:
+    """Return the symbol of a coordinate's second derivative."""
+    return Atom("acceleration", name)
+
+
+@dataclasses.dataclass(frozen=True)
+class Energies:
+    """What a scene's formulas returned when they were run on recorded numbers.
+
+    ``applied`` holds the generalised forces by coordinate.
+    """
+
+    kinetic: Expr
+    potential: Expr
+    dissipation: Expr
+    applied: Mapping[str, Expr]
+
+
+@dataclasses.dataclass(frozen=True)
+class Equations:
+    """The equations of motion ``Σ_j mass[i, j] a_j = force[i]``, and what goes with them.
+
+    Attributes
+    ----------
+    coordinates : tuple of str
+        The free coordinates, then the prescribed ones.
+    free : int
+        Number of free coordinates.
+    mass : dict
+        Entries G_ij with i <= j, over all coordinates; those that vanish are left out.
+    linear : tuple of Expr
+        b_i, the part of T that is linear in the velocities.
+    force : tuple of Expr
+        For each coordinate, everything of its equation but Σ_j G_ij a_j, on the right-hand side.
+    energies : Energies
+        The formulas.
+    """
+
+    coordinates: tuple[str, ...]
+    free: int
+    mass: Mapping[tuple[int, int], Expr]
+    linear: tuple[Expr, ...]
+    force: tuple[Expr, ...]
+    energies: Energies
+
+    def entry(self, i: int, j: int) -> Expr:
+        """Return G_ij."""
+        return self.mass.get((min(i, j), max(i, j)), Expr({}))
+
+    @property
+    def potential_of_motion(self) -> Expr:
+        """V - T₀, the potential of Jacobi's integral."""
+        rest = Expr({m: c for m, c in self.energies.kinetic.terms.items() if _degree(m) == 0})
+        return self.energies.potential - rest
+
+
+def _degree(monomial: Sequence[tuple[Atom, int]]) -> int:
+    return sum(n for atom, n in monomial if atom.kind == "velocity")
+
+
+def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -> Equations:
+    """Derive Lagrange's equations.
+
+    Parameters
+    ----------
+    free, prescribed : sequence of str
+        Names of the coordinates.
+    energies : Energies
+        The scene's formulas in the symbols `place` and `velocity` of these coordinates.
+
+    Raises
+    ------
+    FormulaError
+        Where the kinetic energy is no polynomial of degree two in the velocities, or lacks a coordinate.
+    """
+    names = (*free, *prescribed)
+    kinetic = collect(energies.kinetic)
+    _check_velocities(kinetic)
+    _check_no_velocity("potential", energies.potential)
+    momenta = [derivative(kinetic, velocity(name)) for name in names]
+    mass: dict[tuple[int, int], Expr] = {}
+    for i in range(len(names)):
+        for j in range(i, len(names)):
+            entry = collect(derivative(momenta[i], velocity(names[j])))
+            if entry.terms:
+                mass[i, j] = entry
+    for i, name in enumerate(free):
+        if (i, i) not in mass:
+            raise FormulaError(
+                f"kinetic does not contain the rate of {name!r} squared, so nothing determines its "
+                f"acceleration; give it a mass, or prescribe {name!r}"
+            )
+    linear = tuple(Expr({m: c for m, c in momentum.terms.items() if _degree(m) == 0}) for momentum in momenta)
+    force = []
+    for name, momentum in zip(names, momenta, strict=True):
+        q, v = place(name), velocity(name)
+        convective = Expr({})
+        for other in names:
+            convective = convective + derivative(momentum, place(other)) * velocity(other)
+        total = derivative(kinetic, q) - convective - derivative(energies.potential, q)
+        total = total - derivative(energies.dissipation, v) + energies.applied.get(name, Expr({}))
+        force.append(collect(total))
+    collected = dataclasses.replace(energies, kinetic=kinetic)
+    return Equations(tuple(names), len(free), mass, linear, tuple(force), collected)
+
+
+def _check_velocities(kinetic: Expr) -> None:
+    for monomial in kinetic.terms:
+        for atom, n in monomial:
+            inside = atom.argument is not None and any(s.kind == "velocity" for s in atom.argument.symbols())
+            if inside or (atom.kind == "velocity" and n < 0):
+                what = atom.text if inside else f"1/{atom.name}"
+                raise FormulaError(
+                    f"kinetic has a velocity in a function or denominator: {what:.60}; it must be a "
+                    "polynomial of degree two in the velocities"
+                )
+        if _degree(monomial) > 2:
+            text = Expr({monomial: 1}).text
+            raise FormulaError(
+                f"kinetic is of degree {_degree(monomial)} in the velocities, in {text:.60}; it must be of "
+                "degree two at most"
+            )
+
+
+def _check_no_velocity(formula: str, expr: Expr) -> None:
+    for symbol in sorted(expr.symbols(), key=lambda s: s.text):
+        if symbol.kind == "velocity":
+            raise FormulaError(
+                f"{formula} contains the velocity of {symbol.name!r}; only kinetic, dissipation and "
+                "applied may"
+            )

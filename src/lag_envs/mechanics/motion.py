@@ -1,0 +1,246 @@
+"""The motion of a scene as expressions: what a stepper steps, and what forces and powers follow from.
+
+A resting coordinate, a held place and a held rate are put in before anything is derived or after it,
+whichever leaves less: what rests leaves no code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+from lag_envs.mechanics import recording
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, collect, derivative, substitute
+from lag_envs.mechanics.equations import Energies, Equations, derive, place, velocity
+from lag_envs.mechanics.layout import Layout, Prescribed
+from lag_envs.mechanics.recording import Record, control, parameter
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanics:
+    """The equations of motion of a scene, for its mode and its structural fields.
+
+    The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. Symbols in these are places and
+    velocities of the free coordinates, places and velocities of prescribed ones whose acceleration is
+    controlled, places of those whose rate is, controls, and parameters. A held acceleration,
+    rate or place stands as the control that sets it.
+
+    Attributes
+    ----------
+    layout : Layout
+        Names of coordinates, controls and state.
+    record : Record
+        The formulas, with parameters that are 0 put in.
+    mass : dict
+        Entries of the mass matrix of the free coordinates, (i, j) with i <= j; what vanishes is left out.
+    force : tuple of Expr
+        Right-hand sides, one for each free coordinate.
+    coupling : dict
+        For a prescribed coordinate m whose rate is held, entries G_im of the mass matrix by (i, name of m):
+        the state carries w = v + M⁻¹ Σ_m G_im ṡ_m.
+    zeros : tuple of str
+        Parameters that are 0 and stand in a denominator or a function: they were put in before anything was
+        derived. Others that are 0 leave out their terms when code is made.
+    """
+
+    layout: Layout
+    record: Record
+    mass: Mapping[tuple[int, int], Expr]
+    force: tuple[Expr, ...]
+    coupling: Mapping[tuple[int, str], Expr]
+    zeros: tuple[str, ...] = ()
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Free coordinates, in order."""
+        return self.layout.free
+
+    @property
+    def prescribed(self) -> tuple[Prescribed, ...]:
+        """Prescribed coordinates with level and control."""
+        return self.layout.prescribed
+
+    def entry(self, i: int, j: int) -> Expr:
+        """Return an entry of the mass matrix of the free coordinates."""
+        return self.mass.get((min(i, j), max(i, j)), Expr({}))
+
+    def entries(self) -> list[Expr]:
+        """Return the free coordinates' mass matrix, row by row."""
+        n = range(len(self.free))
+        return [self.entry(i, j) for i in n for j in n]
+
+    @cached_property
+    def text(self) -> str:
+        """All that decides how a step goes, as text; scenes with the same text may share code."""
+        mass = [f"{i} {j} {self.mass[i, j].text}" for i, j in sorted(self.mass)]
+        coupling = [f"{i} {m} {self.coupling[i, m].text}" for i, m in sorted(self.coupling)]
+        layout = (self.layout.free, self.layout.prescribed, self.layout.controls, self.layout.state)
+        return "\n".join([repr(layout), *mass, *(f.text for f in self.force), *coupling])
+
+    @cached_property
+    def key(self) -> str:
+        """A hash of `text`."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def _rate(self, expr: Expr) -> Expr:
+        """Return the time derivative of a function of the places."""
+        total = Expr({})
+        for name in self.layout.names:
+            total = total + derivative(expr, place(name)) * velocity(name)
+        return total
+
+    @cached_property
+    def mass_rate(self) -> tuple[Expr, ...]:
+        """The time derivatives of `entries`."""
+        return tuple(self._rate(entry) for entry in self.entries())
+
+    @cached_property
+    def coupling_rate(self) -> dict[tuple[int, str], Expr]:
+        """The time derivatives of `coupling`."""
+        return {key: self._rate(entry) for key, entry in self.coupling.items()}
+
+    @cached_property
+    def drag(self) -> dict[str, Expr]:
+        """∂D/∂v of each coordinate."""
+        held, loss = _held(self.layout, self.record), self.record.energies.dissipation
+        return {name: substitute(derivative(loss, velocity(name)), held) for name in self.layout.names}
+
+    @cached_property
+    def gyroscopic(self) -> tuple[Expr, Expr] | None:
+        """T₁ and T₀, the parts of T of first and of no degree in the velocities, or None."""
+        parts: list[dict] = [{}, {}]
+        for monomial, c in collect(self.record.energies.kinetic).terms.items():
+            degree = sum(n for atom, n in monomial if atom.kind == "velocity")
+            if degree < 2:
+                parts[1 - degree][monomial] = c
+        held = _held(self.layout, self.record)
+        first, rest = (substitute(Expr(terms), held) for terms in parts)
+        return (first, rest) if any(parts) else None
+
+    def weight(self, name: str) -> list[Expr]:
+        """Return the terms of ∂V/∂q of a coordinate with sines and cosines left out, which are 1 at most."""
+        slope = substitute(
+            derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record)
+        )
+        bare = []
+        for monomial, c in slope.sorted_terms():
+            bare.append(Expr({tuple((a, n) for a, n in monomial if a.function not in ("sin", "cos")): c}))
+        return bare
+
+    @cached_property
+    def full(self) -> Equations:
+        """Lagrange's equations of all coordinates, with what rests put in after they were derived.
+
+        The accelerations of the prescribed coordinates are not put in: see `Equations`. The force that moves
+        or holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
+        """
+        moving = [p.name for p in self.layout.prescribed]
+        found = derive(self.layout.free, moving, self.record.energies)
+        held = _held(self.layout, self.record)
+        mass = {ij: substitute(entry, held) for ij, entry in found.mass.items()}
+        e = found.energies
+        energies = Energies(
+            substitute(e.kinetic, held),
+            substitute(e.potential, held),
+            substitute(e.dissipation, held),
+            {name: substitute(value, held) for name, value in e.applied.items()},
+        )
+        return Equations(
+            found.coordinates,
+            found.free,
+            {ij: entry for ij, entry in mass.items() if entry.terms},
+            tuple(substitute(b, held) for b in found.linear),
+            tuple(substitute(f, held) for f in found.force),
+            energies,
+        )
+
+
+def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
+    """Return what is known of places and velocities of the prescribed coordinates while controls are held."""
+    values: dict[Atom, Expr] = {}
+    for name, level, by in layout.prescribed:
+        if level == "rest":
+            values[place(name)] = record.rests.get(name, Expr.of(0))
+        if level == "place":
+            values[place(name)] = Expr.of(control(by or ""))
+        if level in ("rest", "place"):
+            values[velocity(name)] = Expr.of(0)
+        if level == "rate":
+            values[velocity(name)] = Expr.of(control(by or ""))
+    return values
+
+
+def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
+    """Derive the equations of motion from what a scene's formulas gave.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene; its class's name is used in errors, and which of its parameters are 0.
+    layout : Layout
+        Its names.
+    found : Record
+        Its formulas.
+
+    Raises
+    ------
+    FormulaError
+        Where they are not what an energy may be, or need a coordinate that the state leaves out.
+    """
+    of = type(scene).__name__
+    zero = {
+        parameter(name): Expr.of(0)
+        for name in scene._numbers()
+        if getattr(scene, name) == 0.0 and any(_is_hard(e, name) for e in found.exprs())
+    }
+    if zero:
+        names = ", ".join(f"{atom.name}=0" for atom in zero)
+        found = recording.restrict(found, zero, scene, f"with {names}")
+    held = _held(layout, found)
+    resting = {p.name for p in layout.at("rest", "place")}
+    known = {atom: value for atom, value in held.items() if atom.name in resting}
+    at_rest = recording.restrict(found, known, scene, "with its prescribed coordinates at rest")
+    moving = [p.name for p in layout.at("acceleration", "rate")]
+    try:
+        equations = derive(layout.free, moving, at_rest.energies)
+    except FormulaError as error:
+        raise FormulaError(f"{of}.{error}") from error
+    n = len(layout.free)
+    force = list(equations.force[:n])
+    coupling: dict[tuple[int, str], Expr] = {}
+    for m, name in enumerate(moving, start=n):
+        by = next(p for p in layout.prescribed if p.name == name)
+        for i in range(n):
+            entry = equations.entry(i, m)
+            if by.level == "acceleration":
+                force[i] = force[i] - entry * Expr.of(control(by.control or ""))
+            elif entry.terms:
+                coupling[i, name] = entry
+    mass = {(i, j): entry for (i, j), entry in equations.mass.items() if j < n}
+    force = [substitute(f, held) for f in force]
+    _check_left_out(of, layout, {**{k: e for k, e in mass.items()}, **coupling}, force)
+    return Mechanics(layout, found, mass, tuple(force), coupling, tuple(sorted(atom.name for atom in zero)))
+
+
+def _is_hard(expr: Expr, name: str) -> bool:
+    """Tell whether a parameter stands in a denominator or in a function."""
+    return any(
+        n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
+        for monomial in expr.terms
+        for atom, n in monomial
+    )
+
+
+def _check_left_out(of: str, layout: Layout, mass: Mapping, force: list[Expr]) -> None:
+    omitted = set(layout.left_out)
+    for expr in (*mass.values(), *force):
+        for symbol in sorted(expr.symbols(), key=lambda s: s.text):
+            name = {"place": symbol.name, "velocity": f"{symbol.name}_dot"}.get(symbol.kind)
+            if name in omitted:
+                raise FormulaError(
+                    f"{of}.left_out: the motion of the free coordinates depends on {name!r}; "
+                    "keep it in the state"
+                )

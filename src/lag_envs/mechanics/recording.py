@@ -1,0 +1,315 @@
+"""Run a scene's formulas on recorded numbers, and refuse at the door what these cannot follow.
+
+A formula runs on a twin of the scene: an object of the same class whose parameters are symbols, so that the
+methods and properties that a formula calls see symbols too. Structural fields stay what they are, and may
+branch and count.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import inspect
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NoReturn
+
+from lag_envs.mechanics.algebra import Atom, Expr, FormulaError, Functions, substitute
+from lag_envs.mechanics.equations import Energies, place, velocity
+from lag_envs.mechanics.layout import Layout
+
+#: The formulas of a scene and their arguments after ``self``.
+ARGUMENTS: Mapping[str, tuple[str, ...]] = {
+    "kinetic": ("q", "v", "xp"),
+    "potential": ("q", "xp"),
+    "dissipation": ("q", "v", "u", "xp"),
+    "applied": ("q", "v", "u", "xp"),
+    "poses": ("q", "xp"),
+}
+
+#: Entry of a twin's ``__dict__`` by which it is known.
+TWIN = "_twin"
+
+
+def parameter(name: str) -> Atom:
+    """Return the symbol of a parameter."""
+    return Atom("parameter", name)
+
+
+def control(name: str) -> Atom:
+    """Return the symbol of a control."""
+    return Atom("control", name)
+
+
+class Values:
+    """Numbers by name, by index and in order: ``q.theta``, ``q[0]``, ``x, theta = q``."""
+
+    __slots__ = ("_hidden", "_items", "_what")
+
+    def __init__(self, what: str, items: Mapping[str, Any], hidden: Mapping[str, Any] | None = None) -> None:
+        """Hold numbers.
+
+        Parameters
+        ----------
+        what : str
+            What they are, for errors.
+        items : mapping
+            The numbers, in order.
+        hidden : mapping, optional
+            More numbers that are found by name only.
+        """
+        object.__setattr__(self, "_what", what)
+        object.__setattr__(self, "_items", dict(items))
+        object.__setattr__(self, "_hidden", dict(hidden or {}))
+
+    def __getattr__(self, name: str) -> Any:
+        for found in (self._items, self._hidden):
+            if name in found:
+                return found[name]
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise FormulaError(
+            f"there is no {self._what} {name!r}, only {', '.join(self._items) or 'none at all'}"
+        )
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, str):
+            return getattr(self, index)
+        values = tuple(self._items.values())
+        try:
+            return values[index]
+        except IndexError:
+            raise FormulaError(
+                f"there is no {self._what} number {index}, only {len(values)} of them"
+            ) from None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self._items.values())
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __setattr__(self, name: str, value: Any) -> NoReturn:
+        raise FormulaError(f"a formula sets the {self._what} {name!r}; it may only read")
+
+    def __setitem__(self, index: Any, value: Any) -> NoReturn:
+        raise FormulaError(f"a formula sets the {self._what} {index!r}; it may only read")
+
+    def __contains__(self, item: Any) -> NoReturn:
+        raise FormulaError(f"a formula asks what is `in` the {self._what}s; it cannot branch on numbers")
+
+    def __repr__(self) -> str:
+        return f"<{self._what}s {', '.join(self._items)}>"
+
+
+def twin(scene: Any, numbers: Mapping[str, Any]) -> Any:
+    """Return an object like the scene whose parameters are other numbers, or symbols.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    numbers : mapping
+        A number for each parameter that is not None.
+    """
+    other, given = object.__new__(type(scene)), scene._numbers()
+    for field in dataclasses.fields(scene):
+        value = numbers[field.name] if field.name in given else getattr(scene, field.name)
+        object.__setattr__(other, field.name, value)
+    vars(other)[TWIN] = True
+    return other
+
+
+def symbolic_twin(scene: Any) -> Any:
+    """Return an object like the scene whose parameters are recorded numbers."""
+    return twin(scene, {name: Expr.of(parameter(name)) for name in scene._numbers()})
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What a scene's formulas gave for symbols.
+
+    Attributes
+    ----------
+    energies : Energies
+        Kinetic and potential energy, dissipation and applied forces.
+    rests : mapping from str to Expr
+        Where each prescribed coordinate rests.
+    poses : mapping from str to (Expr, Expr, Expr)
+        Place [m] and angle [rad] of each body.
+    """
+
+    energies: Energies
+    rests: Mapping[str, Expr]
+    poses: Mapping[str, tuple[Expr, Expr, Expr]]
+
+    def exprs(self) -> list[Expr]:
+        """Return all expressions, in a fixed order."""
+        e = self.energies
+        parts = [e.kinetic, e.potential, e.dissipation, *(e.applied[name] for name in sorted(e.applied))]
+        parts += [self.rests[name] for name in sorted(self.rests)]
+        return parts + [x for name in sorted(self.poses) for x in self.poses[name]]
+
+
+@contextlib.contextmanager
+def formula(scene: Any, name: str) -> Iterator[None]:
+    """Let errors within name the class and the formula."""
+    where = f"{type(scene).__name__}.{name}"
+    try:
+        yield
+    except FormulaError as error:
+        raise FormulaError(f"{where}: {error}") from error
+    except dataclasses.FrozenInstanceError as error:
+        raise FormulaError(f"{where} assigns to self: {error}; use a local name") from error
+    except Exception as error:
+        raise FormulaError(
+            f"{where} fails on recorded numbers with {type(error).__name__}: {error}; "
+            "use + - * /, whole powers and functions of xp"
+        ) from error
+
+
+def check_signature(scene: Any, name: str) -> None:
+    """Raise a FormulaError where a formula does not take the arguments that it is called with."""
+    of = type(scene).__name__
+    method, arguments = getattr(scene, name, None), ARGUMENTS[name]
+    wanted = f"{name}(self, {', '.join(arguments)})"
+    if not callable(method):
+        raise FormulaError(f"{of}.{name} must be a method, {wanted}, got {method!r:.60}")
+    kinds = inspect.Parameter
+    taken = list(inspect.signature(method).parameters.values())
+    if any(p.kind is kinds.VAR_POSITIONAL for p in taken):
+        return
+    plain = [p for p in taken if p.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)]
+    if len(plain) != len(arguments) or len(plain) != len(taken):
+        time = (
+            "; time is no argument, a prescribed coordinate moves"
+            if {"t", "time"} & {p.name for p in taken}
+            else ""
+        )
+        raise FormulaError(
+            f"{of}.{name} must be {wanted}, got ({', '.join(['self', *(p.name for p in taken)])}){time}"
+        )
+
+
+def single(value: Any, what: str = "") -> Expr:
+    """Return what a formula gave as an expression, or raise a FormulaError."""
+    if value is None:
+        raise FormulaError(f"{what}returns None; end it with a return of a number")
+    if getattr(value, "ndim", 0) or isinstance(value, tuple | list | set | dict):
+        raise FormulaError(f"{what}returns {type(value).__name__} where one number is wanted")
+    if isinstance(value, complex):
+        raise FormulaError(f"{what}returns the complex number {value}; formulas are real")
+    try:
+        return Expr.of(value)
+    except FormulaError:
+        raise FormulaError(f"{what}returns {value!r:.60}, which is no real number") from None
+
+
+def record(scene: Any, layout: Layout) -> Record:
+    """Run all formulas of a scene on symbols.
+
+    Raises
+    ------
+    FormulaError
+        Naming class and formula, where one does what a recorded number cannot follow.
+    """
+    names = layout.names
+    copy = symbolic_twin(scene)
+    q = Values("coordinate", {name: Expr.of(place(name)) for name in names})
+    v = Values("velocity of a coordinate", {name: Expr.of(velocity(name)) for name in names})
+    u = Values(
+        "control",
+        {name: Expr.of(control(name)) for name in layout.controls},
+        {name: Expr.of(0) for name in layout.absent},
+    )
+    xp = Functions()
+    given = {"q": q, "v": v, "u": u, "xp": xp}
+
+    def run(name: str) -> Any:
+        check_signature(copy, name)
+        return getattr(copy, name)(*(given[argument] for argument in ARGUMENTS[name]))
+
+    parts = {}
+    for name in ("kinetic", "potential", "dissipation"):
+        with formula(scene, name):
+            parts[name] = single(run(name))
+    with formula(scene, "applied"):
+        applied = _by_name(run("applied"), names, "coordinate")
+    with formula(scene, "rests"):
+        rests = _by_name(copy.rests(), names[len(layout.free) :], "prescribed coordinate")
+        for name, value in rests.items():
+            if any(s.kind != "parameter" for s in value.symbols()):
+                raise FormulaError(f"the place of {name!r} depends on more than parameters")
+    with formula(scene, "poses"):
+        poses = _poses(run("poses"))
+    found = Record(Energies(applied=applied, **parts), rests, poses)
+    _check_controls(scene, layout, found)
+    return found
+
+
+def check_again(scene: Any, layout: Layout, found: Record) -> None:
+    """Raise a FormulaError where a formula gives something else when it is run again."""
+    again = record(scene, layout).exprs()
+    if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
+        raise FormulaError(
+            f"{type(scene).__name__}: a formula gives something else when it is run again; it may depend on "
+            "place, velocity, controls and fields only, not on time or chance"
+        )
+
+
+def _by_name(values: Any, names: Sequence[str], what: str) -> dict[str, Expr]:
+    if not isinstance(values, Mapping):
+        raise FormulaError(
+            f"it must return numbers by {what}, as in {{{names[0]!r}: ...}}, got {values!r:.60}"
+            if names
+            else f"it must return {{}}, since there is no {what}, got {values!r:.60}"
+        )
+    for name in values:
+        if name not in names:
+            raise FormulaError(f"there is no {what} {name!r}, only {', '.join(names) or 'none at all'}")
+    return {name: single(values[name], f"for {name!r} it ") for name in names if name in values}
+
+
+def _poses(values: Any) -> dict[str, tuple[Expr, Expr, Expr]]:
+    if not isinstance(values, Mapping):
+        raise FormulaError(f"it must return {{body: (x, y, angle)}}, got {values!r:.60}")
+    poses = {}
+    for body, pose in values.items():
+        if not isinstance(pose, Sequence) or len(pose) != 3:
+            raise FormulaError(f"the pose of {body!r} must be (x, y, angle), got {pose!r:.60}")
+        x, y, angle = (single(value, f"for {body!r} it ") for value in pose)
+        poses[body] = x, y, angle
+    return poses
+
+
+def _check_controls(scene: Any, layout: Layout, found: Record) -> None:
+    used = {s.name for e in found.exprs() for s in e.symbols() if s.kind == "control"}
+    moving = {p.control for p in layout.prescribed}
+    for name in layout.controls:
+        if name not in used and name not in moving:
+            raise FormulaError(
+                f"{type(scene).__name__}: the control {name!r} reaches nothing; use u.{name} in applied or "
+                "dissipation, or name it s_ddot, s_dot or s after a prescribed coordinate s"
+            )
+
+
+def restrict(found: Record, values: Mapping[Atom, Expr], scene: Any, why: str) -> Record:
+    """Return a record with symbols replaced; errors name the formula and why they were replaced."""
+
+    def of(name: str, expr: Expr) -> Expr:
+        try:
+            return substitute(expr, values)
+        except FormulaError as error:
+            raise FormulaError(f"{type(scene).__name__}.{name}, {why}: {error}") from error
+
+    e = found.energies
+    energies = Energies(
+        kinetic=of("kinetic", e.kinetic),
+        potential=of("potential", e.potential),
+        dissipation=of("dissipation", e.dissipation),
+        applied={name: of("applied", value) for name, value in e.applied.items()},
+    )
+    rests = {name: of("rests", value) for name, value in found.rests.items()}
+    poses = {}
+    for body, (x, y, angle) in found.poses.items():
+        poses[body] = of("poses", x), of("poses", y), of("poses", angle)
+    return Record(energies, rests, poses)

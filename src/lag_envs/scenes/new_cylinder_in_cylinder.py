@@ -1,0 +1,184 @@
+r"""A cylinder that rolls without slipping inside a hollow cylinder, the shell.
+
+::
+
+        . - - - .        theta   place of the small cylinder's axis, 0 at the bottom,
+      /     |     \              positive counter-clockwise
+     |      |_a    |     psi     angle of the shell, positive counter-clockwise
+      \      \    /      a = R - r, from axis to axis
+        ' - -(o)'        gap     distance of the small cylinder from the shell
+                         slip    way of its rim along the shell
+
+Rolling, the cylinder turns at Omega = (R psi' - a theta' + slip')/r::
+
+    T = m ((a - gap)² theta'² + gap'²)/2 + I Omega²/2,   V = -m g (a - gap) cos(theta)
+
+`gap` and `slip` rest at 0; they are there so that the contact's forces follow. A round shell has no
+orientation: a static tilt does nothing, its acceleration drives. Drag acts at the small cylinder's axis, as
+of a medium that turns with the shell. The shell's own inertia is not part of the scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.shapes import (
+    Arrow,
+    Circle,
+    Line,
+    Moment,
+    Point,
+    Polygon,
+    Shape,
+    Window,
+    arc,
+    polar,
+    roller,
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CylinderInCylinder(Scene):
+    """A cylinder rolling inside a hollow one; the control is the drag or the shell's angular acceleration.
+
+    Parameters
+    ----------
+    mass : float [kg]
+        Mass m of the small cylinder.
+    shell_radius : float [m]
+        Inner radius R of the shell.
+    radius : float [m]
+        Radius r of the small cylinder, below `shell_radius`.
+    inertia : float [kg m²], optional
+        Moment of inertia I of the small cylinder about its axis; by default solid, mr²/2.
+    damping : float [N m s]
+        Coefficient c of the drag -c(θ' - ψ'). It adds to a drag that is the control.
+    gravity : float [m/s²]
+        Field g, downward.
+    control : {"damping", "tilt"}
+        What the control is: a drag coefficient [N m s] in a fixed shell, or the shell's acceleration ψ''
+        [rad/s²].
+
+    Notes
+    -----
+    State (theta, theta_dot); for the control "tilt" (theta, theta_dot, psi_dot). The zero of the potential
+    energy lies at the height of the shell's axis.
+
+    Examples
+    --------
+    >>> shell = CylinderInCylinder()
+    >>> shell.forces([0.0, 0.0, 0.0])["normal"].round(2).item()
+    9.81
+    """
+
+    mass: float = parameter(1.0, "kg", above=0.0, usable=(1e-6, 1e6))
+    shell_radius: float = parameter(0.5, "m", above=0.0, usable=(1e-5, 1e5))
+    radius: float = parameter(0.1, "m", above=0.0, usable=(1e-5, 1e5))
+    inertia: float = parameter(
+        lambda shell: 0.5 * shell.mass * shell.radius * shell.radius, "kg m²", least=0.0, usable=(0.0, 1e18)
+    )
+    damping: float = parameter(0.0, "N m s", least=0.0, usable=(0.0, 1e9))
+    gravity: float = parameter(9.81, "m/s²", least=0.0, usable=(0.0, 1e4))
+    control: str = "tilt"
+
+    coordinates = {"theta": "rad"}
+    prescribed = {"psi": "rad", "gap": "m", "slip": "m"}
+    modes = {"damping": {"drag": "N m s"}, "tilt": {"psi_ddot": "rad/s²"}}
+    ratios = {"needed_friction": ("friction", "normal")}
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """The small cylinder's, then the shell's rate."""
+        return ("theta", "theta_dot", "psi_dot") if self.control == "tilt" else ()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The shell's angle, on which nothing depends."""
+        return ("psi",) if self.control == "tilt" else ()
+
+    @property
+    def reactions(self) -> dict[str, str]:
+        """The contact's forces, and the torque on a shell that turns."""
+        contact = {"normal": "gap", "friction": "slip"}
+        return contact | {"drive_torque": "psi"} if self.control == "tilt" else contact
+
+    def check(self) -> None:
+        """Check the radii."""
+        if not self.radius < self.shell_radius:
+            raise ValueError(
+                f"radius must be below shell_radius={self.shell_radius:g} m, got {self.radius:g} m"
+            )
+
+    @property
+    def arm(self) -> Any:
+        """Distance a = R - r from axis to axis [m]."""
+        return self.shell_radius - self.radius
+
+    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
+        """Return T [J]."""
+        swing = (self.arm - q.gap) * v.theta
+        spin = (self.shell_radius * v.psi - self.arm * v.theta + v.slip) / self.radius
+        return 0.5 * self.mass * (swing * swing + v.gap * v.gap) + 0.5 * self.inertia * spin * spin
+
+    def potential(self, q: Any, xp: Any) -> Any:
+        """Return V [J]."""
+        return -self.mass * self.gravity * (self.arm - q.gap) * xp.cos(q.theta)
+
+    def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        """Return half of the drag's loss [W]."""
+        return 0.5 * (self.damping + u.drag) * (v.theta - v.psi) * (v.theta - v.psi)
+
+    def poses(self, q: Any, xp: Any) -> Any:
+        """Return places and angles of shell and cylinder."""
+        spin = (self.shell_radius * q.psi - self.arm * q.theta) / self.radius
+        return {
+            "shell": (0.0, 0.0, q.psi),
+            "cylinder": (self.arm * xp.sin(q.theta), -self.arm * xp.cos(q.theta), spin),
+        }
+
+    def bodies(self) -> dict[str, list[Shape]]:
+        """Return the shell with its joints, and the cylinder."""
+        big, rim, up, part = self.shell_radius, 1.1 * self.shell_radius, 0.5 * math.pi, math.pi / 12
+        origin, joints = (0.0, 0.0), [up + part * i for i in range(3, 22, 2)]
+        ratio = self.inertia / (self.mass * self.radius * self.radius)
+        mark = [*arc(origin, rim, up - part, up + part), *arc(origin, big, up + part, up - part)]
+        return {
+            "shell": [
+                Circle(origin, rim, "ground"),
+                *(Line([polar(origin, big, a), polar(origin, rim, a)], "ground") for a in joints),
+                Polygon(mark, "frame"),
+                Circle(origin, big, "hole"),
+            ],
+            "cylinder": roller(origin, self.radius, up, ratio),
+        }
+
+    def place(self, theta: float, distance: float | None = None) -> Point:
+        """Return the point at an angle, and at a distance [m] from the shell's axis: by default R - r."""
+        return polar((0.0, 0.0), self.arm if distance is None else distance, theta - 0.5 * math.pi)
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return shell and cylinder, the angle, and an arrow for drag or acceleration."""
+        theta, big, origin, up = now.state[0], self.shell_radius, (0.0, 0.0), 0.5 * math.pi
+        centre, moved = self.place(theta), super().shapes(now)
+        n = len(self.bodies()["shell"])
+        if self.control == "tilt":
+            action = arc(origin, 1.19 * big, up, up + now.share * math.pi / 3)
+        else:
+            back = -math.copysign(0.6 * big * now.share, now.state[1])
+            action = [centre, polar(centre, back, theta)]
+        return [
+            *moved[:n],
+            Line([origin, (0.0, -big)], "guide"),
+            Line([origin, centre], "guide"),
+            Line(arc(origin, 0.4 * self.arm, -up, math.remainder(theta, 2.0 * math.pi) - up), "guide"),
+            *moved[n:],
+            Arrow(action),
+        ]
+
+    def window(self, now: Moment) -> Window:
+        """Return a window on the whole shell."""
+        size = 1.28 * self.shell_radius
+        return Window(-size, -size, size, size)

@@ -1,0 +1,202 @@
+"""Whole control steps from attempts: substeps as the certificate asks for, one lane or a block of lanes.
+
+An attempt (`lag_envs.stepping.machine`) advances by as much of the wished-for step as it could certify. Here
+it is repeated until the control step is over. In a block the lanes that are not done are gathered and go on
+together. Each lane goes through the same attempts as it would alone, so its bits do not depend on its
+neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from lag_envs.stepping.compiling import compile_python
+from lag_envs.stepping.lowering import SeriesRecord
+from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt, compile_tangent
+from lag_envs.stepping.series import TOLERANCE, Series
+
+#: A control step that would need more attempts than this is refused.
+LARGEST_COUNT = 20_000
+#: So is one that would need a substep below this part of it.
+SMALLEST_PART = 1e-9
+
+
+def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step of the lane in `rows`, see `Layout`; return the attempts, negative where refused.
+
+    Inputs, places and velocities are read; places and velocities are replaced.
+    """
+    rows[status] = 0.0
+    rows[left] = rows[wish] = dt
+    for i in range(2 * n):
+        rows[bounds + i] = 0.0
+    while attempt(rows, 0, dt, order, tolerance) == 0:
+        if rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt:
+            return -np.int64(rows[status])
+    return np.int64(rows[status])
+
+
+def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step of up to BLOCK lanes; return how many were refused.
+
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds. A lane whose
+    status is negative to begin with is left alone. Afterwards it is the number of attempts, negative where a
+    lane was refused.
+    """
+    for i in range(BLOCK):
+        stepped = i < count and memory[base + status * BLOCK + i] >= 0.0
+        memory[base + status * BLOCK + i] = 0.0 if stepped else -1.0
+        memory[base + left * BLOCK + i] = dt if stepped else 0.0
+        memory[base + wish * BLOCK + i] = dt if stepped else 0.0
+    over = 1
+    for first in range(0, count, LANES):
+        over &= attempt(memory, base + first, dt, order, tolerance)
+    return 0 if over else rest(memory, base, count, dt, order)
+
+
+def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
+    """Go on with the lanes that are not done, side by side; return how many were refused."""
+    rows = np.empty(bounds * BLOCK)
+    rows[left * BLOCK : wish * BLOCK] = 0.0
+    lane = np.empty(BLOCK, np.int64)
+    going = refused = 0
+    for i in range(count):
+        if memory[base + left * BLOCK + i] > 0.0:
+            for r in range(bounds):
+                rows[r * BLOCK + going] = memory[base + r * BLOCK + i]
+            lane[going] = i
+            going += 1
+    while going > 0:
+        for first in range(0, going, LANES):
+            attempt(rows, first, dt, order, tolerance)
+        kept = 0
+        for i in range(going):
+            spent = (
+                rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
+            )
+            if rows[left * BLOCK + i] > 0.0 and spent:
+                memory[base + status * BLOCK + lane[i]] = -rows[status * BLOCK + i]
+                refused += 1
+            elif rows[left * BLOCK + i] > 0.0:
+                for r in range(bounds):
+                    rows[r * BLOCK + kept] = rows[r * BLOCK + i]
+                lane[kept] = lane[i]
+                kept += 1
+            else:
+                for r in range(q, left):
+                    memory[base + r * BLOCK + lane[i]] = rows[r * BLOCK + i]
+        for i in range(kept, going):
+            rows[left * BLOCK + i] = 0.0
+        going = kept
+    return refused
+
+
+def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, float]:
+    layout = Layout(record)
+    return {
+        "n": record.size,
+        "q": layout.q,
+        "status": layout.status,
+        "left": layout.left,
+        "wish": layout.wish,
+        "bounds": layout.bounds,
+        "size": layout.rows,
+        "tolerance": tolerance,
+        "SMALLEST_PART": SMALLEST_PART,
+        "LARGEST_COUNT": LARGEST_COUNT,
+    }
+
+
+@cache
+def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
+    """Compile ``advance(rows, dt, order)``, see `_advance`."""
+    return compile_python("advance_lane", _advance, compile_attempt(record, 1), **_numbers(record, tolerance))
+
+
+def lanes(record: SeriesRecord) -> int:
+    """Return how many lanes are stepped at once: as many as find room in the nearest cache."""
+    slots = Series(record).slots
+    return 16 if slots < 8 else 8 if slots < 24 else 4
+
+
+@cache
+def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
+    """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`."""
+    width = lanes(record)
+    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
+    attempt = compile_attempt(record, width)
+    rest = compile_python("rest", _rest, attempt, **numbers)
+    return compile_python("advance_block", _advance_block, attempt, rest, **numbers)
+
+
+def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
+    """Take one control step and its derivatives; return the number of attempts, negative where refused.
+
+    `rows` are those of a lane. `slopes` are those of `compile_tangent`, and their matrix is that of unit
+    vectors to begin with.
+    """
+    rows[status] = 0.0
+    rows[left] = rows[wish] = dt
+    while rows[left] > 0.0:
+        before = rows[left]
+        attempt(rows, 0, dt, order, tolerance)
+        if rows[left] < before:
+            slopes[status] = dt - before
+            slopes[status + 1] = before - rows[left]
+            tangent(slopes, 0, order)
+            for i in range(2 * n):
+                slopes[q + i] = rows[q + i]
+        if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
+            return -np.int64(rows[status])
+    return np.int64(rows[status])
+
+
+def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
+    """Take a control step from each row of `values`; return the row that was refused, or 0.
+
+    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes`
+    becomes the matrix of derivatives of places and velocities, row by row.
+    """
+    rows, matrix = np.zeros(size), status + 2
+    moving = np.zeros(matrix + 2 * n * width)
+    for i in range(values.shape[0]):
+        for j in range(status):
+            rows[j] = moving[j] = values[i, j]
+        for j in range(2 * n * width):
+            moving[matrix + j] = 0.0
+        for j in range(2 * n):
+            moving[matrix + j * width + j] = 1.0
+        if advance(rows, moving, dt, order) < 0:
+            return i + 1
+        for j in range(2 * n):
+            values[i, q + j] = rows[q + j]
+        for j in range(2 * n * width):
+            slopes[i, j] = moving[matrix + j]
+            if not abs(slopes[i, j]) < np.inf:
+                return i + 1
+    return 0
+
+
+@cache
+def compile_advance_tangents(
+    record: SeriesRecord, columns: tuple[str, ...], tolerance: float = TOLERANCE
+) -> Callable:
+    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents`.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    columns : tuple of str
+        Inputs by which derivatives are taken, besides places and velocities.
+    tolerance : float
+        What a substep may leave out, relative to the size of the velocities.
+    """
+    helpers = compile_attempt(record, 1), compile_tangent(record, columns)
+    numbers = _numbers(record, tolerance)
+    advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
+    width = 2 * record.size + len(columns)
+    return compile_python("advance_tangents", _advance_tangents, advance, width=width, **numbers)

@@ -1,0 +1,456 @@
+"""One control step of any scene: from its state to the series' variables, the series, and back.
+
+Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held,
+velocities jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
+converted at both ends of the control step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.mechanics.algebra import Atom, Expr, evaluate
+from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.motion import Mechanics
+from lag_envs.mechanics.recording import control, parameter
+from lag_envs.stepping.compiling import compile_function, record_block
+from lag_envs.stepping.dual import Variable, VariableFunctions
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
+from lag_envs.stepping.series import TOLERANCE
+
+#: Rows that `advance_block` fills itself.
+SCRATCH = ("left", "wish")
+
+
+class SeriesStepper:
+    """One scene's control step by the general series, as lines of code and compiled functions.
+
+    Parameters
+    ----------
+    mechanics : Mechanics
+        The scene's equations of motion.
+    """
+
+    def __init__(self, mechanics: Mechanics) -> None:
+        self.mechanics = mechanics
+        self._layout = mechanics.layout
+        self._lowering = Lowering(self._layout.free, self._moving())
+        self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
+        self._whole = self._lowering.without(*self._parts)
+        converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
+        self._codes: dict[frozenset[str], StepCode] = {}
+        self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
+
+    def _moving(self) -> dict[str, list[Expr]]:
+        """Return the moving prescribed coordinates as polynomials in time."""
+        elapsed = Expr.of(CLOCK)
+        moving: dict[str, list[Expr]] = {}
+        for p in self._layout.at("acceleration", "rate"):
+            s = Expr.of(Atom("start", p.name))
+            held = Expr.of(control(p.control or ""))
+            if p.level == "rate":
+                moving[p.name] = [s + elapsed * held, held]
+            else:
+                rate = Expr.of(Atom("start", f"{p.name}_dot"))
+                half = held / 2
+                moving[p.name] = [s + elapsed * (rate + elapsed * half), rate + elapsed * held, half]
+        return moving
+
+    # --- constants ------------------------------------------------------------------------------------------
+
+    def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
+        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
+        values = {parameter(name): value for name, value in parameters.items()}
+        return _evaluated(self._whole, values) | {
+            f"p_{name}": float(parameters[name]) for name in self._parameters
+        }
+
+    # --- from the state and back ----------------------------------------------------------------------------
+
+    def _values(self, y: Sequence, u: Sequence) -> dict[str, Any]:
+        """Return entries of the state and controls by name."""
+        return dict(zip((e.name for e in self._layout.state), y, strict=True)) | dict(
+            zip(self._layout.controls, u, strict=True)
+        )
+
+    def prepare(self, xp: Any, y: Sequence, u: Sequence, k: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the inputs of the series by name, and places ``q0``, ... and velocities ``v0``, ...."""
+        given = self._values(y, u)
+        inputs: dict[str, Any] = {}
+        for name in self._whole.inputs:
+            if name.startswith("control_"):
+                inputs[name] = given[name.removeprefix("control_")]
+            elif name.startswith("start_"):
+                inputs[name] = given[name.removeprefix("start_")]
+        q = [
+            given.get(name, 0.0) for name in self._layout.free
+        ]  # where one is left out, nothing depends on it
+        shift = self._shift(xp, q, {p.name: given.get(p.name) for p in self._layout.prescribed}, u, k)
+        for i, name in enumerate(self._layout.free):
+            inputs[f"q{i}"] = q[i]
+            inputs[f"v{i}"] = self._rate(given, name, shift[i])
+        return inputs
+
+    def _rate(self, given: Mapping[str, Any], name: str, shift: Any) -> Any:
+        for entry in self._layout.state:
+            if entry.coordinate == name and entry.kind == "velocity":
+                return given[entry.name]
+            if entry.coordinate == name and entry.kind == "momentum":
+                return given[entry.name] - shift
+        raise AssertionError(name)
+
+    def _shift(self, xp: Any, q: Sequence, s: Mapping[str, Any], u: Sequence, k: Mapping[str, Any]) -> list:
+        """Return M⁻¹ Σ_m G_m ṡ_m for the prescribed coordinates whose rates are held."""
+        m = self.mechanics
+        n = len(m.free)
+        if not m.coupling:
+            return [0.0] * n
+        held = dict(zip(self._layout.controls, u, strict=True))
+        values: dict[Atom, Any] = {parameter(name): k[f"p_{name}"] for name in self._parameters}
+        values |= {place(name): value for name, value in zip(m.free, q, strict=True)}
+        values |= {place(name): value for name, value in s.items() if value is not None}
+        values |= {control(name): value for name, value in held.items()}
+        levels = self._layout.at("rate")
+        values |= {velocity(p.name): held[p.control or ""] for p in levels}
+        entries = evaluate(m.entries(), values, xp)
+        right: list[Any] = [0.0] * n
+        for (i, name), entry in sorted(m.coupling.items()):
+            (weight,) = evaluate([entry], values, xp)
+            by = next(p.control for p in levels if p.name == name)
+            right[i] = right[i] + weight * held[by or ""]
+        return _solve([entries[i * n : (i + 1) * n] for i in range(n)], right)
+
+    def finish(
+        self, xp: Any, q: Sequence, v: Sequence, y: Sequence, u: Sequence, dt: Any, k: Mapping[str, Any]
+    ) -> list:
+        """Return the state at the step's end."""
+        given = self._values(y, u)
+        after: dict[str, Any] = {}
+        for p in self._layout.prescribed:
+            if p.level == "acceleration" and f"{p.name}_dot" in given:
+                held, rate = given[p.control or ""], given[f"{p.name}_dot"]
+                if p.name in given:
+                    after[p.name] = given[p.name] + dt * (rate + 0.5 * dt * held)
+                after[f"{p.name}_dot"] = rate + dt * held
+            elif p.level == "rate" and p.name in given:
+                after[p.name] = given[p.name] + dt * given[p.control or ""]
+        shift = self._shift(xp, q, {p.name: after.get(p.name) for p in self._layout.prescribed}, u, k)
+        for entry in self._layout.state:
+            if entry.coordinate in self._layout.free:
+                i = self._layout.free.index(entry.coordinate)
+                if entry.kind == "place":
+                    after[entry.name] = q[i]
+                else:
+                    after[entry.name] = v[i] if entry.kind == "velocity" else v[i] + shift[i]
+        return [after[entry.name] for entry in self._layout.state]
+
+    # --- derivatives ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def _tangents(self) -> SeriesRecord:
+        lowering = Lowering(self._layout.free, self._moving(), tangents=True)
+        return lowering.record(self.mechanics.mass, self.mechanics.force)
+
+    def jacobian(
+        self, states: Any, controls: Any, parameters: Mapping[str, float], dt: float, order: int
+    ) -> tuple[Any, int]:
+        """Return the derivatives of the states at the step's end by states and controls.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n, n_state)
+            Where the steps begin.
+        controls : ndarray, shape (n, n_controls)
+            The controls that are held.
+        parameters : mapping
+            The scene's parameters.
+        dt : float
+            Length of the step [s].
+        order : int
+            Order of the series.
+
+        Returns
+        -------
+        derivatives : ndarray, shape (n, n_state, n_state + n_controls)
+            The derivatives.
+        refused : int
+            The row whose step was refused, counted from 1; 0 where there is none.
+        """
+        from lag_envs.stepping.driver import compile_advance_tangents
+
+        record, n = self._tangents, len(self._layout.free)
+        columns = tuple(x for x in record.inputs if x.startswith(("control_", "start_")))
+        k: dict[str, Any] = {f"p_{name}": parameters[name] for name in self._parameters}
+        constants = _evaluated(record, {parameter(name): value for name, value in parameters.items()})
+        count, wide = len(states), states.shape[1] + controls.shape[1]
+        unit = np.eye(wide)[:, :, None] * np.ones(count)
+        given = [Variable(x, unit[i]) for i, x in enumerate([*states.T, *controls.T])]
+        y, u = given[: states.shape[1]], given[states.shape[1] :]
+        before = self.prepare(VariableFunctions(), y, u, k)
+        moving = [f"q{i}" for i in range(n)] + [f"v{i}" for i in range(n)]
+        values = np.zeros((count, len(record.given) + 2 * n))
+        for i, name in enumerate([*record.given, *moving]):
+            if name in before:
+                values[:, i] = before[name].value
+            elif name in constants:
+                values[:, i] = constants[name]
+        slopes = np.empty((count, 2 * n * (2 * n + len(columns))))
+        refused = compile_advance_tangents(record, columns)(values, slopes, dt, order)
+        if refused:
+            return None, refused
+        core = slopes.reshape(count, 2 * n, -1)
+        inner = np.stack([before[name].slopes for name in [*moving, *columns]])
+        ends = np.einsum("bik,kjb->ijb", core, inner)
+        after = [Variable(values[:, len(record.given) + i], ends[i]) for i in range(2 * n)]
+        finished = self.finish(VariableFunctions(), after[:n], after[n:], y, u, dt, k)
+        return np.stack([z.slopes for z in finished]).transpose(2, 0, 1), 0
+
+    # --- code -----------------------------------------------------------------------------------------------
+
+    def code(self, absent: frozenset[str] = frozenset()) -> StepCode:
+        """Return the step without the terms of constants that are zero."""
+        if absent not in self._codes:
+            self._codes[absent] = StepCode(self, self._lowering.without(*self._parts, absent), absent)
+        return self._codes[absent]
+
+
+def _evaluated(record: SeriesRecord, parameters: Mapping[Atom, float]) -> dict[str, float]:
+    """Return the values of a record's constants."""
+    names = list(record.constants)
+    numbers = evaluate([record.constants[name] for name in names], parameters, math)
+    return {name: float(value) for name, value in zip(names, numbers, strict=True)}
+
+
+def _solve(matrix: Sequence[Sequence], right: Sequence) -> list:
+    """Solve a small linear system by elimination without pivoting, on numbers of any kind."""
+    n = len(right)
+    a, b = [list(row) for row in matrix], list(right)
+    for i in range(n):
+        for j in range(i + 1, n):
+            factor = a[j][i] / a[i][i]
+            a[j] = [x - factor * y for x, y in zip(a[j], a[i], strict=True)]
+            b[j] = b[j] - factor * b[i]
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            b[i] = b[i] - a[i][j] * b[j]
+        b[i] = b[i] / a[i][i]
+    return b
+
+
+class StepBound(NamedTuple):
+    """How a control step is divided, and what its series leave out.
+
+    Attributes
+    ----------
+    substeps : int
+        Number of attempts that the step took; 1 where the first one was certified as a whole.
+    order : int
+        Order of the series.
+    bounds : dict of str to float
+        For each entry of the state a bound on the truncation error, in its unit.
+    kind : str
+        ``"proved with the step"``, or ``"proved before the step"``.
+    """
+
+    substeps: int
+    order: int
+    bounds: dict[str, float]
+    kind: str
+
+
+class StepCode:
+    """The code of a control step.
+
+    Attributes
+    ----------
+    start, end : list of str
+        Names of the state's entries before and after the step.
+    controls : list of str
+        Names of the controls.
+    constants : list of str
+        Names of the constants that the code uses.
+    rows : list of str
+        Rows of a lane that the block function reads and writes: inputs, then places and velocities, then the
+        status, then `SCRATCH`, which it fills itself.
+    """
+
+    def __init__(self, stepper: SeriesStepper, record: SeriesRecord, absent: frozenset[str]) -> None:
+        layout = stepper._layout
+        self.record = record
+        self.start = [f"y{i}" for i in range(len(layout.state))]
+        self.end = [f"z{i}" for i in range(len(layout.state))]
+        self.controls = [f"u{i}" for i in range(len(layout.controls))]
+        n = record.size
+        self._n = n
+        names = [*stepper._whole.constants, *(f"p_{name}" for name in stepper._parameters)]
+        given: dict[str, Any] = {name: 0.0 if name in absent else f"k_{name}" for name in names}
+        q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
+        self._inputs = [
+            name if name.startswith(("control_", "start_")) else f"k_{name}" for name in record.given
+        ]
+        wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
+
+        def run(formula: Callable, inputs: Sequence[str]) -> tuple[list[str], list]:
+            trace = ElementaryTrace()
+            numbers = {
+                name: trace.zero() if value == 0.0 else trace.inputs(value)[0]
+                for name, value in given.items()
+                if name.startswith("p_")
+            }
+            values = [trace.inputs(name)[0] for name in inputs]
+            results = formula(trace, values, numbers)
+            return record_block(trace, results)
+
+        states, controls = len(self.start), len(self.controls)
+
+        def prepare(xp: Any, values: Sequence, k: Mapping) -> dict[str, Any]:
+            found = stepper.prepare(xp, values[:states], values[states:], k)
+            return {name: found[name] for name in (*wanted, *q, *v)}
+
+        def finish(xp: Any, values: Sequence, k: Mapping) -> dict[str, Any]:
+            rest = values[2 * n :]
+            ends = stepper.finish(
+                xp,
+                values[:n],
+                values[n : 2 * n],
+                rest[:states],
+                rest[states : states + controls],
+                rest[-1],
+                k,
+            )
+            return dict(zip(self.end, ends, strict=True))
+
+        self.prepare, prepared = run(prepare, [*self.start, *self.controls])
+        self.prepare += [
+            f"{name} = {value}"
+            for name, value in zip((*wanted, *q, *v), prepared, strict=True)
+            if name != value
+        ]
+        self.finish, finished = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
+        self.finish += [
+            f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value
+        ]
+        used = " ".join([*self.prepare, *self.finish, *self._inputs])
+        self.constants = [
+            value
+            for value in given.values()
+            if isinstance(value, str)
+            and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
+        ]
+        #: Rows that are to be filled in before the step.
+        self.given = [*self._inputs, *q, *v, "status"]
+        self.rows = [*self.given, *SCRATCH]
+        #: Those of them that the rest of the step needs afterwards.
+        self.results = [*q, *v, "status"]
+
+    @property
+    def scratch(self) -> int:
+        """Numbers that `compile` needs in its array of rows."""
+        from lag_envs.stepping.machine import Layout
+
+        return Layout(self.record).rows
+
+    @property
+    def arguments(self) -> str:
+        """The arguments of `advance`."""
+        return ", ".join(["rows", *self.start, *self.controls, "dt", "order", *self.constants])
+
+    def compile(self, tolerance: float = TOLERANCE) -> Callable:
+        """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., status)``.
+
+        The status is the number of attempts, or negative where the step is refused. In `rows`, `scratch`
+        numbers long, the sums of the substeps' bounds on places and velocities are left at the end.
+        """
+        from lag_envs.stepping.driver import compile_advance
+        from lag_envs.stepping.machine import Layout
+
+        layout = Layout(self.record)
+        n = self._n
+        body = [
+            f"def advance({self.arguments}):",
+            *self.prepare,
+            *(f"rows[{i}] = {name}" for i, name in enumerate(self._inputs)),
+            *(f"rows[{layout.q + i}] = q{i}" for i in range(n)),
+            *(f"rows[{layout.v + i}] = v{i}" for i in range(n)),
+            "status = advance_lane(rows, dt, np.int64(order))",
+            *(f"q{i} = rows[{layout.q + i}]" for i in range(n)),
+            *(f"v{i} = rows[{layout.v + i}]" for i in range(n)),
+            *self.finish,
+            f"return {', '.join(self.end)}, status",
+        ]
+        return compile_function(
+            "advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance)
+        )
+
+    def bounded(
+        self,
+        state: Sequence[float],
+        controls: Sequence[float],
+        dt: float,
+        order: int,
+        constants: Sequence[float],
+    ) -> tuple[int, tuple[Any, Any]]:
+        """Take a step; return its status, and the sums of bounds on places and velocities."""
+        rows = np.zeros(self.scratch)
+        *_, status = self._advance(rows, *state, *controls, dt, float(order), *constants)
+        n = self._n
+        return status, (rows[-2 * n : -n], rows[-n:])
+
+    @cached_property
+    def _advance(self) -> Callable:
+        return self.compile()
+
+    @cached_property
+    def simulation(self) -> Callable:
+        """What `compile_simulate` makes."""
+        return self.compile_simulate()
+
+    def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
+        """Compile ``advance_block(memory, base, count, dt, order)`` on `rows` of BLOCK lanes."""
+        from lag_envs.stepping.driver import compile_advance_block
+
+        return compile_advance_block(self.record, tolerance)
+
+    def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
+        """Compile ``simulate(trajectory, controls, dt, order, constants...)``.
+
+        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0.
+        """
+        extra = "".join(f", {name}" for name in self.constants)
+        loop = [
+            *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
+            f"{', '.join(self.start)}, status = advance({self.arguments})",
+            "if status < 0:",
+            "    return i + 1",
+            *(f"trajectory[i + 1, {i}] = {y}" for i, y in enumerate(self.start)),
+        ]
+        body = [
+            f"def simulate(trajectory, controls, dt, order{extra}):",
+            f"rows = np.zeros({self.scratch})",
+            *(f"{y} = trajectory[0, {i}]" for i, y in enumerate(self.start)),
+            "for i in range(controls.shape[0]):",
+            *("    " + line for line in loop),
+            "return 0",
+        ]
+        return compile_function("simulate", "\n    ".join(body) + "\n", self.compile(tolerance))
+
+
+_steppers: dict[str, SeriesStepper] = {}
+
+
+def stepper_of(mechanics: Mechanics) -> SeriesStepper:
+    """Return the stepper of these equations of motion; equal ones share it."""
+    if mechanics.key not in _steppers:
+        _steppers[mechanics.key] = SeriesStepper(mechanics)
+    return _steppers[mechanics.key]
+
+
+def usual_order(dt: float) -> int:
+    """Return the order of the series for a control step [s], unless a scene is given another."""
+    return 16 if dt <= 0.03 else 20 if dt <= 0.1 else 22

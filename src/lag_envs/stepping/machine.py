@@ -1,0 +1,386 @@
+"""Prints the step of `lag_envs.stepping.series` to machine code, for one lane or for several."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from lag_envs.mechanics import algebra
+from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping.dual import Dual
+from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
+from lag_envs.stepping.primitives import emit
+from lag_envs.stepping.series import LARGEST_ORDER, Lane, Series
+
+_DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
+#: Lanes whose rows lie together.
+BLOCK = 64
+#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
+STRIDE = LARGEST_ORDER + 3
+
+
+class Layout:
+    """Where the numbers of a lane lie: rows, one behind the other or `BLOCK` numbers apart.
+
+    Attributes
+    ----------
+    inputs : dict of str to int
+        Inputs by name.
+    q, v : int
+        The first place and the first velocity.
+    status : int
+        The number of attempts, negative where the lane is not stepped.
+    left, wish : int
+        What is left of the control step, 0 where it is done, and the step that is wished for [s].
+    bounds : int
+        Sums of the bounds on what places and velocities leave out; a single lane has them.
+    rows : int
+        Number of rows.
+    """
+
+    def __init__(self, record: SeriesRecord) -> None:
+        n = record.size
+        self.inputs = {name: i for i, name in enumerate(record.given)}
+        self.q = len(self.inputs)
+        self.v, self.status = self.q + n, self.q + 2 * n
+        self.left, self.wish, self.bounds = self.status + 1, self.status + 2, self.status + 3
+        self.rows = self.bounds + 2 * n
+
+
+class Machine:
+    """The target that writes LLVM's language: numbers are doubles, or vectors of them."""
+
+    def __init__(self, builder: ir.IRBuilder, entries: int, lanes: int, fused: bool) -> None:
+        self._b, self._fused = builder, fused
+        self.kind = _DOUBLE if lanes == 1 else ir.VectorType(_DOUBLE, lanes)
+        self._lanes = lanes
+        memory = builder.alloca(self.kind, entries)
+        memory.align = 8 * lanes
+        self._memory = memory
+
+    def number(self, value: float) -> ir.Value:
+        constant = ir.Constant(_DOUBLE, value)
+        return constant if self._lanes == 1 else ir.Constant(self.kind, [constant] * self._lanes)
+
+    def add(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fadd(a, b)
+
+    def sub(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fsub(a, b)
+
+    def mul(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fmul(a, b)
+
+    def div(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fdiv(a, b)
+
+    def fma(self, a: Any, b: Any, c: Any) -> ir.Value:
+        if not self._fused:
+            return self._b.fadd(self._b.fmul(a, b), c)
+        return primitives.call(self._b, "fma", a, b, c)
+
+    def neg(self, a: Any) -> ir.Value:
+        return self._b.fneg(a)
+
+    def abs(self, a: Any) -> ir.Value:
+        return primitives.call(self._b, "fabs", a)
+
+    def sqrt(self, a: Any) -> ir.Value:
+        return primitives.call(self._b, "sqrt", a)
+
+    def less(self, a: Any, b: Any) -> ir.Value:
+        return self._b.fcmp_ordered("<", a, b)
+
+    def both(self, a: Any, b: Any) -> ir.Value:
+        return self._b.and_(a, b)
+
+    def select(self, condition: Any, a: Any, b: Any) -> ir.Value:
+        return self._b.select(condition, a, b)
+
+    def either(self, a: Any, b: Any) -> ir.Value:
+        return self._b.or_(a, b)
+
+    def all(self, condition: Any) -> ir.Value:
+        if self._lanes == 1:
+            return condition
+        kind = ir.IntType(self._lanes)
+        return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
+
+    def negated(self, condition: Any) -> ir.Value:
+        return self._b.not_(condition)
+
+    def real(self, k: Any) -> ir.Value:
+        return self._splat(self._b.sitofp(k, _DOUBLE))
+
+    def reciprocal(self, k: Any) -> ir.Value:
+        table = self._b.module.globals.get("reciprocals")
+        if table is None:
+            values = [ir.Constant(_DOUBLE, 1.0 / max(i, 1)) for i in range(STRIDE + 1)]
+            kind = ir.ArrayType(_DOUBLE, len(values))
+            table = ir.GlobalVariable(self._b.module, kind, "reciprocals")
+            table.linkage, table.global_constant = "internal", True
+            table.initializer = ir.Constant(kind, values)
+        return self._splat(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
+
+    def _splat(self, value: Any) -> ir.Value:
+        return value if self._lanes == 1 else primitives.splat(self._b, value, self._lanes)
+
+    def index(self, k: int) -> ir.Value:
+        return ir.Constant(_INT, k)
+
+    def plus(self, k: Any, n: int) -> ir.Value:
+        if isinstance(k, ir.Constant):
+            return ir.Constant(_INT, k.constant + n)
+        return self._b.add(k, ir.Constant(_INT, n))
+
+    def minus(self, a: Any, b: Any) -> ir.Value:
+        return self._b.sub(a, b)
+
+    def half(self, k: Any) -> ir.Value:
+        return self._b.lshr(k, ir.Constant(_INT, 1))
+
+    def below(self, a: Any, b: Any) -> ir.Value:
+        return self._b.icmp_signed("<", a, b)
+
+    def _at(self, slot: int, k: Any) -> ir.Value:
+        return self._b.gep(self._memory, [self.plus(k, slot * STRIDE)])
+
+    def load(self, slot: int, k: Any) -> ir.Value:
+        return self._b.load(self._at(slot, k))
+
+    def store(self, slot: int, k: Any, value: Any) -> None:
+        self._b.store(value, self._at(slot, k))
+
+    def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
+        b = self._b
+        start = b.basic_block
+        head, inside, after = (b.append_basic_block(name) for name in ("head", "inside", "after"))
+        b.branch(head)
+        b.position_at_end(head)
+        k, phis = self._phis(start, first, carried)
+        b.cbranch(self.below(k, end), inside, after)
+        b.position_at_end(inside)
+        self._again(head, k, phis, body(k, list(phis)), step)
+        b.branch(head).set_metadata("llvm.loop", self._as_written())
+        b.position_at_end(after)
+        return phis
+
+    def repeat(self, times: int, carried: Sequence, body: Callable) -> list:
+        b = self._b
+        start = b.basic_block
+        head, after = (b.append_basic_block(name) for name in ("head", "after"))
+        b.branch(head)
+        b.position_at_end(head)
+        k, phis = self._phis(start, self.index(0), carried)
+        going, values = body(k, list(phis))
+        self._again(head, k, phis, values, 1)
+        b.cbranch(b.and_(going, self.below(k, self.index(times - 1))), head, after)
+        b.position_at_end(after)
+        return values
+
+    def _as_written(self) -> ir.MDValue:
+        """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
+        module = self._b.module
+        request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
+        loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
+        loop.operands = (loop, request)  # a loop's first operand is itself
+        return loop
+
+    def _phis(self, start: ir.Block, first: Any, carried: Sequence) -> tuple[ir.Value, list]:
+        k = self._b.phi(_INT)
+        k.add_incoming(first, start)
+        phis = [self._b.phi(value.type) for value in carried]
+        for phi, value in zip(phis, carried, strict=True):
+            phi.add_incoming(value, start)
+        return k, phis
+
+    def _again(self, head: ir.Block, k: Any, phis: Sequence, values: Sequence, step: int) -> None:
+        k.add_incoming(self._b.add(k, ir.Constant(_INT, step)), self._b.basic_block)
+        for phi, value in zip(phis, values, strict=True):
+            phi.add_incoming(value, self._b.basic_block)
+
+    def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list:
+        b = self._b
+        start = b.basic_block
+        with b.if_then(condition):
+            values = body()
+            last = b.basic_block
+        phis = [b.phi(value.type) for value in otherwise]
+        for phi, value, other in zip(phis, values, otherwise, strict=True):
+            phi.add_incoming(value, last)
+            phi.add_incoming(other, start)
+        return phis
+
+    def elementary(self, name: str, x: Any) -> ir.Value:
+        operations, result = series.elementary(name, self._fused)
+        return emit(self._b, operations, {"x": x})[result]
+
+    def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
+        return emit(self._b, record.scalars, dict(inputs))
+
+
+@cache
+def _version() -> str:
+    """Return a digest of the code that decides what is printed."""
+    modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
+    source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
+        sys.modules[__name__]
+    )
+    return hashlib.sha256(source.encode()).hexdigest()
+
+
+def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
+    """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
+
+    It takes a step of each lane for which something is left, of the length that is wished for or of a part of
+    it, and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at
+    ``rows[at]``. It returns 1 where nothing is left, else 0. See `Series.attempt`.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped.
+    lanes : int
+        How many steps are taken at once. The rows of a single lane are one number, of several `BLOCK`
+        numbers.
+    fused : bool, default True
+        Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
+    """
+    digest = hashlib.sha256(f"{_version()} {record.digest} {lanes} {fused}".encode()).hexdigest()[:16]
+    name = f"attempt_{digest}"
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        first = builder.gep(array.data, [args[1]])
+        function = builder.module.globals.get(name) or _write(builder.module, name, record, lanes, fused)
+        return builder.call(function, [first, *args[2:]])
+
+    @intrinsic
+    def attempt(typingctx, rows, at, dt, order, tolerance):  # type: ignore[no-untyped-def]
+        return types.int64(rows, types.int64, types.float64, types.int64, types.float64), codegen
+
+    attempt.__name__ = name
+    return attempt
+
+
+def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused: bool) -> ir.Function:
+    """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
+    step, layout, n = Series(record), Layout(record), record.size
+    function = ir.Function(
+        module, ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE]), name
+    )
+    function.linkage = "internal"
+    set.add(function.attributes, "noinline")
+    set.add(function.attributes, '"prefer-vector-width"="512"')
+    rows, dt, order, tolerance = function.args
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    t = Machine(builder, step.slots * STRIDE, lanes, fused)
+    apart = 1 if lanes == 1 else BLOCK
+
+    def pointer(row: int) -> ir.Value:
+        return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * apart)]), t.kind.as_pointer())
+
+    def read(row: int) -> ir.Value:
+        value = builder.load(pointer(row))
+        value.align = 8
+        return value
+
+    def write(row: int, value: ir.Value) -> None:
+        builder.store(value, pointer(row)).align = 8
+
+    def splat(value: ir.Value) -> ir.Value:
+        return value if lanes == 1 else primitives.splat(builder, value, lanes)
+
+    inputs = {name: read(row) for name, row in layout.inputs.items()}
+    q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
+    before = Lane(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    lane, bounds = step.substep(t, inputs, before, splat(dt), order, splat(tolerance))
+    for i in range(n):
+        write(layout.q + i, lane.q[i])
+        write(layout.v + i, lane.v[i])
+    write(layout.status, lane.status)
+    write(layout.left, lane.left)
+    write(layout.wish, lane.wish)
+    if lanes == 1:
+        for row, bound in enumerate(bounds, layout.bounds):
+            write(row, t.add(read(row), bound))
+    over = t.all(t.negated(t.less(t.number(0.0), lane.left)))
+    builder.ret(builder.zext(over, _INT))
+    return function
+
+
+def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
+    """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
+
+    The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the
+    step, and then the derivatives of the places and velocities by places, velocities and the inputs named in
+    `columns`, as a matrix. Places, velocities and the matrix are replaced by those after the step.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    columns : tuple of str
+        Inputs by which derivatives are taken.
+    """
+    digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
+    name = f"tangent_{digest}"
+
+    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        first = builder.gep(array.data, [args[1]])
+        function = builder.module.globals.get(name) or _write_tangent(builder.module, name, record, columns)
+        builder.call(function, [first, args[2]])
+        return context.get_dummy_value()
+
+    @intrinsic
+    def tangent(typingctx, rows, at, order):  # type: ignore[no-untyped-def]
+        return types.void(rows, types.int64, types.int64), codegen
+
+    tangent.__name__ = name
+    return tangent
+
+
+def _write_tangent(
+    module: ir.Module, name: str, record: SeriesRecord, columns: tuple[str, ...]
+) -> ir.Function:
+    """Write the function ``name(rows, order)`` into a module."""
+    step, layout, n = Series(record), Layout(record), record.size
+    width, matrix = 2 * n + len(columns), layout.status + 2
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT]), name)
+    function.linkage = "internal"
+    set.add(function.attributes, "noinline")
+    rows, order = function.args
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
+    t: Any = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
+
+    def at(row: int) -> ir.Value:
+        return builder.gep(rows, [ir.Constant(_INT, row)])
+
+    def moving(row: int, i: int) -> dual.Number:
+        return dual.Number(
+            builder.load(at(row)), tuple(builder.load(at(matrix + i * width + k)) for k in range(width))
+        )
+
+    inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
+    inputs[ELAPSED] = t.plain(builder.load(at(layout.status)))
+    q = [moving(layout.q + i, i) for i in range(n)]
+    v = [moving(layout.v + i, n + i) for i in range(n)]
+    h = t.plain(builder.load(at(layout.status + 1)))
+    step.expand(t, inputs, q, v, h, order)
+    q, v = step.advance(t, q, h, order)
+    for i, number in enumerate([*q, *v]):
+        builder.store(number.value, at(layout.q + i))
+        for k, slope in enumerate(number.slopes):
+            builder.store(plain.number(0.0) if slope is None else slope, at(matrix + i * width + k))
+    builder.ret_void()
+    return function

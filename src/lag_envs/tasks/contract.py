@@ -1,0 +1,567 @@
+"""The contract of a task: what it adds to a scene, written by name."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import inspect
+import math
+import numbers
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import Values, formula, twin
+from lag_envs.scenes import picture
+from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.contract import Scene, check_number, real_array
+from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
+from lag_envs.stepping.elementary import ElementaryTrace
+
+#: Unless a task says otherwise, starts given by hand may be this fast at most [rad/s or m/s].
+FASTEST_START = 100.0
+#: Names of the formulas of a task.
+FORMULAS = ("guard", "observe", "reward", "last_reward", "terminated", "kick")
+_UNBOUNDED = float(np.finfo(np.float32).max)
+
+
+class Task:
+    """A task on a scene.
+
+    A subclass says what its attributes and methods ask for; `scene`, `interval`, `steps`, `action`, `observe`
+    and `reward` at least. Formulas go by name: ``before`` and ``after`` are the state at the step's two ends,
+    with the names of ``scene.state_names``, ``control`` the controls that were applied, ``target`` the
+    targets. They use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, and functions of
+    ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum. The scene's parameters
+    and energies may be used: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
+
+    Attributes
+    ----------
+    id : str
+        Name under which `lag_envs.register` registers it.
+    scene : type
+        The scene; an instance has the scene itself here.
+    defaults : mapping
+        Parameters of the scene that differ from its own.
+    interval : float
+        Control interval [s].
+    steps : int
+        Steps of an episode.
+    action : mapping
+        For each control that is acted on its limit, (low, high), or a list of values to choose from.
+    start : mapping
+        For entries of the state a half width around 0, or (centre, half width); the others start at 0.
+    target : mapping
+        For each target (unit, half width) or (unit, centre, half width).
+    draws : int
+        Random numbers in [0, 1) that `kick` uses.
+    scaled : bool
+        Whether rewards of another `dt` are scaled by dt/interval.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Control interval [s]. The episode keeps its seconds, not its steps.
+    duration : float, optional
+        Length of an episode [s]; infinity for one without an end.
+    target : float, sequence or mapping, optional
+        Fixed targets in place of random ones.
+    **parameters
+        Parameters of the scene.
+    """
+
+    id: ClassVar[str] = ""
+    scene: Any
+    defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+    interval: ClassVar[float] = 0.02
+    steps: ClassVar[int] = 500
+    action: Any = MappingProxyType({})
+    start: Any = MappingProxyType({})
+    target: Any = MappingProxyType({})
+    draws: ClassVar[int] = 0
+    scaled: ClassVar[bool] = True
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for name in ("defaults", "action", "start", "target"):
+            if isinstance(vars(cls).get(name), Mapping):
+                setattr(cls, name, MappingProxyType(dict(vars(cls)[name])))
+
+    def __init__(
+        self, *, dt: float | None = None, duration: float | None = None, target: Any = None, **parameters: Any
+    ) -> None:
+        kind = type(self).scene
+        if not (isinstance(kind, type) and issubclass(kind, Scene)):
+            raise FormulaError(
+                f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}"
+            )
+        known = list(inspect.signature(kind).parameters)
+        for name in sorted(set(parameters) - set(known)):
+            options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else [])]
+            raise TypeError(f"unknown keyword {name!r}; this environment takes {', '.join(options)}")
+        self.scene = kind(**(dict(self.defaults) | parameters))
+        self.dt = self.interval if dt is None else check_number("dt", dt, "s")
+        if not 1e-6 <= self.dt <= 1.0:
+            raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
+        seconds = self.interval * self.steps if duration is None else duration
+        if isinstance(seconds, bool) or not isinstance(seconds, numbers.Real) or not seconds >= self.dt:
+            raise ValueError(f"duration must be at least dt={self.dt:g} s, got {seconds!r}")
+        self.duration: float = float(seconds)
+        self.fixed_target: NDArray[np.float64] | None = None
+        _ = self.formulas
+        if target is not None:
+            self.fixed_target = np.atleast_1d(self.check_target(target))
+        self.check()
+
+    # --- what a task defines -------------------------------------------------------------------------------
+
+    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
+        """Return the controls that are applied in place of those that are wanted, by name."""
+        return wanted
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return the observation: numbers by name, in order."""
+        raise FormulaError("it is not defined; write observe(self, after, target, xp)")
+
+    def bounds(self) -> Mapping[str, Any]:
+        """Return bounds on entries of the observation, ±bound or (low, high), where they are proved."""
+        return {}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return the reward of a step of `interval`."""
+        raise FormulaError("it is not defined; write reward(self, before, after, control, target, dt, xp)")
+
+    def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return the reward of the step that terminates; by default that of any other."""
+        return self.reward(before, after, control, target, dt, xp)
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the episode has come to its end."""
+        return False
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Return what a random disturbance adds to entries of the state; draws lie in [0, 1)."""
+        return {}
+
+    def check(self) -> None:
+        """Raise ValueError where the parameters do not fit the task."""
+
+    def check_start(self, state: Any) -> None:
+        """Raise ValueError for a start that the task cannot have; `state` goes by name and by index."""
+
+    # --- what follows --------------------------------------------------------------------------------------
+
+    def chance(self, per_interval: float) -> float:
+        """Return a step's chance of what has a chance per interval: a second has as many for any `dt`."""
+        recorded = vars(self).get("_recorded_chance")
+        if recorded is not None:
+            return recorded(per_interval)
+        return -math.expm1(self.dt / self.interval * math.log1p(-per_interval))
+
+    @property
+    def limit(self) -> float:
+        """Steps of an episode; infinity for one without an end."""
+        steps = self.duration / self.dt
+        return steps if math.isinf(steps) else float(round(steps))
+
+    @cached_property
+    def formulas(self) -> TaskFormulas:
+        """What compiled functions are made of."""
+        return TaskFormulas(self)
+
+    @property
+    def observation(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        return self.formulas.observation
+
+    @property
+    def variant(self) -> tuple:
+        """What decides the code besides the class: the environments of a batch must agree in it."""
+        return *self.scene._structure[1:3], self.scene.mechanics.zeros, self.fixed_target is None
+
+    @property
+    def target_range(self) -> tuple[float, ...] | None:
+        """Half widths of the random targets; None for a task without any."""
+        return tuple(t.half for t in self.formulas.target_boxes) or None
+
+    def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
+        """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
+        array = self.scene._check_state(state)
+        for entry, value in zip(self.scene._layout.state, array, strict=True):
+            if entry.kind != "place" and abs(value) > FASTEST_START:
+                raise ValueError(
+                    f"{entry.name} must lie within ±{FASTEST_START:g} {entry.unit} at the start, "
+                    f"got {value:g} {entry.unit}"
+                )
+        self.check_start(
+            Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
+        )
+        return array
+
+    def check_target(self, target: Any) -> Any:
+        """Return the target as float, or an array where there are several; or raise a ValueError."""
+        names = [t.name for t in self.formulas.target_boxes]
+        if not names:
+            raise ValueError(f"this task has no target, got target={target!r}")
+        if isinstance(target, Mapping):
+            if sorted(target) != sorted(names):
+                raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
+            target = [target[name] for name in names]
+        array = np.atleast_1d(real_array("target", target))
+        if array.shape != (len(names),):
+            raise ValueError(f"target must be {', '.join(names)}, got {target!r}")
+        for name, value in zip(names, array, strict=True):
+            if not math.isfinite(value):
+                raise ValueError(f"target {name} must be finite, got {value}")
+        return float(array[0]) if len(names) == 1 else array
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "formulas"}
+
+    # --- the picture ---------------------------------------------------------------------------------------
+
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen, from back to front: the scene, and what matters to the task."""
+        return self.scene.shapes(now)
+
+    def window(self, now: Moment) -> Window:
+        """Return the part of the plane to look at [m]."""
+        return self.scene.window(now)
+
+    def share(self, control: Any) -> Any:
+        """Return controls as shares of their largest sizes."""
+        largest = {a.control: max(abs(a.low), abs(a.high)) for a in self.formulas.acting}
+        shares = [
+            float(value) / largest[name] if name in largest else 0.0
+            for name, value in zip(self.scene.control_names, np.atleast_1d(control), strict=True)
+        ]
+        return shares[0] if len(shares) == 1 else shares
+
+    def turning(self, state: Sequence[float]) -> Any:
+        """Return the rates of the coordinates that the state leaves out."""
+        return np.array(picture.turning(self.scene, state))
+
+    def control_readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells of the controls."""
+        names = zip(
+            self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True
+        )
+        return [Reading(name, float(value), unit, "action") for name, value, unit in names]
+
+    def readings(self, now: Moment) -> list[Reading]:
+        """Return what the read-out tells besides state and controls: the targets."""
+        given: Any = [] if now.target is None else np.atleast_1d(now.target)
+        return [
+            Reading(t.name, float(value), t.unit, "target")
+            for t, value in zip(self.formulas.target_boxes, given, strict=False)
+        ]
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetBox:
+    """Where a random target lies."""
+
+    name: str
+    unit: str
+    centre: float
+    half: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Acting:
+    """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or one of `values`."""
+
+    control: str
+    low: float
+    high: float
+    values: tuple[float, ...] = ()
+
+
+class TaskFormulas:
+    """The formulas of a task, as `lag_envs.envs.program` asks for them."""
+
+    trace = ElementaryTrace
+    bounded = True
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        self._chances: dict[float, str] = {}
+        scene = task.scene
+        self.state = scene.state_names
+        self._controls = scene.control_names
+        self.controls = len(self._controls)
+        self.acting = _acting(task)
+        self.actions = len(self.acting)
+        self.choices = tuple(len(a.values) for a in self.acting if a.values)
+        if self.choices and len(self.choices) != self.actions:
+            raise FormulaError(
+                f"{type(task).__name__}.action mixes lists of values with ranges; "
+                "give each control one or each the other"
+            )
+        self.clipped = not self.choices
+        self.target_boxes = _target_boxes(task)
+        self.targets = len(self.target_boxes)
+        self.draws = task.draws
+        self._starts = _starts(task)
+        self.has_last = type(task).last_reward is not Task.last_reward
+        self.observation = self._names()
+
+    # --- constants ------------------------------------------------------------------------------------------
+
+    def constants(self) -> dict[str, float]:
+        """Return every number that compiled functions take, by name."""
+        task, scene = self._task, self._task.scene
+        found = dict(scene._constants())
+        found |= {f"self_{name}": float(getattr(scene, name)) for name in scene._numbers()}
+        for i, name in enumerate(self.state):
+            found[f"centre{i}"], found[f"half{i}"] = self._starts[name]
+        if task.fixed_target is not None:
+            found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
+        found |= {name: task.chance(p) for p, name in self._chances.items()}
+        found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
+        return found | {"x": float(scene._order(task.dt))}
+
+    @property
+    def key(self) -> tuple:
+        """What decides the code: tasks of a class that agree in it differ in their numbers only."""
+        scene = self._task.scene
+        formulas = tuple(getattr(type(self._task), name) for name in FORMULAS)
+        acting = tuple(self.acting)
+        plain = (self._task.scaled, self.draws, tuple(self.target_boxes))
+        return scene.mechanics.key, self._task.variant, formulas, acting, plain
+
+    def refusal(self, *arguments: Any) -> StepRefused:
+        """Return the error for a step that was refused."""
+        return self._task.scene._refusal(*arguments)
+
+    def stepper(self, absent: frozenset[str]) -> Any:
+        """Return the code of a control step."""
+        return self._task.scene._stepper.code(absent)
+
+    # --- formulas -------------------------------------------------------------------------------------------
+
+    def _self(self, k: Any) -> Task:
+        """Return a task whose numbers are those that are recorded."""
+        task = copy.copy(self._task)
+        vars(task).pop("formulas", None)
+        names = self._task.scene._numbers()
+        task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
+        task.dt = k.dt
+        vars(task)["_recorded_chance"] = lambda p: getattr(
+            k, self._chances.setdefault(p, f"chance{len(self._chances)}")
+        )
+        return task
+
+    def _state(self, y: Sequence) -> Values:
+        layout = self._task.scene._layout
+        names = dict(zip(self.state, y, strict=False))
+        rates = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
+        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
+        return Values("entry of the state", names, hidden)
+
+    def _targets(self, g: Sequence) -> Values:
+        return Values("target", dict(zip((t.name for t in self.target_boxes), g, strict=True)))
+
+    def _applied(self, u: Sequence) -> Values:
+        return Values("control", dict(zip(self._controls, u, strict=True)))
+
+    def _call(self, name: str, k: Any, *arguments: Any) -> Any:
+        with formula(self._task, name):
+            return getattr(self._self(k), name)(*arguments)
+
+    def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the controls that are applied."""
+        wanted = dict.fromkeys(self._controls, 0.0)
+        for acting, number in zip(self.acting, a, strict=True):
+            wanted[acting.control] = _control(acting, number, xp)
+        if type(self._task).guard is Task.guard:
+            return list(wanted.values())
+        given = Values("control", wanted)
+        found = self._call("guard", k, given, self._state(y), k.dt, xp)
+        if isinstance(found, Values):
+            return list(found)
+        if not isinstance(found, Mapping):
+            if len(self.acting) != 1:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard must return controls by name, got {found!r:.60}"
+                )
+            found = {self.acting[0].control: found}
+        for name in found:
+            if name not in wanted:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard: there is no control {name!r}, "
+                    f"only {', '.join(wanted)}"
+                )
+        return list((wanted | dict(found)).values())
+
+    def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
+        """Return the reward, and whether the episode is over."""
+        ended = self._call("terminated", k, self._state(z), self._targets(g), xp)
+        return self._reward("reward", xp, y, z, u, g, k), ended
+
+    def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that terminates."""
+        return self._reward("last_reward", xp, y, z, u, g, k)
+
+    def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        value = self._call(
+            name, k, self._state(y), self._state(z), self._applied(u), self._targets(g), k.dt, xp
+        )
+        if value is None or isinstance(value, Mapping | Sequence):
+            raise FormulaError(
+                f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
+            )
+        return k.scale * value if self._task.scaled else value
+
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
+        """Return the state after a kick."""
+        added = self._call("kick", k, self._state(z), draws, xp)
+        after = dict(zip(self.state, z, strict=False))
+        for name, value in added.items():
+            if name not in after:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.kick: there is no entry {name!r} of the state, "
+                    f"only {', '.join(self.state)}"
+                )
+            after[name] = after[name] + value
+        return list(after.values())
+
+    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> list:
+        """Return the observation."""
+        found = self._call("observe", k, self._state(y), self._targets(g), xp)
+        if not isinstance(found, Mapping) or not found:
+            raise FormulaError(
+                f"{type(self._task).__name__}.observe must return numbers by name, in order, "
+                f"got {found!r:.60}"
+            )
+        return list(found.values())
+
+    def _names(self) -> tuple[str, ...]:
+        """Run all formulas once, for their errors and for the observation's names."""
+        trace = self.trace()
+
+        class Inputs:
+            def __getattr__(self, name: str) -> Any:
+                return trace.inputs(name)[0]
+
+        k = Inputs()
+        y, z = ([trace.inputs(f"{letter}{i}")[0] for i in range(len(self.state))] for letter in "yz")
+        a = [trace.inputs(f"a{i}")[0] for i in range(self.actions)]
+        u = [trace.inputs(f"u{i}")[0] for i in range(self.controls)]
+        g = [trace.inputs(f"g{i}")[0] for i in range(self.targets)]
+        self.control(trace, a, y, g, k)
+        self.judge(trace, y, z, u, g, k)
+        if self.has_last:
+            self.last(trace, y, z, u, g, k)
+        if self.draws:
+            self.kick(trace, [trace.inputs(f"d{i}")[0] for i in range(self.draws)], z, k)
+        self.observe(trace, y, g, k)
+        return tuple(self._call("observe", k, self._state(y), self._targets(g), trace))
+
+    def sample_targets(self, draws: Sequence, k: Any) -> list:
+        """Return targets from draws in [0, 1)."""
+        if self._task.fixed_target is not None:
+            return [k[f"goal{i}"] for i in range(self.targets)]
+        return [t.centre + t.half * (2.0 * d - 1.0) for t, d in zip(self.target_boxes, draws, strict=True)]
+
+    def lift(self, y: str) -> list[str]:
+        """Return the lines that complete the state: none."""
+        return []
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return the lowest and highest values of the observation's entries."""
+        given = dict(self._task.bounds())
+        for name in given:
+            if name not in self.observation:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.bounds: there is no observation {name!r}, "
+                    f"only {', '.join(self.observation)}"
+                )
+        low, high = [], []
+        for name in self.observation:
+            bound = given.get(name, _UNBOUNDED)
+            pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
+            low.append(max(float(pair[0]), -_UNBOUNDED))
+            high.append(min(float(pair[1]), _UNBOUNDED))
+        return low, high
+
+
+def _control(acting: Acting, a: Any, xp: Any) -> Any:
+    if acting.values:
+        value: Any = acting.values[-1]
+        for i in reversed(range(len(acting.values) - 1)):
+            value = xp.where(a < i + 0.5, acting.values[i], value)
+        return value
+    if acting.low == -acting.high:
+        return acting.high * a
+    return acting.low + (acting.high - acting.low) * (0.5 + 0.5 * a)
+
+
+def _numbers_of(where: str, value: Any) -> tuple[float, ...]:
+    try:
+        return tuple(check_number(where, v) for v in value)
+    except (TypeError, ValueError) as error:
+        raise FormulaError(f"{where}: {error}") from error
+
+
+def _mapping(task: Task, name: str) -> dict[str, Any]:
+    value = getattr(task if name != "target" else type(task), name)
+    if not isinstance(value, Mapping):
+        raise FormulaError(f"{type(task).__name__}.{name} must map names to numbers, got {value!r:.60}")
+    return dict(value)
+
+
+def _acting(task: Task) -> list[Acting]:
+    of, known = type(task).__name__, task.scene.control_names
+    found = []
+    for name, given in _mapping(task, "action").items():
+        where = f"{of}.action[{name!r}]"
+        if name not in known:
+            raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
+        if isinstance(given, list):
+            values = _numbers_of(where, given)
+            if len(values) < 2:
+                raise FormulaError(f"{where} must list at least two values, got {given!r}")
+            found.append(Acting(name, min(values), max(values), values))
+            continue
+        low, high = (
+            _numbers_of(where, given if isinstance(given, tuple) else (given,))
+            if isinstance(given, tuple)
+            else (-check_number(where, given), check_number(where, given))
+        )
+        if not low < high:
+            raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
+        found.append(Acting(name, low, high))
+    if known and not found:
+        raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
+    return found
+
+
+def _target_boxes(task: Task) -> list[TargetBox]:
+    of, found = type(task).__name__, []
+    for name, given in _mapping(task, "target").items():
+        where = f"{of}.target[{name!r}]"
+        if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
+            raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
+        *centre, half = _numbers_of(where, given[1:])
+        found.append(TargetBox(name, given[0], centre[0] if centre else 0.0, half))
+    return found
+
+
+def _starts(task: Task) -> dict[str, tuple[float, float]]:
+    of, names = type(task).__name__, task.scene.state_names
+    found = dict.fromkeys(names, (0.0, 0.0))
+    for name, given in _mapping(task, "start").items():
+        where = f"{of}.start[{name!r}]"
+        if name not in found:
+            raise FormulaError(f"{where}: the state has no such entry, only {', '.join(names)}")
+        if isinstance(given, tuple) and len(given) != 2:
+            raise FormulaError(f"{where} must be a half width or (centre, half width), got {given!r}")
+        pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
+        found[name] = pair[0], pair[1]
+    return found

@@ -1,0 +1,64 @@
+"""Tasks as environments of Gymnasium."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import gymnasium as gym
+
+
+def register(task: str | type[Any], *, id: str | None = None, **options: Any) -> str:
+    """Register a task with Gymnasium, so that `gym.make` and `gym.make_vec` make it.
+
+    Parameters
+    ----------
+    task : type or str
+        The task's class, or where it stands: ``"module:Class"``.
+    id : str, optional
+        Name of the environment; by default the class's own ``id``.
+    **options
+        Parameters of the scene and of the task that differ from their defaults.
+
+    Returns
+    -------
+    str
+        The environment's id.
+
+    Raises
+    ------
+    ValueError
+        Where there is no id.
+
+    Notes
+    -----
+    A class that can be imported is registered by its place, so that specifications survive JSON. One that
+    stands in a notebook or inside a function is registered itself; worker processes then need cloudpickle,
+    which Gymnasium's `AsyncVectorEnv` and Stable-Baselines3's `SubprocVecEnv` use.
+    """
+    if isinstance(task, type):
+        id = id or getattr(task, "id", "")
+        if not id:
+            raise ValueError(f'{task.__name__} has no id; write id = "{task.__name__}-v0" into the class')
+        task = _place(task)
+    if not id:
+        raise ValueError(f"an id is needed to register {task!r}")
+    gym.register(
+        id,
+        entry_point="lag_envs.envs.single:LagrangianEnv",
+        vector_entry_point="lag_envs.envs.vector:LagrangianVectorEnv",
+        order_enforce=False,  # the environment itself refuses a step before its reset
+        kwargs={"task": task, **options},
+    )
+    return id
+
+
+def _place(task: type[Any]) -> str | type[Any]:
+    """Return "module:Class" where that leads to the class, else the class."""
+    found: Any = sys.modules.get(task.__module__)
+    if task.__module__ == "__main__" and not hasattr(found, "__file__"):
+        return task  # a notebook or a prompt: another process would not find it
+    for part in task.__qualname__.split("."):
+        found = getattr(found, part, None)
+    # While its module runs, a class that registers itself by a decorator is not there yet.
+    return f"{task.__module__}:{task.__qualname__}" if found is task else task

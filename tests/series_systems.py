@@ -1,0 +1,348 @@
+"""Eight systems for the tests of the series: energies as a scene states them, and equations typed in by hand.
+
+The equations give mass matrix and right-hand side in plain arithmetic and a few functions, so they run on
+floats, on mpmath's numbers and on series of python-flint. Nothing of the package is used for them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.scenes.contract import Scene, parameter
+
+
+class System(NamedTuple):
+    """A scene, and what to hold it against.
+
+    ``motion(q, v, u, s, a, xp)`` returns mass matrix and right-hand side; s and a are the place and the
+    acceleration of the prescribed coordinate. ``places`` and ``speeds`` are half widths of the harsh states
+    that are drawn around ``centre``, ``push`` those of the controls.
+    """
+
+    scene: Scene
+    motion: Callable
+    places: tuple[float, ...]
+    speeds: tuple[float, ...]
+    push: tuple[float, ...] = ()
+    centre: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return type(self.scene).__name__
+
+    @property
+    def driven(self) -> bool:
+        return bool(self.scene.prescribed)
+
+    def draw(self, generator: np.random.Generator, part: float = 1.0) -> tuple[list[float], list[float]]:
+        """Return a random state in the scene's order, and random controls."""
+        state = [0.3, -0.8] if self.driven else []
+        centre = self.centre or (0.0,) * len(self.places)
+        for c, place, speed in zip(centre, self.places, self.speeds, strict=True):
+            state += [c + place * generator.uniform(-1, 1), part * speed * generator.uniform(-1, 1)]
+        return state, [part * push * generator.uniform(-1, 1) for push in self.push]
+
+
+class CartPole(Scene):
+    """A pole hinged on a cart that a force pushes."""
+
+    cart: float = parameter(1.0, "kg", above=0.0)
+    pole: float = parameter(0.1, "kg", above=0.0)
+    length: float = parameter(0.5, "m", above=0.0)
+    gravity: float = parameter(9.8, "m/s²", least=0.0)
+    friction: float = parameter(0.05, "N s/m", least=0.0)
+    coordinates = {"x": "m", "theta": "rad"}
+    controls = {"force": "N"}
+
+    def kinetic(self, q, v, xp):
+        across = v.x + self.length * v.theta * xp.cos(q.theta)
+        up = self.length * v.theta * xp.sin(q.theta)
+        turning = self.pole * self.length**2 / 3 * v.theta**2
+        return (self.cart * v.x**2 + self.pole * (across**2 + up**2) + turning) / 2
+
+    def potential(self, q, xp):
+        return self.pole * self.gravity * self.length * xp.cos(q.theta)
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.friction * v.x**2
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force}
+
+
+def cart_pole(q, v, u, s, a, xp):
+    m, length, c = 0.1, 0.5, xp.cos(q[1])
+    mass = [[1.0 + m, m * length * c], [m * length * c, 4 * m * length**2 / xp.number(3)]]
+    return mass, [
+        u[0] - 0.05 * v[0] + m * length * v[1] * v[1] * xp.sin(q[1]),
+        m * 9.8 * length * xp.sin(q[1]),
+    ]
+
+
+class Acrobot(Scene):
+    """Two bars, the second angle relative to the first, a torque at the elbow, smooth dry friction."""
+
+    mass: float = parameter(0.8, "kg", above=0.0)
+    length: float = parameter(0.9, "m", above=0.0)
+    viscous: float = parameter(0.1, "N m s", least=0.0)
+    dry: float = parameter(0.2, "N m", least=0.0)
+    coordinates = {"shoulder": "rad", "elbow": "rad"}
+    controls = {"torque": "N m"}
+
+    def kinetic(self, q, v, xp):
+        m, half = self.mass, self.length / 2
+        inertia = m * self.length**2 / 12
+        both = v.shoulder + v.elbow
+        second = q.shoulder + q.elbow
+        across = 2 * half * v.shoulder * xp.cos(q.shoulder) + half * both * xp.cos(second)
+        up = 2 * half * v.shoulder * xp.sin(q.shoulder) + half * both * xp.sin(second)
+        return (
+            0.5 * (m * half**2 + inertia) * v.shoulder**2
+            + 0.5 * m * (across**2 + up**2)
+            + 0.5 * inertia * both**2
+        )
+
+    def potential(self, q, xp):
+        weight, half = 9.81 * self.mass, self.length / 2
+        return -weight * (3 * half * xp.cos(q.shoulder) + half * xp.cos(q.shoulder + q.elbow))
+
+    def dissipation(self, q, v, u, xp):
+        w = v.elbow
+        dry = w * xp.atan(100 * w) - xp.log(1 + 10_000 * w**2) / 200
+        return 0.5 * self.viscous * (v.shoulder**2 + w**2) + self.dry * dry
+
+    def applied(self, q, v, u, xp):
+        return {"elbow": u.torque}
+
+
+def acrobot(q, v, u, s, a, xp):
+    m, length = xp.number(0.8), xp.number(0.9)
+    bar, half = m * length**2 / 3, m * length**2 / 2
+    c, sine = xp.cos(q[1]), xp.sin(q[1])
+    mixed = bar + half * c
+    w, both = v[1], v[0] + v[1]
+    weight = 9.81 * m * length / 2
+    lower = weight * xp.sin(q[0] + q[1])
+    force = half * sine * (both * both - v[0] * v[0]) - 3 * weight * xp.sin(q[0]) - lower - 0.1 * v[0]
+    elbow = -half * sine * v[0] * v[0] - lower + u[0] - 0.1 * w - 0.2 * xp.atan(100 * w)
+    return [[bar + m * length**2 + 2 * half * c + bar, mixed], [mixed, bar]], [force, elbow]
+
+
+class _Chain(Scene):
+    """Point masses on a support that is moved; absolute angles, friction in the joints."""
+
+    mass: float = parameter(0.1, "kg", above=0.0)
+    length: float = parameter(0.3, "m", above=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    friction: float = parameter(1e-4, "N m s", least=0.0)
+    bars: int = 2
+    prescribed = {"s": "m"}
+    controls = {"s_ddot": "m/s²"}
+
+    @property
+    def coordinates(self):
+        return {f"theta{i}": "rad" for i in range(1, self.bars + 1)}
+
+    def kinetic(self, q, v, xp):
+        across, up, total = v.s, 0.0, 0.0
+        for i in range(self.bars):
+            across = across + self.length * v[i] * xp.cos(q[i])
+            up = up + self.length * v[i] * xp.sin(q[i])
+            total = total + 0.5 * self.mass * (across**2 + up**2)
+        return total
+
+    def potential(self, q, xp):
+        weight = self.mass * self.gravity * self.length
+        return sum(-weight * (self.bars - i) * xp.cos(q[i]) for i in range(self.bars))
+
+    def dissipation(self, q, v, u, xp):
+        rates = [v[i] - (v[i - 1] if i else 0.0) for i in range(self.bars)]
+        return sum(0.5 * self.friction * rate**2 for rate in rates)
+
+
+class DoublePendulum(_Chain):
+    """Two of them."""
+
+
+class TriplePendulum(_Chain):
+    """Three of them."""
+
+    bars: int = 3
+
+
+def chain(q, v, u, s, a, xp):
+    n = len(q)
+    m, length, friction = xp.number(0.1), xp.number(0.3), 1e-4
+    mass: list[list] = [[None] * n for _ in range(n)]
+    force = []
+    for i in range(n):
+        total = -m * length * (n - i) * (9.81 * xp.sin(q[i]) + a * xp.cos(q[i]))
+        total = total - friction * (v[i] - (v[i - 1] if i else 0.0))
+        if i + 1 < n:
+            total = total + friction * (v[i + 1] - v[i])
+        for j in range(n):
+            weight = m * length * length * (n - max(i, j))
+            mass[i][j] = weight * xp.cos(q[i] - q[j])
+            if i != j:
+                total = total - weight * xp.sin(q[i] - q[j]) * v[j] * v[j]
+        force.append(total)
+    return mass, force
+
+
+class RotaryPendulum(Scene):
+    """A pendulum hinged on an arm that a torque turns in the plane (Furuta)."""
+
+    arm: float = parameter(0.2, "m", above=0.0)
+    length: float = parameter(0.15, "m", above=0.0)
+    mass: float = parameter(0.1, "kg", above=0.0)
+    inertia: float = parameter(2e-3, "kg m²", above=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    drag: float = parameter(1e-3, "N m s", least=0.0)
+    coordinates = {"phi": "rad", "theta": "rad"}
+    controls = {"torque": "N m"}
+
+    def kinetic(self, q, v, xp):
+        along = self.arm * v.phi + self.length * v.theta * xp.cos(q.theta)
+        out = self.length * v.phi * xp.sin(q.theta)
+        up = self.length * v.theta * xp.sin(q.theta)
+        return 0.5 * self.inertia * v.phi**2 + 0.5 * self.mass * (along**2 + out**2 + up**2)
+
+    def potential(self, q, xp):
+        return self.mass * self.gravity * self.length * xp.cos(q.theta)
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.drag * v.phi**2
+
+    def applied(self, q, v, u, xp):
+        return {"phi": u.torque}
+
+
+def rotary(q, v, u, s, a, xp):
+    m, r, length = xp.number(0.1), xp.number(0.2), xp.number(0.15)
+    c, sine = xp.cos(q[1]), xp.sin(q[1])
+    square = m * length**2
+    mixed = m * r * length * c
+    phi = u[0] - 1e-3 * v[0] - 2 * square * sine * c * v[0] * v[1] + m * r * length * sine * v[1] * v[1]
+    theta = square * sine * c * v[0] * v[0] + m * 9.81 * length * sine
+    return [[2e-3 + m * r**2 + square * sine * sine, mixed], [mixed, square + 0 * c]], [phi, theta]
+
+
+class ElasticPendulum(Scene):
+    """A ball on a spring, in Cartesian coordinates; the spring hangs on a support that is moved."""
+
+    mass: float = parameter(0.3, "kg", above=0.0)
+    stiffness: float = parameter(40.0, "N/m", above=0.0)
+    length: float = parameter(0.4, "m", above=0.0)
+    gravity: float = parameter(9.81, "m/s²", least=0.0)
+    coordinates = {"x": "m", "y": "m"}
+    prescribed = {"s": "m"}
+    controls = {"s_ddot": "m/s²"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * self.mass * (v.x**2 + v.y**2)
+
+    def potential(self, q, xp):
+        stretch = xp.sqrt((q.x - q.s) ** 2 + q.y**2) - self.length
+        return 0.5 * self.stiffness * stretch**2 + self.mass * self.gravity * q.y
+
+
+def elastic(q, v, u, s, a, xp):
+    across = q[0] - s
+    r = xp.sqrt(across * across + q[1] * q[1])
+    pull = -40 * (1 - xp.number(0.4) / r)
+    m = xp.number(0.3)
+    return [[m, 0.0], [0.0, m]], [pull * across, pull * q[1] - m * 9.81]
+
+
+class TurningFrame(Scene):
+    """A mass in a bowl on a table that turns at a constant rate, driven by a force: T has parts T1 and T0."""
+
+    mass: float = parameter(0.5, "kg", above=0.0)
+    rate: float = parameter(7.0, "rad/s")
+    stiffness: float = parameter(30.0, "N/m", above=0.0)
+    skew: float = parameter(25.0, "N/m²")
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"push": "N", "pull": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * self.mass * ((v.x - self.rate * q.y) ** 2 + (v.y + self.rate * q.x) ** 2)
+
+    def potential(self, q, xp):
+        return 0.5 * self.stiffness * (q.x**2 + q.y**2) + self.skew * (q.x**2 * q.y - q.y**3 / 3)
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.push, "y": u.pull}
+
+
+def turning(q, v, u, s, a, xp):
+    m, rate = xp.number(0.5), xp.number(7.0)
+    x, y = q
+    inward = m * rate**2 - 30
+    return [[m, 0.0], [0.0, m]], [
+        2 * m * rate * v[1] + inward * x - 50 * x * y + u[0],
+        -2 * m * rate * v[0] + inward * y - 25 * (x * x - y * y) + u[1],
+    ]
+
+
+class Lattice(Scene):
+    """Exponential, logarithm, hyperbolic tangent and reciprocals, in mass, forces and drag."""
+
+    light: float = parameter(0.2, "kg", above=0.0)
+    stiffness: float = parameter(12.0, "N/m", above=0.0)
+    steep: float = parameter(1.5, "1/m", above=0.0)
+    drag: float = parameter(0.7, "N", least=0.0)
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"force": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2 + 0.5 * (self.light + 1 / (1 + q.x**2)) * v.y**2
+
+    def potential(self, q, xp):
+        bond = xp.exp(-self.steep * (q.x - q.y)) + self.steep * (q.x - q.y)
+        return self.stiffness * bond + 3 * xp.log(1 + q.y**2) + 0.5 * self.stiffness * q.x**2
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force, "y": -self.drag * xp.tanh(5 * v.y)}
+
+
+def lattice(q, v, u, s, a, xp):
+    x, y = q
+    one = 1 / (1 + x * x)
+    bond = 18 * (1 - xp.exp(-1.5 * (x - y)))
+    return [[1.0 + 0 * x, 0.0], [0.0, xp.number(0.2) + one]], [
+        u[0] - x * one * one * v[1] * v[1] - bond - 12 * x,
+        bond - 6 * y / (1 + y * y) + 2 * x * one * one * v[0] * v[1] - xp.number(0.7) * xp.tanh(5 * v[1]),
+    ]
+
+
+SYSTEMS = (
+    System(CartPole(), cart_pole, (2.0, 3.1), (3.0, 12.0), (10.0,)),
+    System(Acrobot(), acrobot, (3.1, 3.1), (6.0, 8.0), (2.0,)),
+    System(DoublePendulum(), chain, (3.1, 3.1), (10.0, 10.0), (15.0,)),
+    System(TriplePendulum(), chain, (3.1, 3.1, 3.1), (8.0, 8.0, 8.0), (15.0,)),
+    System(RotaryPendulum(), rotary, (3.1, 3.1), (10.0, 10.0), (0.1,)),
+    System(ElasticPendulum(), elastic, (0.35, 0.35), (3.0, 3.0), (15.0,), (0.3, -0.3)),
+    System(TurningFrame(), turning, (0.5, 0.5), (4.0, 4.0), (3.0, 3.0)),
+    System(Lattice(), lattice, (1.0, 1.0), (4.0, 4.0), (5.0,)),
+)
+
+
+def acceleration(system: System, q: list, v: list, u: list, s: Any, a: Any, xp: Any) -> list:
+    """Return the accelerations, by elimination on numbers of any kind."""
+    mass, force = system.motion(q, v, u, s, a, xp)
+    n = len(force)
+    rows = [[*row, b] for row, b in zip(mass, force, strict=True)]
+    for i in range(n):
+        for j in range(i + 1, n):
+            factor = rows[j][i] / rows[i][i]
+            rows[j] = [x - factor * y for x, y in zip(rows[j], rows[i], strict=True)]
+    result: list = [None] * n
+    for i in reversed(range(n)):
+        total = rows[i][n]
+        for j in range(i + 1, n):
+            total = total - rows[i][j] * result[j]
+        result[i] = total / rows[i][i]
+    return result

@@ -1,0 +1,807 @@
+"""The contract of a scene: how a class is made, what it declares, and what follows."""
+
+import copy
+import dataclasses
+import gc
+import inspect
+import itertools
+import math
+import pickle
+import subprocess
+import sys
+import threading
+import weakref
+from types import MappingProxyType
+
+import cloudpickle
+import contract_scenes
+import gymnasium as gym
+import numpy as np
+import pytest
+import sympy
+from sympy.physics.vector import dynamicsymbols
+
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.scenes.acrobot import Acrobot
+from lag_envs.scenes.cart_pole import CartPole
+from lag_envs.scenes.chain import Chain
+from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.new_cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.new_incline import Incline
+from lag_envs.scenes.new_pivoted_bar import PivotedBar
+from lag_envs.scenes.rotary_pendulum import RotaryPendulum
+from lag_envs.scenes.two_link_arm import TwoLinkArm
+
+# --- how a class is made -----------------------------------------------------------------------------------
+
+
+def cart(decorate):
+    """Return the same class with or without the decorator."""
+
+    class Cart(Scene):
+        """A cart on a spring."""
+
+        mass: float = parameter(1.0, "kg", above=0.0)
+        spring: float = parameter(2.0, "N/m", least=0.0)
+        springs: int = 1
+        pair: tuple = dataclasses.field(default_factory=tuple)
+        coordinates = {"x": "m"}
+        controls = {"force": "N"}
+
+        def kinetic(self, q, v, xp):
+            return self.mass * v.x**2 / 2
+
+        def potential(self, q, xp):
+            return self.springs * self.spring * q.x**2 / 2
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.force}
+
+    return dataclasses.dataclass(frozen=True, kw_only=True)(Cart) if decorate else Cart
+
+
+both = pytest.mark.parametrize("decorate", [False, True], ids=["plain", "decorated"])
+
+
+@both
+def test_class_is_a_frozen_dataclass_with_and_without_the_decorator(decorate):
+    cls = cart(decorate)
+    assert list(inspect.signature(cls).parameters) == ["mass", "spring", "springs", "pair"]
+    scene = cls(mass=2.0, springs=3)
+    assert repr(scene).endswith("Cart(mass=2.0, spring=2.0, springs=3, pair=())")
+    assert scene == cls(mass=2.0, springs=3) != cls()
+    assert hash(scene) == hash(cls(mass=2.0, springs=3))
+    assert dataclasses.replace(scene, spring=1.0).acceleration([1.0, 0.0])["x"] == -1.5
+    assert [f.name for f in dataclasses.fields(cls)] == ["mass", "spring", "springs", "pair"]
+    assert cls.mass == 1.0
+    for change in (
+        lambda: setattr(scene, "mass", 3.0),
+        lambda: setattr(scene, "other", 3.0),
+        lambda: delattr(scene, "mass"),
+    ):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            change()
+    with pytest.raises(TypeError, match="width"):
+        cls(width=1.0)
+    with pytest.raises(TypeError):
+        cls(2.0)
+
+
+def test_other_ways_of_dataclasses():
+    """Slots, positional fields, an __init__ of one's own, an annotation that says it is none."""
+    from typing import ClassVar
+
+    @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
+    class Slots(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+
+        def potential(self, q, xp):
+            return self.spring * (q.x - self.width) ** 2 / 2
+
+    @dataclasses.dataclass(frozen=True)
+    class Positional(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+        coordinates: ClassVar = {"x": "m"}
+
+    class Own(cart(False)):
+        def __init__(self, width):
+            for name, value in {"mass": width, "spring": 2.0, "springs": 1, "pair": ()}.items():
+                object.__setattr__(self, name, value)
+
+    slots = Slots(width=1.0)
+    assert slots.acceleration([1.5, 0.0])["x"] == -1.0
+    assert copy.deepcopy(slots) == copy.copy(slots) == slots and copy.copy(Own(2.0)) == Own(2.0)
+    assert dataclasses.replace(slots, mass=2.0).acceleration([1.5, 0.0])["x"] == -0.5
+    assert Positional(0.25).width == 0.25
+    assert Own(4.0).acceleration([1.0, 0.0])["x"] == -0.5
+
+
+def test_singular_state_is_its_own_affair():
+    class Polar(Scene):
+        coordinates = {"r": "m", "phi": "rad"}
+
+        def kinetic(self, q, v, xp):
+            return (v.r**2 + q.r**2 * v.phi**2) / 2
+
+        def potential(self, q, xp):
+            return -1 / q.r
+
+    scene = Polar()
+    found = scene.acceleration([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0], [2.0, 0.0, 0.0, 1.0]])["r"]
+    assert found[0] == 0.0 and found[2] == 1.75 and not np.isfinite(found[1])
+    A, _ = scene.linearise([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+    assert np.isfinite(A[0]).all() and not np.isfinite(A[1]).all()
+
+
+@both
+def test_derived_class_inherits_parameters_and_formulas(decorate):
+    class Stiff(cart(decorate)):
+        cubic: float = parameter(4.0, "N/m³")
+
+        def potential(self, q, xp):
+            return super().potential(q, xp) + self.cubic * q.x**4 / 4
+
+    assert Stiff(mass=2.0).acceleration([1.0, 0.0], 2.0)["x"] == -2.0
+    assert list(inspect.signature(Stiff).parameters) == ["mass", "spring", "springs", "pair", "cubic"]
+
+
+@both
+def test_own_post_init_does_not_switch_the_checks_off(decorate):
+    class Own(cart(decorate)):
+        def __post_init__(self):
+            pass
+
+    with pytest.raises(ValueError, match="mass must be above 0 kg"):
+        Own(mass=-1.0)
+
+
+def test_declared_dicts_are_copies_that_cannot_be_changed():
+    mine = {"x": "m"}
+
+    class Cart(cart(False)):
+        coordinates = mine
+
+    mine["y"] = "m"
+    assert Cart().state_names == ("x", "x_dot")
+    assert isinstance(Cart.coordinates, MappingProxyType)
+    with pytest.raises(TypeError):
+        Cart.coordinates["y"] = "m"
+    with pytest.raises(TypeError):
+        Incline.modes["tilt"]["psi"] = "rad"
+
+
+def test_scene_itself_is_no_scene():
+    with pytest.raises(FormulaError, match="base"):
+        Scene()
+
+
+def test_parameter_made_from_others():
+    assert PivotedBar(mass=3.0, com_distance=2.0).inertia == 4.0
+    assert PivotedBar(mass=3.0, com_distance=2.0, inertia=None).inertia == 4.0
+    assert PivotedBar(inertia=0.0).inertia == 0.0
+    assert Incline().tilt == 0.26 and Incline(control="tilt").tilt is None
+    with pytest.raises(ValueError, match=r"tilt=0.1 rad would be ignored"):
+        Incline(control="tilt", tilt=0.1)
+    assert PivotedBar(track=math.inf).track == math.inf
+    with pytest.raises(ValueError, match="finite"):
+        PivotedBar(mass=math.inf)
+
+    class Uniform(cart(False)):
+        inertia: float = parameter(None, "kg m²", least=0.0)
+
+        def kinetic(self, q, v, xp):
+            inertia = self.mass / 3 if self.inertia is None else self.inertia
+            return inertia * v.x**2 / 2
+
+    assert Uniform().mass_matrix([0.0, 0.0]) == pytest.approx(1 / 3)
+    assert Uniform(inertia=4.0).mass_matrix([0.0, 0.0]) == 4.0
+
+
+def test_check_may_fill_in_as_before():
+    class Uniform(cart(False)):
+        inertia: float = parameter(None, "kg m²", least=0.0)
+
+        def check(self):
+            if self.inertia is None:
+                object.__setattr__(self, "inertia", self.mass / 3)
+
+        def kinetic(self, q, v, xp):
+            return self.inertia * v.x**2 / 2
+
+    assert Uniform(mass=6.0).mass_matrix([0.0, 0.0]) == 2.0
+
+
+def test_methods_and_properties_that_formulas_call_see_recorded_numbers():
+    class Cart(cart(False)):
+        @property
+        def doubled(self):
+            return 2 * self.spring
+
+        def energy_of(self, stretch):
+            return self.doubled * stretch**2 / 4
+
+        def potential(self, q, xp):
+            return self.energy_of(q.x)
+
+    assert {s.name for s in Cart().mechanics.record.energies.potential.symbols()} == {"spring", "x"}
+    assert Cart(spring=3.0).acceleration([1.0, 0.0])["x"] == -3.0
+    assert Cart(spring=3.0).doubled == 6.0
+
+
+# --- places, velocities and controls -----------------------------------------------------------------------
+
+
+def test_numbers_go_by_name_by_index_and_in_order():
+    class Chain3(Scene):
+        coordinates = {"a": "m", "b": "m", "c": "m"}
+        prescribed = {"s": "m"}
+        controls = {"first": "N", "second": "N"}
+
+        def kinetic(self, q, v, xp):
+            a, b, c, _ = v
+            assert len(v) == 4
+            return a * a / 2 + sum(w**2 for w in v[1:3]) / 2 + 0 * (b + c)
+
+        def potential(self, q, xp):
+            return sum(x**2 for x in q) / 2 + q[-1] * q.a + q["b"] ** 2
+
+        def applied(self, q, v, u, xp):
+            first, second = u
+            return {"a": first, "b": u[1], "c": u.second - second}
+
+    acceleration = Chain3().acceleration([1.0, 0.0, 2.0, 0.0, 3.0, 0.0], [10.0, 20.0])
+    assert list(acceleration.values()) == [9.0, 14.0, -3.0]
+
+
+def test_modes_share_formulas_and_leave_no_code():
+    assert Incline.control == "damping" and Acrobot().control_names == ("elbow_torque",)
+    for mode, names in (("damping", ("drag",)), ("tilt", ("phi",)), ("tilt_rate", ("phi_dot",))):
+        scene = Incline(control=mode)
+        assert scene.control_names == names
+        assert "drag" in scene.mechanics.text if mode == "damping" else "drag" not in scene.mechanics.text
+    with pytest.raises(ValueError, match="control must be one of damping, tilt, tilt_rate, got 'drag'"):
+        Incline(control="drag")
+
+    class Cart(cart(False)):
+        controls = {}
+        modes = {"pushed": {"force": "N"}, "free": {}}
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.force}
+
+    assert Cart().control == "pushed" and list(inspect.signature(Cart).parameters)[-1] == "control"
+    free = Cart(control="free")
+    assert free.control_names == () and "control" not in free.mechanics.force[0].text
+    assert free.acceleration([1.0, 0.0])["x"] == -2.0
+
+
+def test_structural_fields_may_branch_and_count():
+    for bars in (1, 2, 5):
+        names = Chain(bars=bars).state_names
+        assert len(names) == 2 + 2 * bars and names[-1] == f"theta_{bars}_dot"
+    for bad in (0, 1.5, True, "2"):
+        with pytest.raises(ValueError, match="bars must be a whole number above 0"):
+            Chain(bars=bad)
+
+
+def test_control_may_depend_on_a_structural_field():
+    class Motors(Scene):
+        n: int = 3
+
+        @property
+        def coordinates(self):
+            return {f"x_{i}": "m" for i in range(self.n)}
+
+        @property
+        def controls(self):
+            return {f"f_{i}": "N" for i in range(self.n)}
+
+        def kinetic(self, q, v, xp):
+            return sum(w**2 for w in v) / 2
+
+        def potential(self, q, xp):
+            return 0.0
+
+        def applied(self, q, v, u, xp):
+            return {f"x_{i}": u[i] for i in range(self.n)}
+
+    assert Motors(n=2).acceleration([0.0] * 4, [1.0, 2.0]) == {"x_0": 1.0, "x_1": 2.0}
+    assert Motors().control_units == ("N", "N", "N")
+
+
+# --- the state ---------------------------------------------------------------------------------------------
+
+
+def layout(controls, **declared):
+    """Return names and units of the state of a scene with free x and theta and prescribed s and h."""
+
+    class Free(Scene):
+        coordinates = {"x": "m", "theta": "rad"}
+        prescribed = {"s": "furlong", "h": ""}
+
+        def kinetic(self, q, v, xp):
+            return (v.x + v.s) ** 2 + (v.theta + v.h) ** 2
+
+        def potential(self, q, xp):
+            return q.x**2 + (q.theta) ** 2
+
+        def applied(self, q, v, u, xp):
+            return {"x": sum(x for name, x in zip(self.controls, u, strict=True) if name == "push")}
+
+    scene = type("Scene1", (Free,), {"controls": controls, **declared})()
+    return scene.state_names, scene.state_units
+
+
+@pytest.mark.parametrize(
+    ("controls", "names"),
+    [
+        ({}, "x x_dot theta theta_dot"),
+        ({"push": "N"}, "x x_dot theta theta_dot"),
+        ({"s_ddot": "a"}, "s s_dot x x_dot theta theta_dot"),
+        ({"h_ddot": "a"}, "h h_dot x x_dot theta theta_dot"),
+        ({"h_ddot": "a", "s_ddot": "a"}, "s s_dot h h_dot x x_dot theta theta_dot"),
+        ({"s_dot": "a"}, "s x w_x theta w_theta"),
+        ({"s_dot": "a", "h_ddot": "a"}, "s h h_dot x w_x theta w_theta"),
+        ({"s": "a"}, "x x_dot theta theta_dot"),
+        ({"s": "a", "h_dot": "a"}, "h x w_x theta w_theta"),
+    ],
+    ids=str,
+)
+def test_state_follows_from_the_names_of_the_controls(controls, names):
+    assert layout(controls)[0] == tuple(names.split())
+
+
+def test_units_are_never_read():
+    assert layout({"s_ddot": "acres", "h_ddot": ""})[1] == (
+        "furlong", "furlong/s", "", "1/s", "m", "m/s", "rad", "rad/s"
+    )  # fmt: skip
+    assert layout({"s_dot": "acres"})[1] == ("furlong", "m", "m/s", "rad", "rad/s")
+    assert CylinderInCylinder().control_units == ("rad/s²",)
+
+
+def test_order_and_omission_are_declared():
+    assert layout({"s_ddot": ""}, left_out=("s",))[0] == ("s_dot", "x", "x_dot", "theta", "theta_dot")
+    assert layout({"s_ddot": ""}, left_out=["s", "s_dot"])[0] == ("x", "x_dot", "theta", "theta_dot")
+    assert layout({"s_dot": ""}, left_out=("s",))[0] == ("x", "w_x", "theta", "w_theta")
+    turned = ("theta_dot", "x_dot", "theta", "x")
+    assert layout({}, state=turned)[0] == turned
+    assert Incline(control="tilt_rate").state_names == ("x", "w", "phi")
+
+
+def test_free_place_may_be_left_out():
+    class Coasting(Scene):
+        coordinates = {"x": "m", "theta": "rad"}
+        left_out = ("x",)
+
+        def kinetic(self, q, v, xp):
+            return v.x**2 + v.x * v.theta * xp.cos(q.theta) + v.theta**2
+
+        def potential(self, q, xp):
+            return -xp.cos(q.theta)
+
+    scene = Coasting()
+    assert scene.state_names == ("x_dot", "theta", "theta_dot")
+    whole = type("Whole", (Coasting,), {"left_out": ()})()
+    path = whole.simulate([5.0, 1.0, 0.2, 0.3], 3, 0.02)
+    np.testing.assert_array_equal(scene.simulate([1.0, 0.2, 0.3], 3, 0.02), path[:, 1:])
+    A, B = scene.linearise([1.0, 0.2, 0.3])
+    assert A.shape == (3, 3) and B.shape == (3, 0)
+
+
+# --- what follows ------------------------------------------------------------------------------------------
+
+
+def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same():
+    """In a denominator or a function it is put in at once; elsewhere code leaves out what it multiplies."""
+    damped = RotaryPendulum(damping=0.1)
+    assert damped.mechanics.key == RotaryPendulum(damping=0.2, mass=3.0).mechanics.key
+    assert RotaryPendulum()._code() is not damped._code() is RotaryPendulum(damping=0.2, mass=3.0)._code()
+
+    class Soft(cart(False)):
+        width: float = parameter(0.5, "m", least=0.0)
+        slope: float = parameter(0.0, "N", least=0.0)
+
+        def potential(self, q, xp):
+            return self.spring * xp.sqrt(1 + q.x**2 + self.width * q.x**4) + self.slope * q.x
+
+    assert "width" in Soft().mechanics.text and "width" not in Soft(width=0.0).mechanics.text
+    assert Soft(width=0.1).mechanics.key == Soft(width=0.2).mechanics.key != Soft(width=0.0).mechanics.key
+    assert Soft(width=0.0).acceleration([1.0, 0.0])["x"] == pytest.approx(-math.sqrt(2.0))
+
+
+def test_what_rests_leaves_no_code():
+    for scene in (PivotedBar(), *(Incline(control=mode) for mode in Incline.modes), CylinderInCylinder()):
+        for name in ("rise", "lift", "slip", "gap"):
+            assert f" {name}" not in "".join(f.text for f in scene.mechanics.force)
+
+
+def test_mechanics_says_how_prescribed_coordinates_are_moved():
+    class Rail(cart(False)):
+        prescribed = {"a": "m", "b": "m", "c": "m", "d": "m"}
+        controls = {"a_ddot": "", "b_dot": "", "c": "", "force": "N"}
+
+        def kinetic(self, q, v, xp):
+            return (v.x + v.a + v.b + v.c + v.d) ** 2
+
+        def potential(self, q, xp):
+            return (q.x + q.a + q.b + q.c + q.d) ** 2
+
+        def rests(self):
+            return {"d": 3 * self.mass}
+
+    found = Rail().mechanics
+    assert [(p.name, p.level, p.control) for p in found.prescribed] == [
+        ("a", "acceleration", "a_ddot"), ("b", "rate", "b_dot"), ("c", "place", "c"), ("d", "rest", None)
+    ]  # fmt: skip
+    assert found.free == ("x",)
+    kinds = {(s.kind, s.name) for s in found.force[0].symbols()}
+    assert kinds == {
+        ("place", "x"), ("place", "a"), ("place", "b"), ("control", "c"), ("control", "a_ddot"), ("control",
+        "force"), ("parameter", "mass"),
+    }  # fmt: skip
+    assert set(found.coupling) == {(0, "b")}
+
+
+def test_energy_reports_jacobis_integral_where_it_differs():
+    assert set(CartPole().energy([0.0] * 4)) == {"kinetic", "potential", "total"}
+    hoop = contract_scenes.RotatingHoop(rate=2.0, gravity=0.0, radius=1.0, mass=2.0)
+    energy = hoop.energy([math.pi / 2, 3.0])
+    assert energy == {"kinetic": 13.0, "potential": 0.0, "total": 13.0, "jacobi": 5.0}
+    charge = contract_scenes.ChargedParticle(growth=0.0, field=5.0)
+    energy = charge.energy([[1.0, 2.0, 0.0, 4.0]])
+    assert energy["kinetic"] == [30.0] and energy["jacobi"] == [10.25]
+
+
+def test_needed_friction_is_infinite_where_the_contact_carries_nothing():
+    shell = CylinderInCylinder(control="damping")
+    mu = shell.forces([[0.5, 0.0], [math.pi / 2, 0.0], [3.0, 0.0]])["needed_friction"]
+    assert mu[0] == pytest.approx(math.tan(0.5) / 3) and list(mu[1:]) == [math.inf, math.inf]
+    weightless = CylinderInCylinder(control="damping", gravity=0.0)
+    assert weightless.forces([0.0, 0.0])["needed_friction"] == math.inf
+    assert weightless.forces([0.0, 1.0])["needed_friction"] == 0.0
+
+
+def test_forces_of_what_moves_have_names():
+    class Rail(cart(False)):
+        prescribed = {"s": "m", "h": "m"}
+        controls = {"s_ddot": "m/s²"}
+
+        def kinetic(self, q, v, xp):
+            return self.mass * (v.x + v.s + v.h) ** 2 / 2
+
+        def applied(self, q, v, u, xp):
+            return {"s": 3.0}
+
+    # x' = -s' - spring x / m: the force on s is m (x'' + s'') - 3.
+    assert Rail().forces([0.0, 0.0, 1.0, 0.0], 5.0) == {"drive_s": -5.0}
+
+
+def test_control_may_stand_without_its_axis():
+    scene, states = CartPole(), np.random.default_rng(1).normal(size=(5, 4))
+    for control in (2.0, [2.0], np.full(5, 2.0), np.full((5, 1), 2.0)):
+        np.testing.assert_array_equal(
+            scene.acceleration(states, control)["x"], scene.acceleration(states, np.full(5, 2.0))["x"]
+        )
+    many = scene.acceleration(states[0], np.linspace(-1, 1, 7))["x"]
+    assert many.shape == (7,)
+    arm = TwoLinkArm()
+    assert arm.acceleration(states)["theta_1"].shape == (5,)
+    assert arm.acceleration(states, np.ones((5, 2)))["theta_1"].shape == (5,)
+    free = contract_scenes.ChargedParticle()
+    assert free.acceleration(states)["x"].shape == (5,)
+    assert free.acceleration(states, np.empty((5, 0)))["x"].shape == (5,)
+    with pytest.raises(ValueError, match="has none"):
+        free.acceleration(states, np.ones((5, 1)))
+
+
+# --- references --------------------------------------------------------------------------------------------
+
+
+def test_cart_pole_is_gymnasiums():
+    env = gym.make("CartPole-v1").unwrapped
+    env.tau = 1.0  # Euler's step of a second adds the acceleration
+    generator = np.random.default_rng(2)
+    for _ in range(50):
+        state, action = generator.uniform(-2, 2, 4), int(generator.integers(2))
+        env.reset(seed=1)
+        env.state, env.steps_beyond_terminated = state.copy(), None
+        with np.errstate(all="ignore"):
+            env.step(action)
+        found = CartPole().acceleration(state, 10.0 if action else -10.0)
+        expected = np.asarray(env.state, dtype=np.float64)[[1, 3]] - state[[1, 3]]
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_acrobot_is_gymnasiums():
+    env = gym.make("Acrobot-v1").unwrapped
+    scene = Acrobot(inertia_1=1.0, inertia_2=1.0, gravity=9.8)
+    generator = np.random.default_rng(3)
+    for _ in range(50):
+        theta_1, theta_2, rate_1, rate_2, torque = generator.uniform(-3, 3, 5)
+        expected = env._dsdt([theta_1, theta_2, rate_1, rate_2, torque])[2:4]
+        found = scene.acceleration([theta_1, rate_1, theta_2, rate_2], torque)
+        np.testing.assert_allclose(list(found.values()), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.1])
+def test_chain_of_one_bar_is_the_bar(damping):
+    bar = PivotedBar(mass=0.3, com_distance=0.4, damping=damping)
+    chain = Chain(bars=1, mass=0.3, length=0.8, damping=damping)
+    assert chain.inertia == pytest.approx(bar.inertia, rel=1e-15)
+    generator = np.random.default_rng(4)
+    states, controls = generator.normal(size=(50, 4)) * 3, generator.normal(size=50) * 5
+    np.testing.assert_allclose(
+        chain.acceleration(states, controls)["theta_1"],
+        bar.acceleration(states, controls)["theta"],
+        rtol=1e-13,
+    )
+    for call in ("energy", "forces", "power"):
+        mine, theirs = getattr(chain, call)(states, controls), getattr(bar, call)(states, controls)
+        for name, value in theirs.items():
+            np.testing.assert_allclose(mine[name], value, rtol=1e-12, atol=1e-12)
+
+
+def test_smooth_friction_is_what_it_says():
+    scene = Acrobot(damping=0.2, dry_friction=0.3, control="both")
+    bare = Acrobot(control="both")
+    generator = np.random.default_rng(5)
+    for rates in generator.normal(size=(20, 2)):
+        state = [0.4, rates[0], -0.7, rates[1]]
+        loss = np.array([0.2 * w + 0.3 * math.atan(100 * w) for w in rates])
+        expected = bare.acceleration(state, -loss)
+        for name, value in scene.acceleration(state).items():
+            assert value == pytest.approx(expected[name], rel=1e-12, abs=1e-12)
+        assert scene.power(state)["drag"] == pytest.approx(float(loss @ rates), rel=1e-12)
+
+
+def test_chains_are_alike_in_any_frame():
+    """Swinging on a support that is accelerated is swinging in a tilted field."""
+    chain, generator = Chain(bars=3, gravity=3.0), np.random.default_rng(6)
+    lean, field = math.atan2(4.0, 3.0), Chain(bars=3, gravity=5.0)
+    for _ in range(10):
+        angles, rates = generator.normal(size=(2, 3))
+        upright = np.concatenate([[0, 0], np.stack([angles + lean, rates], axis=1).ravel()])
+        tilted = np.concatenate([[0, 0], np.stack([angles, rates], axis=1).ravel()])
+        np.testing.assert_allclose(
+            list(chain.acceleration(tilted, 4.0).values()),
+            list(field.acceleration(upright, 0.0).values()),
+            rtol=1e-12,
+        )
+
+
+# --- SymPy -------------------------------------------------------------------------------------------------
+
+
+def test_lagrangian_is_t_less_v():
+    bar = PivotedBar(track=None)
+    names = "mass com_distance inertia gravity"
+    m, d, i, g = sympy.symbols(names, positive=True)
+    t = sympy.Symbol("t", real=True)
+    s, theta = (sympy.Function(name, real=True)(t) for name in ("s", "theta"))
+    along, up = s.diff(t) + d * theta.diff(t) * sympy.cos(theta), d * theta.diff(t) * sympy.sin(theta)
+    expected = m * (along**2 + up**2) / 2 + i * theta.diff(t) ** 2 / 2 + m * g * d * sympy.cos(theta)
+    assert sympy.expand(bar.lagrangian() - expected) == 0
+    fixed = Incline().lagrangian()
+    assert {str(f.func) for f in fixed.atoms(sympy.Function)} == {"sin", "cos", "x"}
+
+
+def test_equations_are_solved_by_the_accelerations():
+    from lag_envs.new_lagrange import equations
+
+    scene = CartPole(friction=0.2)
+    found = equations(scene)
+    assert len(found) == 2 and r"\frac{d^{2}}{d t^{2}} x" in sympy.latex(found[0])
+
+
+@pytest.mark.parametrize("functions_of_time", [False, True])
+def test_scene_of_sympys_expressions(functions_of_time):
+    m, l, g, b, tau = sympy.symbols("m l g b tau")  # noqa: E741
+    if functions_of_time:
+        x, theta = dynamicsymbols("x theta")
+        x_dot, theta_dot = x.diff(), theta.diff()
+    else:
+        x, theta, x_dot, theta_dot = sympy.symbols("x theta x_dot theta_dot")
+    along, up = x_dot + l * theta_dot * sympy.cos(theta), -l * theta_dot * sympy.sin(theta)
+    scene = Scene.from_sympy(
+        "Cart",
+        x_dot**2 / 2 + m * (along**2 + up**2) / 2 + m * l**2 * theta_dot**2 / 6,
+        m * g * l * sympy.cos(theta),
+        coordinates={x: "m", theta: "rad"},
+        controls={tau: "N"},
+        dissipation=b * x_dot**2 / 2,
+        applied={x: tau},
+        parameters={m: 0.1, l: 0.5, g: 9.8, b: 0.2},
+    )
+    twin = CartPole(friction=0.2)
+    assert type(scene).__name__ == "Cart" and scene.state_units == twin.state_units
+    states = np.random.default_rng(7).normal(size=(20, 4))
+    for name, value in twin.acceleration(states, 3.0).items():
+        np.testing.assert_allclose(scene.acceleration(states, 3.0)[name], value, rtol=1e-13)
+    np.testing.assert_allclose(scene.energy(states)["total"], twin.energy(states)["total"], rtol=1e-13)
+    assert scene(b=0.0).b == 0.0 and type(scene(b=0.0)) is type(scene)
+    for again in (
+        pickle.loads(pickle.dumps(scene)),
+        copy.deepcopy(scene),
+        cloudpickle.loads(cloudpickle.dumps(scene)),
+    ):
+        assert again == scene and type(again) is type(scene)
+
+
+def test_scene_of_sympys_expressions_has_all_functions():
+    q, q_dot, k = sympy.symbols("q q_dot k")
+    potential = sum(f(q / 3) for f in (sympy.sin, sympy.cos, sympy.tan, sympy.atan, sympy.tanh, sympy.exp))
+    potential += sympy.log(3 + q) + sympy.sqrt(3 + q) + 1 / sympy.sqrt(5 + q) + (4 + q) ** -2 + sympy.pi * q
+    scene = Scene.from_sympy(
+        "All", q_dot**2 * (k + sympy.Rational(1, 3)) / 2, potential, coordinates={q: "m"}, parameters={k: 1.0}
+    )
+    for x in (-0.3, 0.2, 1.0):
+        expected = -float(potential.diff(q).subs(q, x)) / (4 / 3)
+        assert scene.acceleration([x, 0.0])["q"] == pytest.approx(expected, rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("potential", "words"),
+    [
+        ("q + c", "c is neither a coordinate"),
+        ("Abs(q)", "Abs"),
+        ("sinh(q)", "sinh"),
+        ("q * t", "time"),
+        ("q ** 1.5", "power"),
+        ("q_dot ** 2", "q_dot is neither"),
+        ("I * q", "none of|neither|real"),
+        ("Piecewise((q, q > 0), (0, True))", "Piecewise"),
+    ],
+)
+def test_expressions_that_are_no_energy(potential, words):
+    q, q_dot = sympy.symbols("q q_dot")
+    with pytest.raises(FormulaError, match=rf"(?s)Odd\.potential.*({words})"):
+        Scene.from_sympy("Odd", q_dot**2, sympy.sympify(potential), coordinates={q: "m"})
+
+
+# --- anywhere ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        PivotedBar(track=None),
+        Incline(control="tilt_rate"),
+        Chain(bars=3),
+        Acrobot(control="both"),
+        CartPole(friction=1.0),
+    ],
+    ids=lambda s: type(s).__name__,
+)
+def test_copies_are_the_same(scene):
+    state = np.linspace(0.1, 0.9, len(scene.state_names))
+    control = np.linspace(0.5, 1.0, len(scene.control_names))
+    expected = scene.acceleration(state, control)  # fills what is cached
+    copies = [
+        pickle.loads(pickle.dumps(scene)),
+        copy.copy(scene),
+        copy.deepcopy(scene),
+        cloudpickle.loads(cloudpickle.dumps(scene)),
+    ]
+    for again in copies:
+        assert again == scene and type(again) is type(scene)
+        assert again.acceleration(state, control) == expected
+
+
+def test_class_that_no_module_has_goes_by_value():
+    """As classes of `__main__` and of notebooks do: cloudpickle, in another process; used before or not."""
+    sent = []
+    for decorate, used in itertools.product((False, True), repeat=2):
+        cls = cart(decorate)
+        sent.append((cls, cls(mass=2.0, pair=(1, 2)) if used else None))
+    code = (
+        "import sys, dataclasses, pickle\n"
+        "for cls, scene in map(pickle.loads, pickle.loads(sys.stdin.buffer.read())):\n"
+        "    scene = scene or cls(mass=2.0, pair=(1, 2))\n"
+        "    again = dataclasses.replace(scene, spring=4.0)\n"
+        "    print(again, again.acceleration([1.0, 0.0], 3.0)['x'], cls(springs=2) == cls(springs=2))\n"
+        "    try: cls(mass=-1.0)\n"
+        "    except ValueError as error: print(error)\n"
+    )
+    text = pickle.dumps([cloudpickle.dumps(one) for one in sent])
+    run = subprocess.run([sys.executable, "-c", code], input=text, capture_output=True, check=False)
+    lines = run.stdout.decode().splitlines()
+    assert len(lines) == 8, run.stderr.decode()
+    for first, second in zip(lines[::2], lines[1::2], strict=True):
+        assert first.endswith("Cart(mass=2.0, spring=4.0, springs=1, pair=(1, 2)) -0.5 True")
+        assert second == "mass must be above 0 kg, got -1 kg"
+
+
+MAIN = """
+import multiprocessing, pickle
+from lag_envs.scenes.contract import Scene, parameter
+
+class Cart(Scene):
+    mass: float = parameter(1.0, "kg", above=0.0)
+    coordinates = {"x": "m"}
+    def kinetic(self, q, v, xp): return self.mass * v.x**2 / 2
+    def potential(self, q, xp): return q.x**2 / 2
+
+def work(scene):
+    return scene.acceleration([1.0, 0.0])["x"]
+
+if __name__ == "__main__":
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        print(pool.map(work, [Cart(mass=2.0)])[0])
+"""
+
+
+def test_script_sends_its_scene_to_a_spawned_worker(tmp_path):
+    (tmp_path / "script.py").write_text(MAIN)
+    run = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], capture_output=True, text=True, check=False
+    )
+    assert run.stdout == "-0.5\n", run.stderr
+
+
+def test_classes_of_one_name_never_share():
+    """As a notebook's cell that is run again with another formula."""
+    scenes = []
+    for factor in (1, 2, 3):
+        space = {"Scene": Scene, "__name__": "__main__"}
+        exec(
+            "class Cart(Scene):\n"
+            "    coordinates = {'x': 'm'}\n"
+            "    def kinetic(self, q, v, xp): return v.x**2 / 2\n"
+            f"    def potential(self, q, xp): return {factor} * q.x**2 / 2\n",
+            space,
+        )
+        scenes.append(space["Cart"]())
+    assert [scene.acceleration([1.0, 0.0])["x"] for scene in scenes] == [-1.0, -2.0, -3.0]
+    assert len({scene.mechanics.key for scene in scenes}) == 3
+
+
+FACTOR = 1.0
+
+
+def test_formula_sees_what_it_uses_when_the_scene_is_made(monkeypatch):
+    class Cart(cart(False)):
+        def potential(self, q, xp):
+            return FACTOR * q.x**2
+
+    assert Cart().acceleration([1.0, 0.0])["x"] == -2.0
+    monkeypatch.setitem(globals(), "FACTOR", 5.0)
+    assert Cart().acceleration([1.0, 0.0])["x"] == -10.0
+
+
+def test_replaced_formula_is_looked_at_again(monkeypatch):
+    cls = cart(False)
+    assert cls().acceleration([1.0, 0.0])["x"] == -2.0
+    monkeypatch.setattr(cls, "potential", lambda self, q, xp: math.sin(q.x))
+    with pytest.raises(FormulaError, match="potential"):
+        cls()
+
+
+def test_classes_can_be_forgotten():
+    cls = cart(False)
+    cls().mechanics  # noqa: B018
+    gone = weakref.ref(cls)
+    del cls
+    gc.collect()
+    assert gone() is None
+
+
+def test_threads_share_a_scene():
+    scene, states = Chain(bars=3), np.random.default_rng(8).normal(size=(40, 8))
+    expected = Chain(bars=3).acceleration(states)["theta_2"]
+    found = []
+    threads = [
+        threading.Thread(target=lambda: found.append(scene.acceleration(states)["theta_2"])) for _ in range(8)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 8 and all((x == expected).all() for x in found)
+
+
+def test_sympy_is_not_loaded():
+    code = (
+        "import sys; from lag_envs.scenes.chain import Chain; Chain(bars=2).linearise([.1] * 6)\n"
+        "print([m for m in ('sympy', 'scipy', 'pygame', 'torch', 'matplotlib') if m in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"

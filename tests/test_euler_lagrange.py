@@ -1,0 +1,209 @@
+"""What is derived is Lagrange's: held against SymPy's derivatives in 40 digits, at random points."""
+
+import dataclasses
+import functools
+
+import contract_scenes
+import mpmath
+import numpy as np
+import pytest
+from lagrange_oracle import Oracle
+
+from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.recording import control, parameter
+from lag_envs.scenes.acrobot import Acrobot
+from lag_envs.scenes.cart_pole import CartPole
+from lag_envs.scenes.chain import Chain
+from lag_envs.scenes.new_cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.new_incline import Incline
+from lag_envs.scenes.new_pivoted_bar import PivotedBar
+from lag_envs.scenes.rotary_pendulum import RotaryPendulum
+from lag_envs.scenes.two_link_arm import TwoLinkArm
+
+PACKAGE = [
+    (PivotedBar, {}),
+    (PivotedBar, {"track": None}),
+    *((Incline, {"control": mode}) for mode in Incline.modes),
+    *((CylinderInCylinder, {"control": mode}) for mode in CylinderInCylinder.modes),
+    (CartPole, {}),
+    *((Acrobot, {"control": mode}) for mode in Acrobot.modes),
+    *((Chain, {"bars": n}) for n in (1, 2, 3)),
+    (RotaryPendulum, {}),
+    (TwoLinkArm, {}),
+]
+CASES = [*PACKAGE, *((scene, {}) for scene in contract_scenes.ALL)]
+SLOW = [(Chain, {"bars": n}) for n in (4, 5, 6)]
+IDS = ["-".join([s.__name__, *(f"{v}" for v in k.values())]) for s, k in [*CASES, *SLOW]]
+scenes = pytest.mark.parametrize(
+    "case",
+    [*CASES, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)],
+    ids=IDS,
+)
+
+
+def complete(case):
+    """Return a scene none of whose parameters is zero, so that all its terms are there."""
+    scene, keywords = case
+    made = scene(**keywords)
+    zero = [f.name for f in dataclasses.fields(made) if "unit" in f.metadata and getattr(made, f.name) == 0.0]
+    return scene(**keywords, **dict.fromkeys(zero, 0.3))
+
+
+@functools.cache
+def _oracle(scene):
+    return Oracle(scene)
+
+
+def symbols(point):
+    values = {place(name): x for name, x in point.q.items()} | {
+        velocity(name): x for name, x in point.v.items()
+    }
+    values |= {control(name): x for name, x in point.u.items()}
+    return values | {parameter(name): x for name, x in point.p.items()}
+
+
+def solved(mechanics, values):
+    n = len(mechanics.free)
+    mass = mpmath.matrix(n, n)
+    for i in range(n):
+        for j in range(n):
+            mass[i, j] = evaluate([mechanics.entry(i, j)], values, mpmath)[0]
+    right = mpmath.matrix(evaluate(mechanics.force, values, mpmath))
+    return list(mpmath.lu_solve(mass, right))
+
+
+@scenes
+def test_accelerations_and_forces_solve_lagranges_equations(case):
+    scene = complete(case)
+    oracle, mechanics = _oracle(scene), scene.mechanics
+    generator = np.random.default_rng(3)
+    with mpmath.workdps(40):
+        for _ in range(5):
+            point = oracle.point(scene, generator)
+            values = symbols(point)
+            point.a |= dict(zip(mechanics.free, solved(mechanics, values), strict=True))
+            for name in mechanics.free:
+                residual, size = oracle.residual(name, point)
+                assert abs(residual) < 1e-25 * size
+            full = mechanics.full
+            for m, name in enumerate(oracle.prescribed, start=len(mechanics.free)):
+                entries = [full.entry(m, j) for j in range(len(full.coordinates))]
+                numbers = evaluate([*entries, full.force[m]], values, mpmath)
+                force = (
+                    mpmath.fsum(g * point.a[c] for g, c in zip(numbers, full.coordinates, strict=False))
+                    - numbers[-1]
+                )
+                expected, size = oracle.residual(name, point)
+                assert abs(force - expected) < 1e-25 * size
+
+
+@scenes
+def test_energy_changes_by_what_power_says(case):
+    """dE/dt along the motion, by differences, is drive + applied - drag as `power` gives them."""
+    scene = complete(case)
+    generator = np.random.default_rng(4)
+    states = generator.uniform(0.1, 1.0, (4, len(scene.state_names)))
+    controls = generator.uniform(-1.0, 1.0, (4, len(scene.control_names)))
+    name = "jacobi" if "jacobi" in scene.energy(states, controls) else "total"
+    rates = rate(scene, states, controls)
+    step = 1e-5
+    ahead, behind = (scene.energy(states + sign * step * rates, controls)[name] for sign in (1.0, -1.0))
+    power = scene.power(states, controls)
+    expected = power["drive"] + power["applied"] - power["drag"]
+    np.testing.assert_allclose((ahead - behind) / (2 * step), expected, rtol=1e-6, atol=1e-6)
+
+
+def rate(scene, states, controls):
+    """Return d(state)/dt by solving for accelerations; that of w by differences along the motion."""
+    from lag_envs.mechanics.evaluation import Numeric, Point
+
+    columns = [np.moveaxis(a, -1, 0) for a in (states, controls)]
+    point = Point(scene.mechanics, scene._symbols(), *columns, Numeric)
+    return np.stack([np.broadcast_to(r, states.shape[:-1]) for r in point.rates()], axis=-1)
+
+
+@scenes
+def test_linearisation_is_the_derivative(case):
+    scene = complete(case)
+    generator = np.random.default_rng(5)
+    state = generator.uniform(0.2, 1.0, len(scene.state_names))
+    held = generator.uniform(-1.0, 1.0, len(scene.control_names))
+    both, step = np.concatenate([state, held]), 1e-5
+    n = len(state)
+    A, B = scene.linearise(state, held)
+    for k in range(len(both)):
+        numbers = []
+        for h in (-2, -1, 1, 2):
+            moved = both.copy()
+            moved[k] += h * step
+            numbers.append(rate(scene, moved[None, :n], moved[None, n:])[0])
+        far, near = numbers[3] - numbers[0], numbers[2] - numbers[1]
+        slope = (8 * near - far) / (12 * step)
+        mine = A[:, k] if k < n else B[:, k - n]
+        np.testing.assert_allclose(mine, slope, rtol=1e-7, atol=1e-7 * max(1.0, np.abs(slope).max()))
+
+
+def test_held_rate_carries_what_stays_continuous():
+    """M (w - v) = Σ G ṡ, and w' by differences of w along the motion that the accelerations give."""
+    scene = contract_scenes.Trolley()
+    assert scene.state_names == ("s", "h", "alpha", "w_alpha", "beta", "w_beta")
+    generator = np.random.default_rng(6)
+    with mpmath.workdps(40):
+        for _ in range(3):
+            oracle = _oracle(scene)
+            point = oracle.point(scene, generator)
+            point.p = {name: mpmath.mpf(getattr(scene, name)) for name in point.p}
+            values = symbols(point)
+            a = solved(scene.mechanics, values)
+
+            def carried(t, oracle=oracle, point=point, a=a):
+                """Return w at the time t along the parabola of the motion."""
+                q, v = dict(point.q), dict(point.v)
+                for name, x in zip(("alpha", "beta"), a, strict=True):
+                    q[name], v[name] = q[name] + t * v[name] + t * t * x / 2, v[name] + t * x
+                for name in ("s", "h"):
+                    q[name] = q[name] + t * v[name]
+                numbers = [*q.values(), *v.values(), *point.u.values(), *point.p.values()]
+                mass = mpmath.matrix([[oracle.mass[i][j](*numbers) for j in (0, 1)] for i in (0, 1)])
+                drive = mpmath.matrix(
+                    [sum(oracle.mass[i][j](*numbers) * v[c] for j, c in ((2, "s"), (3, "h"))) for i in (0, 1)]
+                )
+                shift = mpmath.lu_solve(mass, drive)
+                return [v["alpha"] + shift[0], v["beta"] + shift[1]]
+
+            w = [float(x) for x in carried(mpmath.mpf(0))]
+            state = [
+                float(point.q["s"]),
+                float(point.q["h"]),
+                float(point.q["alpha"]),
+                w[0],
+                float(point.q["beta"]),
+                w[1],
+            ]
+            held = [float(point.u[name]) for name in scene.control_names]
+            found = rate(scene, np.array([state]), np.array([held]))[0]
+            step = mpmath.mpf("1e-12")
+            ahead, behind = carried(step), carried(-step)
+            expected = [float((x - y) / (2 * step)) for x, y in zip(ahead, behind, strict=True)]
+            np.testing.assert_allclose(found[[3, 5]], expected, rtol=1e-9)
+            np.testing.assert_allclose(
+                found[[2, 4]], [float(point.v[c]) for c in ("alpha", "beta")], rtol=1e-12
+            )
+
+
+STEPPED = [(CartPole, {}), (contract_scenes.RotatingFrame, {}), (contract_scenes.ElasticPendulum, {})]
+
+
+@pytest.mark.parametrize(
+    "case", [*STEPPED, *(pytest.param(case, marks=pytest.mark.slow) for case in CASES if case not in STEPPED)]
+)
+def test_energy_balance_of_a_step(case):
+    """The change of energy over a step by the general series is the work done in it, by quadrature."""
+    scene = complete(case)
+    generator = np.random.default_rng(7)
+    state = generator.uniform(0.1, 1.0, len(scene.state_names))
+    held = generator.uniform(-1.0, 1.0, len(scene.control_names))
+    balance = scene.energy_balance(state, held, 0.02)
+    size = max(1.0, *(abs(balance[name]) for name in ("change", "work", "loss")))
+    assert abs(balance["residual"]) < 1e-12 * size

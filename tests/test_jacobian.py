@@ -1,0 +1,91 @@
+"""Derivatives of a control step against differences in 50-digit arithmetic."""
+
+import mpmath
+import numpy as np
+import pytest
+from contract_scenes import ChargedParticle, RotatingHoop
+
+from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.recording import parameter
+from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum, StepRefused, TwoLinkArm
+from lag_envs.scenes.new_incline import Incline
+from lag_envs.stepping.lowering import ELAPSED
+from lag_envs.stepping.series import Plain, Series
+
+CASES = {
+    "cart_pole": (CartPole(friction=0.2), [0.3, -1.0, 2.0, 3.0], [4.0], 0.02),
+    "acrobot": (Acrobot(), [0.5, 1.0, -1.0, 2.0], [0.3], 0.02),
+    "double": (Chain(bars=2, damping=0.01), [0.1, 0.2, 2.0, -5.0, 1.0, 6.0], [3.0], 0.02),
+    "triple, long step": (Chain(bars=3), [0.1, 0.2, 2.0, -5.0, 1.0, 6.0, 0.3, -4.0], [3.0], 0.1),
+    "rotary": (RotaryPendulum(), [0.2, 1.0, 2.0, -3.0], [0.1], 0.02),
+    "arm": (TwoLinkArm(), [0.2, 1.0, 2.0, -3.0], [0.4, -0.2], 0.02),
+    "charge": (ChargedParticle(), [0.2, 1.0, 2.0, -3.0], [], 0.1),
+    "hoop": (RotatingHoop(), [0.4, 1.0], [0.01], 0.05),
+    "turning plane": (Incline(control="tilt_rate", damping=0.03), [0.1, 0.2, 0.05], [0.3], 0.05),
+}
+
+
+def exact_step(scene, state, control, dt):
+    """Return the state after a step in mpmath's arithmetic, by short series of a high order."""
+    stepper = scene._stepper
+    values = {parameter(name): mpmath.mpf(getattr(scene, name)) for name in scene._numbers()}
+    numbers = {f"p_{name}": mpmath.mpf(getattr(scene, name)) for name in scene._numbers()}
+    names = list(stepper._whole.constants)
+    exprs = [stepper._whole.constants[name] for name in names]
+    constants = dict(zip(names, evaluate(exprs, values, mpmath), strict=True))
+    series, parts = Series(stepper._whole), 8
+    for _ in range(parts):
+        h = mpmath.mpf(dt) / parts
+        start = stepper.prepare(mpmath, state, control, numbers)
+        t = Plain(series.slots, mpmath.mpf, mpmath)
+        n = len(scene._layout.free)
+        q, v = ([start[f"{letter}{i}"] for i in range(n)] for letter in "qv")
+        inputs = {**constants, **start, ELAPSED: mpmath.mpf(0)}
+        series.expand(t, {name: inputs[name] for name in stepper._whole.inputs}, q, v, h, 40)
+        q, v = series.advance(t, q, h, 40)
+        state = stepper.finish(mpmath, q, v, state, control, h, numbers)
+    return mpmath.matrix(state)
+
+
+FAST = ("cart_pole", "turning plane")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in FAST else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
+def test_jacobian_is_the_derivative(case):
+    scene, state, control, dt = CASES[case]
+    a, b = scene.jacobian(state, control, dt) if control else scene.jacobian(state, dt=dt)
+    found = np.concatenate([a, b], axis=1)
+    with mpmath.workdps(50):
+        at = [mpmath.mpf(x) for x in [*state, *control]]
+        h = mpmath.mpf(10) ** -12
+        columns = []
+        for j in range(len(at)):
+            ends = []
+            for side in (h, -h):
+                moved = [*at[:j], at[j] + side, *at[j + 1 :]]
+                ends.append(exact_step(scene, moved[: len(state)], moved[len(state) :], dt))
+            columns.append([float(x) for x in (ends[0] - ends[1]) / (2 * h)])
+    expected = np.array(columns).T
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
+
+
+def test_rows_of_a_batch():
+    scene, state, _, dt = CASES["double"]
+    states = np.array([state, np.multiply(state, 0.5), np.zeros(6)])
+    a, b = scene.jacobian(states, [[3.0], [1.0], [0.0]], dt)
+    assert a.shape == (3, 6, 6) and b.shape == (3, 6, 1)
+    for i, u in enumerate([3.0, 1.0, 0.0]):
+        one = scene.jacobian(states[i], u, dt)
+        np.testing.assert_array_equal(a[i], one[0])
+        np.testing.assert_array_equal(b[i], one[1])
+
+
+def test_step_that_is_refused():
+    class Rope(ChargedParticle):
+        def kinetic(self, q, v, xp):
+            return self.mass * (v.x**2 + (q.x * v.y) ** 2) / 2
+
+    with pytest.raises(StepRefused, match="the step of row 1"):
+        Rope().jacobian([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]], dt=0.02)

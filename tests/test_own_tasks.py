@@ -1,0 +1,246 @@
+"""Scenes and tasks outside the package: written by name, as good as those inside."""
+
+import copy
+import pickle
+from pathlib import Path
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import own_tasks
+import pytest
+from gymnasium.utils.env_checker import check_env
+from rollouts import RENDERS
+
+import lag_envs
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.scenes import StepRefused
+from lag_envs.tasks import Task
+
+IDS = [task.id for task in own_tasks.TASKS]
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered():
+    for task in own_tasks.TASKS:
+        lag_envs.register(task)
+    yield
+    for id in IDS:
+        del gym.registry[id]
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_gymnasium_checker(id):
+    check_env(gym.make(id).unwrapped, skip_render_check=not RENDERS)
+
+
+@pytest.mark.parametrize("id", IDS)
+@pytest.mark.parametrize("n", [3, 70])
+def test_vector_is_single(id, n):
+    single = gym.make_vec(id, num_envs=n, vectorization_mode="sync")
+    native = gym.make_vec(id, num_envs=n)
+    native.action_space.seed(1)
+    pairs = [(native.reset(seed=5)[0], single.reset(seed=5)[0])]
+    steps = 200 if n == 3 else 30
+    ends = 0
+    for _ in range(steps):
+        action = native.action_space.sample()
+        ours, theirs = native.step(action), single.step(action)
+        ends += int((ours[2] | ours[3]).sum())
+        pairs += zip(ours[:4], theirs[:4], strict=True)
+    for ours, theirs in pairs:
+        np.testing.assert_array_equal(ours, theirs)
+    assert ends or n != 3
+
+
+def test_simulate_is_step():
+    env = gym.make("OwnCrane-v0", rail_drag=0.0).unwrapped
+    env.reset(seed=3)
+    env.action_space.seed(0)
+    states, controls = [env.state], []
+    for _ in range(5):
+        before = env.state
+        env.step(env.action_space.sample())
+        controls.append(env.control)
+        states.append(env.scene.simulate(before, [env.control], env.task.dt)[1])
+        kicked = env.state
+        # The kick comes after the held step, and changes rates only.
+        assert kicked[:1] == states[-1][:1] and kicked[2] == states[-1][2]
+    assert np.shape(controls) == (5, 2)
+
+
+def test_numbers_of_a_batch_may_differ_zero_among_them():
+    drags = [0.0, 0.3, 2.0]
+    native = gym.make_vec("OwnCrane-v0", num_envs=3, rope_drag=drags, load_mass=[0.5, 1.0, 2.0])
+    single = [
+        gym.make("OwnCrane-v0", rope_drag=d, load_mass=m) for d, m in zip(drags, [0.5, 1.0, 2.0], strict=True)
+    ]
+    seen = [native.reset(seed=7)[0]], [np.stack([e.reset(seed=7 + i)[0] for i, e in enumerate(single)])]
+    native.action_space.seed(2)
+    for _ in range(8):
+        actions = native.action_space.sample()
+        seen[0].append(native.step(actions)[0])
+        seen[1].append(np.stack([e.step(a)[0] for e, a in zip(single, actions, strict=True)]))
+    np.testing.assert_array_equal(*seen)
+
+
+def test_structure_of_a_batch_must_agree():
+    with pytest.raises(ValueError, match="agree"):
+        gym.make_vec("OwnSwitched-v0", num_envs=2, bars=[3, 4])
+
+
+def test_targets():
+    env = gym.make("OwnCrane-v0", target={"x_goal": 0.4, "y_goal": -1.4}).unwrapped
+    env.reset(seed=1)
+    np.testing.assert_array_equal(env.target, [0.4, -1.4])
+    env = gym.make("OwnCrane-v0").unwrapped
+    env.reset(seed=1, options={"target": [0.1, -1.3]})
+    np.testing.assert_array_equal(env.target, [0.1, -1.3])
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for seed in range(200):
+        env.reset(seed=seed)
+        low, high = np.minimum(low, env.target), np.maximum(high, env.target)
+    assert -1.0 <= low[0] < -0.9 < 0.9 < high[0] <= 1.0
+    assert -1.8 <= low[1] < -1.75 < -1.25 < high[1] <= -1.2
+    vec = gym.make_vec("OwnCrane-v0", num_envs=2)
+    vec.reset(seed=0, options={"target": [[0.1, -1.3], [0.2, -1.4]]})
+    np.testing.assert_array_equal(vec.unwrapped.target, [[0.1, -1.3], [0.2, -1.4]])
+
+
+def test_reward_scales_with_dt():
+    rewards = []
+    for dt in (0.05, 0.025):
+        env = gym.make("OwnCrane-v0", dt=dt).unwrapped
+        env.reset(seed=0, options={"state": [0, 0, 1, 0, 0, 0], "target": [0, -1]})
+        rewards.append(env.step(np.array([0.0, -0.019], np.float32))[1])
+    assert rewards[0] == pytest.approx(2 * rewards[1], rel=1e-2)
+
+
+def test_discrete_actions():
+    env = gym.make("OwnSwitched-v0").unwrapped
+    assert env.action_space == gym.spaces.Discrete(3)
+    env.reset(seed=0)
+    for action, control in ((0, -5.0), (1, 0.0), (2, 5.0), (np.int64(2), 5.0)):
+        env.step(action)
+        assert env.control == control
+    for wrong in (3, -1, 0.5, [1], True, None):
+        with pytest.raises(ValueError, match="action"):
+            env.step(wrong)
+
+
+@pytest.mark.parametrize("action", [[0.1], [0.1, 0.2, 0.3], [0.1, np.nan], ["a", "b"], None, [[0.1, 0.2]]])
+def test_bad_actions(action):
+    env = gym.make("OwnCrane-v0").unwrapped
+    env.reset(seed=0)
+    before = env.state
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+    np.testing.assert_array_equal(env.state, before)
+
+
+def test_refused_step_keeps_the_state():
+    wild = [0, 0, 0, 0, 0.3, 1]  # without rope the mass matrix is singular
+    env = gym.make("OwnCrane-v0").unwrapped
+    env.reset(seed=0, options={"state": wild})
+    before = env.state
+    with pytest.raises(StepRefused):
+        env.step(np.zeros(2, np.float32))
+    np.testing.assert_array_equal(env.state, before)
+    vec = gym.make_vec("OwnCrane-v0", num_envs=3)
+    calm = [0, 0, 1, 0, 0.1, 0]
+    vec.reset(seed=0, options={"state": [calm, wild, calm]})
+    with pytest.raises(StepRefused) as refusal:
+        vec.step(np.zeros((3, 2), np.float32))
+    states = vec.unwrapped.state
+    np.testing.assert_array_equal(states[1], wild)
+    np.testing.assert_array_equal(states[0], env.scene.simulate(calm, [vec.unwrapped.control[0]], 0.05)[1])
+    assert np.isfinite(refusal.value.results[1][[0, 2]]).all()
+
+
+@pytest.mark.parametrize("dump", [pickle, cloudpickle], ids=["pickle", "cloudpickle"])
+@pytest.mark.parametrize("id", IDS)
+def test_copies_go_on_alike(id, dump):
+    env = gym.make(id).unwrapped
+    env.reset(seed=2)
+    env.action_space.seed(0)
+    twins = [dump.loads(dump.dumps(env)), copy.deepcopy(env)]
+    action = env.action_space.sample()
+    expected = env.step(action)
+    for twin in twins:
+        np.testing.assert_array_equal(twin.step(action)[0], expected[0])
+
+
+def test_class_that_only_a_notebook_knows():
+    def cell(gain):
+        class Lean(Task):
+            id = "OwnNotebook-v0"
+            scene = own_tasks.Crane
+            action = {"push": 1.0, "pull": 1.0}
+            start = {"rope": (1.0, 0.0)}
+
+            def observe(self, after, target, xp):
+                return {"x": after.x}
+
+            def reward(self, before, after, control, target, dt, xp):
+                return gain * after.rope
+
+        return Lean
+
+    found = []
+    for gain in (1.0, 3.0):  # the cell is run again with another formula
+        lag_envs.register(cell(gain))
+        env = gym.make("OwnNotebook-v0").unwrapped
+        env.reset(seed=0)
+        found.append(env.step(np.zeros(2, np.float32))[1])
+        del gym.registry["OwnNotebook-v0"]
+    assert found[1] == pytest.approx(3.0 * found[0])
+
+
+def _mistaken(**changes):
+    return type("Mistaken", (own_tasks.Deliver,), changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scene": None}, "Mistaken.scene must be a class derived from Scene"),
+        ({"action": {"shove": 1.0}}, r"action\['shove'\]: the scene has no such control, only push, pull"),
+        ({"action": {}}, "Mistaken.action must give limits"),
+        ({"action": {"push": 0.0, "pull": 1.0}}, "limit above 0"),
+        ({"action": {"push": [1.0, 2.0], "pull": 1.0}}, "mixes lists of values with ranges"),
+        ({"action": {"push": [1.0]}}, "at least two values"),
+        ({"start": {"y": 0.1}}, r"start\['y'\]: the state has no such entry, only x, x_dot"),
+        ({"start": {"x": "far"}}, "real number"),
+        ({"target": {"x_goal": 0.3}}, r"target\['x_goal'\] must be \(unit, half width\)"),
+        ({"observe": lambda self, after, target, xp: [after.x]}, "observe must return numbers by name"),
+        ({"observe": lambda self, after, target, xp: {"x": after.y}}, "there is no entry of the state 'y'"),
+        ({"reward": lambda self, *_: None}, "reward returns None"),
+        ({"reward": lambda self, b, after, *_: 1.0 if after.x > 0 else 0.0}, "branch"),
+        ({"terminated": lambda self, after, target, xp: after.x > 1 and after.x < 2}, "branch"),
+        ({"kick": lambda self, after, draws, xp: {"place": 1.0}}, "no entry 'place' of the state"),
+        ({"guard": lambda self, wanted, before, dt, xp: {"shove": 1.0}}, "there is no control 'shove'"),
+        ({"bounds": lambda self: {"height": 1.0}}, "there is no observation 'height'"),
+    ],
+)
+def test_mistakes_in_a_task(changes, message):
+    with pytest.raises((FormulaError, ValueError), match=message):
+        _mistaken(**changes)().formulas.box()
+
+
+def test_unknown_keyword():
+    with pytest.raises(TypeError, match="unknown keyword 'wind'; this environment takes gravity, load_mass"):
+        gym.make("OwnCrane-v0", wind=1.0)
+
+
+def test_example(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    env = gym.make("ball_on_beam:BallOnBeam-v0", render_mode="rgb_array" if RENDERS else None)
+    check_env(env.unwrapped, skip_render_check=not RENDERS)
+    scene = env.unwrapped.scene
+    before = scene.energy([0.2, 0.0, 0.3, 0.0])["total"]
+    after = scene.energy(type(scene)(friction=0.0).simulate([0.2, 0.0, 0.3, 0.0], np.zeros(50), 0.02)[-1])[
+        "total"
+    ]
+    assert after == pytest.approx(before, abs=1e-14)
+    del gym.registry["BallOnBeam-v0"]
