@@ -303,7 +303,7 @@ def test_scale_is_what_was_measured(env_id):
     if env_id in REFERENCES:
         mean, error, episodes = REFERENCES[env_id][1:]
         assert (mean, error) == pytest.approx(
-            (found["reference"]["mean"], found["reference"]["error"]), rel=0.02
+            (found["reference"]["mean"], found["reference"]["error"]), rel=0.05
         )
         assert abs(mean - found["reference"]["mean"]) < 0.1 * error
         assert episodes == found["reference"]["episodes"]
