@@ -16,6 +16,7 @@ from rollouts import IDS, make
 
 from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
+from lag_envs.leaderboard.protocol import REFERENCES
 from lag_envs.report.docs import generated
 from lag_envs.report.environments import LARGEST_STEP, play, random_actions
 from lag_envs.report.report import SECTIONS
@@ -299,6 +300,13 @@ def test_scale_is_what_was_measured(env_id):
     assert abs(known.best - best["mean"]) < 3.0 * known.error
     # What counts as random was set from fewer episodes.
     assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
+    if env_id in REFERENCES:
+        mean, error, episodes = REFERENCES[env_id][1:]
+        assert (mean, error) == pytest.approx(
+            (found["reference"]["mean"], found["reference"]["error"]), rel=0.05
+        )
+        assert abs(mean - found["reference"]["mean"]) < 0.1 * error
+        assert episodes == found["reference"]["episodes"]
     assert (known.optimum is not None) == ("optimum" in found)
     if known.optimum is not None:
         assert known.optimum == pytest.approx(found["optimum"]["mean"], abs=1e-4)

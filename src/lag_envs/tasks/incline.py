@@ -119,7 +119,7 @@ class Tilt(Task):
 
     | Id | Random actions | Zero control | Cascade | Best known |
     | -- | -------------- | ------------ | ------- | ---------- |
-    | InclineTilt-v0 | 9.46 ± 0.18 | 11.29 ± 0.23 | 179.88 ± 0.28 | 181.560 ± 0.026 |
+    | InclineTilt-v0 | 9.46 ± 0.18 | 11.29 ± 0.23 | 179.88 ± 0.28 | 181.562 ± 0.025 |
 
     ## Version History
 
