@@ -42,9 +42,9 @@ def _advance(rows, dt, order):  # type: ignore[no-untyped-def]
 def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step of up to BLOCK lanes; return how many were refused.
 
-    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds. A lane whose
-    status is negative to begin with is left alone. Afterwards it is the number of attempts, negative where a
-    lane was refused.
+    Row r of lane i lies at ``memory[base + r * BLOCK + i]``, see `Layout`, without bounds; behind them is
+    room for as many rows and one more. A lane whose status is negative to begin with is left alone.
+    Afterwards it is the number of attempts, negative where a lane was refused.
     """
     for i in range(BLOCK):
         stepped = i < count and memory[base + status * BLOCK + i] >= 0.0
@@ -59,35 +59,32 @@ def _advance_block(memory, base, count, dt, order):  # type: ignore[no-untyped-d
 
 def _rest(memory, base, count, dt, order):  # type: ignore[no-untyped-def]
     """Go on with the lanes that are not done, side by side; return how many were refused."""
-    rows = np.empty(bounds * BLOCK)
-    rows[left * BLOCK : wish * BLOCK] = 0.0
-    lane = np.empty(BLOCK, np.int64)
+    rows = memory[base + bounds * BLOCK :]  # the last row has the lanes' numbers
     going = refused = 0
     for i in range(count):
         if memory[base + left * BLOCK + i] > 0.0:
             for r in range(bounds):
                 rows[r * BLOCK + going] = memory[base + r * BLOCK + i]
-            lane[going] = i
+            rows[bounds * BLOCK + going] = i
             going += 1
+    for i in range(going, BLOCK):
+        rows[left * BLOCK + i] = 0.0
     while going > 0:
         for first in range(0, going, LANES):
             attempt(rows, first, dt, order, tolerance)
         kept = 0
         for i in range(going):
-            spent = (
-                rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
-            )
-            if rows[left * BLOCK + i] > 0.0 and spent:
-                memory[base + status * BLOCK + lane[i]] = -rows[status * BLOCK + i]
-                refused += 1
-            elif rows[left * BLOCK + i] > 0.0:
-                for r in range(bounds):
-                    rows[r * BLOCK + kept] = rows[r * BLOCK + i]
-                lane[kept] = lane[i]
-                kept += 1
-            else:
+            lane = base + np.int64(rows[bounds * BLOCK + i])
+            if not rows[left * BLOCK + i] > 0.0:
                 for r in range(q, left):
-                    memory[base + r * BLOCK + lane[i]] = rows[r * BLOCK + i]
+                    memory[lane + r * BLOCK] = rows[r * BLOCK + i]
+            elif rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt:
+                memory[lane + status * BLOCK] = -rows[status * BLOCK + i]
+                refused += 1
+            else:
+                for r in range(bounds + 1):
+                    rows[r * BLOCK + kept] = rows[r * BLOCK + i]
+                kept += 1
         for i in range(kept, going):
             rows[left * BLOCK + i] = 0.0
         going = kept
@@ -111,9 +108,10 @@ def _numbers(record: SeriesRecord, tolerance: float) -> dict[str, float]:
 
 
 @cache
-def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
-    """Compile ``advance(rows, dt, order)``, see `_advance`."""
-    return compile_python("advance_lane", _advance, compile_attempt(record, 1), **_numbers(record, tolerance))
+def compile_advance(record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True) -> Callable:
+    """Compile ``advance(rows, dt, order)``, see `_advance`; `compile_attempt` says what `fused` is."""
+    attempt = compile_attempt(record, 1, fused)
+    return compile_python("advance_lane", _advance, attempt, **_numbers(record, tolerance))
 
 
 def lanes(record: SeriesRecord) -> int:
@@ -123,11 +121,25 @@ def lanes(record: SeriesRecord) -> int:
 
 
 @cache
-def compile_advance_block(record: SeriesRecord, tolerance: float = TOLERANCE) -> Callable:
-    """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`."""
-    width = lanes(record)
+def compile_advance_block(
+    record: SeriesRecord, tolerance: float = TOLERANCE, fused: bool = True, width: int | None = None
+) -> Callable:
+    """Compile ``advance(memory, base, count, dt, order)``, see `_advance_block`.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped.
+    tolerance : float
+        What a substep may leave out, relative to the size of the velocities.
+    fused : bool
+        See `compile_attempt`.
+    width : int, optional
+        How many lanes are stepped at once; by default `lanes`. The bits do not depend on it.
+    """
+    width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
-    attempt = compile_attempt(record, width)
+    attempt = compile_attempt(record, width, fused)
     rest = compile_python("rest", _rest, attempt, **numbers)
     return compile_python("advance_block", _advance_block, attempt, rest, **numbers)
 

@@ -24,9 +24,6 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
 
-#: Rows that `advance_block` fills itself.
-SCRATCH = ("left", "wish")
-
 
 class SeriesStepper:
     """One scene's control step by the general series, as lines of code and compiled functions.
@@ -44,7 +41,7 @@ class SeriesStepper:
         self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
-        self._codes: dict[frozenset[str], StepCode] = {}
+        self._codes: dict[tuple[frozenset[str], bool], StepCode] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
     def _moving(self) -> dict[str, list[Expr]]:
@@ -213,11 +210,15 @@ class SeriesStepper:
 
     # --- code -----------------------------------------------------------------------------------------------
 
-    def code(self, absent: frozenset[str] = frozenset()) -> StepCode:
-        """Return the step without the terms of constants that are zero."""
-        if absent not in self._codes:
-            self._codes[absent] = StepCode(self, self._lowering.without(*self._parts, absent), absent)
-        return self._codes[absent]
+    def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> StepCode:
+        """Return the step without the terms of constants that are zero.
+
+        Unfused, it gives the bits of plain + - * / √ and comparisons on any machine, see `Plain`.
+        """
+        if (absent, fused) not in self._codes:
+            record = self._lowering.without(*self._parts, absent, fused)
+            self._codes[absent, fused] = StepCode(self, record, absent, fused)
+        return self._codes[absent, fused]
 
 
 def _evaluated(record: SeriesRecord, parameters: Mapping[Atom, float]) -> dict[str, float]:
@@ -277,12 +278,14 @@ class StepCode:
         Names of the constants that the code uses.
     rows : list of str
         Rows of a lane that the block function reads and writes: inputs, then places and velocities, then the
-        status, then `SCRATCH`, which it fills itself.
+        status, then what it fills itself.
     """
 
-    def __init__(self, stepper: SeriesStepper, record: SeriesRecord, absent: frozenset[str]) -> None:
+    def __init__(
+        self, stepper: SeriesStepper, record: SeriesRecord, absent: frozenset[str], fused: bool = True
+    ) -> None:
         layout = stepper._layout
-        self.record = record
+        self.record, self._fused = record, fused
         self.start = [f"y{i}" for i in range(len(layout.state))]
         self.end = [f"z{i}" for i in range(len(layout.state))]
         self.controls = [f"u{i}" for i in range(len(layout.controls))]
@@ -305,7 +308,7 @@ class StepCode:
             }
             values = [trace.inputs(name)[0] for name in inputs]
             results = formula(trace, values, numbers)
-            return record_block(trace, results)
+            return record_block(trace, results, fused=fused)
 
         states, controls = len(self.start), len(self.controls)
 
@@ -345,7 +348,8 @@ class StepCode:
         ]
         #: Rows that are to be filled in before the step.
         self.given = [*self._inputs, *q, *v, "status"]
-        self.rows = [*self.given, *SCRATCH]
+        own = [*self.given, "left", "wish"]
+        self.rows = [*own, *(f"rest_{name}" for name in own), "rest_lane"]
         #: Those of them that the rest of the step needs afterwards.
         self.results = [*q, *v, "status"]
 
@@ -384,9 +388,8 @@ class StepCode:
             *self.finish,
             f"return {', '.join(self.end)}, status",
         ]
-        return compile_function(
-            "advance", "\n    ".join(body) + "\n", compile_advance(self.record, tolerance)
-        )
+        helper = compile_advance(self.record, tolerance, self._fused)
+        return compile_function("advance", "\n    ".join(body) + "\n", helper)
 
     def bounded(
         self,
@@ -415,7 +418,7 @@ class StepCode:
         """Compile ``advance_block(memory, base, count, dt, order)`` on `rows` of BLOCK lanes."""
         from lag_envs.stepping.driver import compile_advance_block
 
-        return compile_advance_block(self.record, tolerance)
+        return compile_advance_block(self.record, tolerance, self._fused)
 
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, order, constants...)``.

@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
 from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.dual import Dual
 from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
@@ -189,9 +190,11 @@ class Machine:
     def _as_written(self) -> ir.MDValue:
         """Return the request not to unroll a loop: ours are short, and long code compiles slowly."""
         module = self._b.module
-        request = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
-        loop = module.add_metadata([request, ir.Constant(_INT, len(module.metadata))])
-        loop.operands = (loop, request)  # a loop's first operand is itself
+        unrolled = module.add_metadata([ir.MetaDataString(module, "llvm.loop.unroll.disable")])
+        off = ir.Constant(_BIT, 0)
+        vectors = module.add_metadata([ir.MetaDataString(module, "llvm.loop.vectorize.enable"), off])
+        loop = module.add_metadata([unrolled, ir.Constant(_INT, len(module.metadata))])
+        loop.operands = (loop, unrolled, vectors)  # a loop's first operand is itself
         return loop
 
     def _phis(self, start: ir.Block, first: Any, carried: Sequence) -> tuple[ir.Value, list]:
@@ -237,12 +240,55 @@ def _version() -> str:
     return hashlib.sha256(source.encode()).hexdigest()
 
 
+def _linked(name: str, kind: ir.FunctionType, write: Callable) -> Callable:
+    """Return a function for compiled code that stands once, in a module of its own.
+
+    Whoever calls it is linked with it when it is loaded. Numba would put a copy into every caller, and into
+    the callers' callers, and compile them all.
+
+    Parameters
+    ----------
+    name : str
+        The function's name.
+    kind : ir.FunctionType
+        Its type; the first argument is a pointer. Compiled code gives an array and an index in its place.
+    write : callable
+        Writes it into a module.
+    """
+    known = {_DOUBLE: types.float64, _INT: types.int64, ir.VoidType(): types.void}
+    arguments = ", ".join(["rows", "at", *(f"a{i}" for i in range(len(kind.args) - 1))])
+    result, rest = known[kind.return_type], [known[a] for a in kind.args[1:]]
+
+    def called(declare: Callable) -> Callable:
+        def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
+            array = context.make_array(signature.args[0])(context, builder, args[0])
+            function = builder.module.globals.get(name) or declare(builder.module)
+            value = builder.call(function, [builder.gep(array.data, [args[1]]), *args[2:]])
+            return context.get_dummy_value() if result is types.void else value
+
+        # Numba wants the arguments by name.
+        scope = {"answer": lambda rows: (result(rows, types.int64, *rest), codegen)}
+        exec(f"def function(typingctx, {arguments}): return answer(rows)", scope)
+        function = intrinsic(scope["function"])
+        function.__name__ = name
+        return function
+
+    short = name.rsplit("_", 1)[0]
+    source = f"def hold({arguments}):\n    return {short}({arguments})\n"
+    holder: Any = compile_function("hold", source, called(lambda module: write(module, name)))
+    holder.compile((types.float64[::1], types.int64, *rest))
+    function: Any = called(lambda module: ir.Function(module, kind, name))
+    function.holder = holder  # keeps the code in memory
+    return function
+
+
+@cache
 def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Callable:
     """Return ``attempt(rows, at, dt, order, tolerance)``, to be called from compiled code.
 
     It takes a step of each lane for which something is left, of the length that is wished for or of a part of
     it, and replaces places, velocities, status, `left` and `wish` in the rows of `Layout`, which begin at
-    ``rows[at]``. It returns 1 where nothing is left, else 0. See `Series.attempt`.
+    ``rows[at]``. It returns 1 where nothing is left, else 0. See `Series.substep`.
 
     Parameters
     ----------
@@ -255,29 +301,18 @@ def compile_attempt(record: SeriesRecord, lanes: int, fused: bool = True) -> Cal
         Whether fused multiply-adds are used. Without them the bits are those of any other language's doubles.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {lanes} {fused}".encode()).hexdigest()[:16]
-    name = f"attempt_{digest}"
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, args[0])
-        first = builder.gep(array.data, [args[1]])
-        function = builder.module.globals.get(name) or _write(builder.module, name, record, lanes, fused)
-        return builder.call(function, [first, *args[2:]])
-
-    @intrinsic
-    def attempt(typingctx, rows, at, dt, order, tolerance):  # type: ignore[no-untyped-def]
-        return types.int64(rows, types.int64, types.float64, types.int64, types.float64), codegen
-
-    attempt.__name__ = name
-    return attempt
+    kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE])
+    return _linked(
+        f"attempt_{digest}", kind, lambda module, name: _write(module, name, kind, record, lanes, fused)
+    )
 
 
-def _write(module: ir.Module, name: str, record: SeriesRecord, lanes: int, fused: bool) -> ir.Function:
+def _write(
+    module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, lanes: int, fused: bool
+) -> ir.Function:
     """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
-    function = ir.Function(
-        module, ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE]), name
-    )
-    function.linkage = "internal"
+    function = ir.Function(module, kind, name)
     set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, dt, order, tolerance = function.args
@@ -332,32 +367,19 @@ def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
         Inputs by which derivatives are taken.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
-    name = f"tangent_{digest}"
-
-    def codegen(context: Any, builder: ir.IRBuilder, signature: Any, args: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, args[0])
-        first = builder.gep(array.data, [args[1]])
-        function = builder.module.globals.get(name) or _write_tangent(builder.module, name, record, columns)
-        builder.call(function, [first, args[2]])
-        return context.get_dummy_value()
-
-    @intrinsic
-    def tangent(typingctx, rows, at, order):  # type: ignore[no-untyped-def]
-        return types.void(rows, types.int64, types.int64), codegen
-
-    tangent.__name__ = name
-    return tangent
+    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])
+    return _linked(
+        f"tangent_{digest}", kind, lambda module, name: _write_tangent(module, name, kind, record, columns)
+    )
 
 
 def _write_tangent(
-    module: ir.Module, name: str, record: SeriesRecord, columns: tuple[str, ...]
+    module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, columns: tuple[str, ...]
 ) -> ir.Function:
     """Write the function ``name(rows, order)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
     width, matrix = 2 * n + len(columns), layout.status + 2
-    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT]), name)
-    function.linkage = "internal"
-    set.add(function.attributes, "noinline")
+    function = ir.Function(module, kind, name)
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
