@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.base import Scene, parameter
 
 
 class ChargedParticle(Scene):

@@ -25,10 +25,10 @@ from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
-from lag_envs.scenes.contract import Scene, parameter
-from lag_envs.scenes.new_cylinder_in_cylinder import CylinderInCylinder
-from lag_envs.scenes.new_incline import Incline
-from lag_envs.scenes.new_pivoted_bar import PivotedBar
+from lag_envs.scenes.base import Scene, parameter
+from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.incline import Incline
+from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
 
@@ -586,7 +586,7 @@ def test_lagrangian_is_t_less_v():
 
 
 def test_equations_are_solved_by_the_accelerations():
-    from lag_envs.new_lagrange import equations
+    from lag_envs.lagrange import equations
 
     scene = CartPole(friction=0.2)
     found = equations(scene)
@@ -713,7 +713,7 @@ def test_class_that_no_module_has_goes_by_value():
 
 MAIN = """
 import multiprocessing, pickle
-from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.base import Scene, parameter
 
 class Cart(Scene):
     mass: float = parameter(1.0, "kg", above=0.0)

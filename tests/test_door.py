@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lag_envs.mechanics.algebra import FormulaError
-from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.base import Scene, parameter
 
 
 class Good(Scene):

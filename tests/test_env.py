@@ -20,7 +20,7 @@ from lag_envs.envs import program
 from lag_envs.envs.model import Model
 from lag_envs.envs.program import Program
 from lag_envs.envs.single import LagrangianEnv
-from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.checks import StepRefused
 from lag_envs.tasks.incline import Brake
 
 each_id = pytest.mark.parametrize("env_id", IDS)

@@ -15,9 +15,9 @@ from lag_envs.mechanics.recording import control, parameter
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
-from lag_envs.scenes.new_cylinder_in_cylinder import CylinderInCylinder
-from lag_envs.scenes.new_incline import Incline
-from lag_envs.scenes.new_pivoted_bar import PivotedBar
+from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.incline import Incline
+from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
 

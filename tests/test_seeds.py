@@ -9,9 +9,9 @@ import pytest
 from lag_envs.scenes import CylinderInCylinder as OldShell
 from lag_envs.scenes import Incline as OldIncline
 from lag_envs.scenes import PivotedBar as OldBar
-from lag_envs.scenes.new_cylinder_in_cylinder import CylinderInCylinder
-from lag_envs.scenes.new_incline import Incline
-from lag_envs.scenes.new_pivoted_bar import PivotedBar
+from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
+from lag_envs.scenes.incline import Incline
+from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.shapes import Moment
 
 #: Old class, new class and keywords of all variants.

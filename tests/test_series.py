@@ -14,7 +14,7 @@ import pytest
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System, acceleration
 
-from lag_envs.scenes.contract import Scene
+from lag_envs.scenes.base import Scene
 from lag_envs.stepping import driver, machine
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from rollouts import ANY_BAR, IDS, actions, make
 
-from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.checks import StepRefused
 
 each_id = pytest.mark.parametrize("env_id", IDS)
 MODES = ["NextStep", "SameStep", "Disabled"]

@@ -1,69 +1,252 @@
-"""SymPy's side of a scene: the Lagrangian, Euler-Lagrange equations and the equation of motion.
+"""SymPy's side of a scene: Lagrangian and Euler-Lagrange equations of a scene, and a scene of expressions.
 
-The expressions are made by passing symbols through the very functions that the numbers pass through.
+The expressions are made by passing symbols through the very formulas that numbers pass through.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any, TypeVar
+import types
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
 
 import sympy
+from sympy.core.function import AppliedUndef
 
-from lag_envs.scenes.base import Scene
+from lag_envs.mechanics.algebra import FormulaError, Functions
+from lag_envs.mechanics.recording import Values, twin
+from lag_envs.scenes.base import Scene, parameter
 
-S = TypeVar("S", bound=Scene)
 t = sympy.Symbol("t", real=True)
 
 
-def symbolic(scene: S) -> S:
-    """Return a copy of the scene whose parameters are positive symbols of their names."""
-    twin = object.__new__(type(scene))
-    for field in dataclasses.fields(scene):
-        value = getattr(scene, field.name)
-        if "unit" in field.metadata and value is not None:
-            value = sympy.Symbol(field.name, positive=True)
-        object.__setattr__(twin, field.name, value)
-    return twin
+class Symbolic:
+    """The namespace ``xp`` of a formula on SymPy's expressions."""
+
+    pi = sympy.pi
+    sin, cos, tan, exp, log, sqrt, tanh = (
+        staticmethod(f)
+        for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.sqrt, sympy.tanh)
+    )
+    atan = arctan = staticmethod(sympy.atan)
 
 
-def coordinates(scene: Scene) -> tuple[SimpleNamespace, SimpleNamespace]:
-    """Return the scene's coordinates as functions of time, and their velocities."""
-    q = {name: sympy.Function(name, real=True)(t) for name in scene.coordinates}
-    return SimpleNamespace(**q), SimpleNamespace(**{name: f.diff(t) for name, f in q.items()})
+# --- a scene as expressions --------------------------------------------------------------------------------
+
+
+def symbolic(scene: Scene) -> Any:
+    """Return a twin of the scene whose parameters are symbols of their names."""
+    ranges = {f.name: f.metadata for f in dataclasses.fields(scene)}  # type: ignore[arg-type]
+    symbols = {}
+    for name in scene._numbers():
+        positive = any(
+            ranges[name][bound] is not None and ranges[name][bound] >= 0 for bound in ("above", "least")
+        )
+        symbols[name] = sympy.Symbol(name, positive=True) if positive else sympy.Symbol(name, real=True)
+    return twin(scene, symbols)
+
+
+def motion(scene: Scene) -> tuple[Values, Values, Values]:
+    """Return places, velocities and controls as SymPy's functions of time; what rests is where it rests."""
+    layout, rests = scene._layout, symbolic(scene).rests()
+    q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
+    for p in layout.at("rest"):
+        q[p.name] = sympy.sympify(rests.get(p.name, 0))
+    u = {name: sympy.Function(name, real=True)(t) for name in layout.controls}
+    return (
+        Values("coordinate", q),
+        Values("velocity of a coordinate", {name: place.diff(t) for name, place in q.items()}),
+        Values("control", u, dict.fromkeys(layout.absent, sympy.Integer(0))),
+    )
 
 
 def lagrangian(scene: Scene) -> sympy.Expr:
     """Return T - V of the scene with symbols for its parameters."""
-    twin = symbolic(scene)
-    q, v = coordinates(scene)
-    return sympy.nsimplify(twin.kinetic(q, v, sympy) - twin.potential(q, sympy))
+    copy, (q, v, _) = symbolic(scene), motion(scene)
+    return sympy.nsimplify(copy.kinetic(q, v, Symbolic) - copy.potential(q, Symbolic), rational=True)
 
 
-def euler_lagrange(scene: Scene, coordinate: str, control: Any = 0) -> sympy.Expr:
-    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂(dissipation)/∂q': zero for a free coordinate, else the drive's force.
+def euler_lagrange(scene: Scene, coordinate: str) -> sympy.Expr:
+    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that moves it.
 
     Parameters
     ----------
     scene : Scene
         The scene; its numbers do not matter.
     coordinate : str
-        One of its `coordinates`.
-    control : symbol, optional
-        The control, where drag depends on it.
+        A coordinate that is free or moves.
     """
-    q, v = coordinates(scene)
-    dissipation = sympy.nsimplify(symbolic(scene).dissipation(v, control))
-    of, rate = getattr(q, coordinate), getattr(v, coordinate)
-    energy = lagrangian(scene)
-    return sympy.expand(energy.diff(rate).diff(t) - energy.diff(of) + dissipation.diff(rate))
+    copy, (q, v, u) = symbolic(scene), motion(scene)
+    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene)
+    loss = sympy.nsimplify(sympy.sympify(copy.dissipation(q, v, u, Symbolic)), rational=True)
+    force = sympy.nsimplify(sympy.sympify(copy.applied(q, v, u, Symbolic).get(coordinate, 0)), rational=True)
+    return energy.diff(rate).diff(t) - energy.diff(of) + loss.diff(rate) - force
 
 
-def acceleration(scene: Scene, control: Any = 0) -> sympy.Expr:
-    """Return the free coordinate's acceleration, solved from its Euler-Lagrange equation."""
-    free = scene.coordinates[0]
-    second = getattr(coordinates(scene)[0], free).diff(t, 2)
-    equation = euler_lagrange(scene, free, control)
-    inertia = equation.coeff(second)
-    return sympy.factor_terms((inertia * second - equation).expand() / inertia)
+def equations(scene: Scene) -> list[sympy.Eq]:
+    """Return the equations of motion of the free coordinates; `sympy.latex` prints them."""
+    return [sympy.Eq(sympy.simplify(euler_lagrange(scene, name)), 0) for name in scene._layout.free]
+
+
+# --- expressions as a scene --------------------------------------------------------------------------------
+
+
+def from_sympy(
+    name: str,
+    kinetic: Any,
+    potential: Any,
+    *,
+    coordinates: Mapping,
+    controls: Mapping,
+    prescribed: Mapping,
+    dissipation: Any,
+    applied: Mapping | None,
+    parameters: Mapping,
+) -> Scene:
+    """Return a scene of SymPy expressions; see `Scene.from_sympy`."""
+    maps = {
+        "coordinates": coordinates,
+        "controls": controls,
+        "prescribed": prescribed,
+        "parameters": parameters,
+    }
+    items = []
+    for what, given in {**maps, "applied": applied or {}}.items():
+        try:
+            items.append((what, tuple(dict(given).items())))
+        except (TypeError, ValueError):
+            raise FormulaError(
+                f"{name}.{what} must be a dict from SymPy symbols, got {given!r:.60}"
+            ) from None
+    formulas = tuple(
+        (what, sympy.sympify(e))
+        for what, e in (("kinetic", kinetic), ("potential", potential), ("dissipation", dissipation))
+    )
+    return _scene_type(name, tuple(items), formulas)()
+
+
+@lru_cache(maxsize=256)
+def _scene_type(name: str, items: tuple, formulas: tuple) -> type[Scene]:
+    """Return a class for these expressions; the same ones give the same class."""
+    given = {what: dict(pairs) for what, pairs in items}
+    expressions = dict(formulas)
+    named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
+    applied = {key: sympy.sympify(value) for key, value in named["applied"].items()}
+    places: dict[Any, tuple[str, str]] = {}
+    for symbol in (*given["coordinates"], *given["prescribed"]):
+        places[symbol] = ("q", _name(symbol))
+        if isinstance(symbol, AppliedUndef):
+            places[sympy.Derivative(symbol, *symbol.args)] = ("v", _name(symbol))
+        else:
+            places[sympy.Symbol(f"{_name(symbol)}_dot", **symbol._assumptions_orig)] = ("v", _name(symbol))
+    places |= {symbol: ("u", _name(symbol)) for symbol in given["controls"]}
+    places |= {symbol: ("self", _name(symbol)) for symbol in given["parameters"]}
+
+    def numbers(self: Any, **spaces: Any) -> dict[Any, Any]:
+        spaces["self"] = self
+        return {symbol: getattr(spaces[of], key) for symbol, (of, key) in places.items() if of in spaces}
+
+    def kinetic(self: Any, q: Any, v: Any, xp: Any) -> Any:
+        return evaluate(expressions["kinetic"], numbers(self, q=q, v=v), xp)
+
+    def potential(self: Any, q: Any, xp: Any) -> Any:
+        return evaluate(expressions["potential"], numbers(self, q=q), xp)
+
+    def dissipation(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        return evaluate(expressions["dissipation"], numbers(self, q=q, v=v, u=u), xp)
+
+    def forces(self: Any, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        return {key: evaluate(force, numbers(self, q=q, v=v, u=u), xp) for key, force in applied.items()}
+
+    def reduce(self: Any) -> Any:
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return _remake, (name, items, formulas, fields)
+
+    body = {
+        "__doc__": f"The scene {name} of SymPy expressions.",
+        "__module__": __name__,
+        "__annotations__": dict.fromkeys(named["parameters"], "float"),
+        "__reduce__": reduce,
+        "__call__": lambda self, **values: dataclasses.replace(self, **values),
+        "coordinates": named["coordinates"],
+        "prescribed": named["prescribed"],
+        "controls": named["controls"],
+        "kinetic": kinetic,
+        "potential": potential,
+        "dissipation": dissipation,
+        "applied": forces,
+        **{key: parameter(value, "") for key, value in named["parameters"].items()},
+    }
+    return types.new_class(name, (Scene,), exec_body=lambda space: space.update(body))
+
+
+def _remake(name: str, items: tuple, formulas: tuple, fields: dict) -> Scene:
+    return _scene_type(name, items, formulas)(**fields)
+
+
+def _name(symbol: Any) -> str:
+    if isinstance(symbol, str):
+        return symbol
+    if isinstance(symbol, AppliedUndef):
+        return symbol.func.__name__
+    if isinstance(symbol, sympy.Symbol):
+        return symbol.name
+    raise FormulaError(f"{symbol!r} is no SymPy symbol or function of time; it cannot be a name")
+
+
+_FUNCTIONS = {
+    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
+}
+
+
+def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
+    """Return the value of a SymPy expression for numbers of any kind.
+
+    Parameters
+    ----------
+    expression : sympy.Expr
+        What to evaluate.
+    values : mapping
+        A number for each symbol.
+    xp : namespace
+        Functions for these numbers.
+    """
+    of: Callable[[Any], Any] = lambda e: evaluate(e, values, xp)  # noqa: E731
+    if expression in values:
+        return values[expression]
+    if expression.is_Integer:
+        return int(expression)
+    if expression.is_Rational:
+        exact = isinstance(xp, Functions)
+        return Fraction(expression.p, expression.q) if exact else expression.p / expression.q
+    if expression.is_number and expression.is_real:
+        return float(expression)
+    if expression.is_Add or expression.is_Mul:
+        first, *rest = (of(a) for a in expression.args)
+        for value in rest:
+            first = first + value if expression.is_Add else first * value
+        return first
+    if expression.is_Pow:
+        base, exponent = expression.args
+        if exponent.is_Integer:
+            return of(base) ** int(exponent) if exponent > 0 else 1 / of(base) ** -int(exponent)
+        if exponent.is_Rational and exponent.q == 2:
+            root = xp.sqrt(of(base)) ** abs(int(exponent.p))
+            return root if exponent > 0 else 1 / root
+        raise FormulaError(
+            f"{expression} has the power {exponent}; only whole numbers and halves can be powers"
+        )
+    if expression.func in _FUNCTIONS:
+        return getattr(xp, _FUNCTIONS[expression.func])(of(expression.args[0]))
+    if expression.is_Symbol or isinstance(expression, AppliedUndef | sympy.Derivative):
+        time = " (time is no symbol of an energy)" if str(expression) == "t" else ""
+        raise FormulaError(
+            f"{expression} is neither a coordinate, its velocity, a control nor a parameter of this "
+            f"formula{time}; declare it"
+        )
+    raise FormulaError(
+        f"{expression.func.__name__} in {expression!s:.40} is none of sin, cos, tan, atan, tanh, sqrt, exp, "
+        "log; rewrite it in these"
+    )

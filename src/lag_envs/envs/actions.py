@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.scenes.base import is_masked, shown
+from lag_envs.scenes.checks import is_masked, shown
 
 
 class Actions:

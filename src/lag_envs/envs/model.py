@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
 from lag_envs.envs.single import absent
-from lag_envs.scenes.base import real_array
+from lag_envs.scenes.checks import real_array
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import SLOW, constants_of, program_for
-from lag_envs.scenes.base import shown
+from lag_envs.scenes.checks import shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 

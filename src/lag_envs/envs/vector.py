@@ -28,7 +28,7 @@ from lag_envs.envs.single import (
     true_spec,
 )
 from lag_envs.scenes import StepRefused
-from lag_envs.scenes.base import is_masked, real_array, shown
+from lag_envs.scenes.checks import is_masked, real_array, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 

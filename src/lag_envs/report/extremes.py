@@ -14,7 +14,8 @@ from lag_envs import scenes
 from lag_envs.report import reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.runner import Row
-from lag_envs.scenes.base import Scene, StepRefused
+from lag_envs.scenes.base import Scene
+from lag_envs.scenes.checks import StepRefused
 
 EPS = 2.0**-53
 #: What README calls exact, as a share of the scales; and how many roundings of the state are allowed beside.

@@ -16,7 +16,7 @@ from lag_envs.report.content import Claim, Content, Picture, Table
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.runner import Job, Result, Row, describe
 from lag_envs.report.steppers import comparison
-from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.checks import StepRefused
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -94,8 +94,8 @@ def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> t
     if isinstance(coefficients, slope.Turn):
         turn = coefficients.rate
         if pair:
-            return v, slope.rolling(q, v, pair[1], coefficients), -(turn * pair[1]), turn * pair[0]
-        return v, slope.rolling(q, v, xp.sin(angle + turn * t), coefficients)
+            return v, slope.turning(q, v, pair[1], coefficients), -(turn * pair[1]), turn * pair[0]
+        return v, slope.turning(q, v, xp.sin(angle + turn * t), coefficients)
     c, s = pair or (xp.cos(q), xp.sin(q))
     push = pendulum.acceleration(v, c, s, coefficients) + coefficients.ramp * t
     return (v, push, -(v * s), v * c) if pair else (v, push)
@@ -149,7 +149,7 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
         else:
             c, s = cosine_sine(plane.rate * t, xp)
             s = variables[3] * c + variables[2] * s
-        return slope.rolling(q, 0.0, s, plane)
+        return slope.turning(q, 0.0, s, plane)
 
     return Problem(rolling, lambda q, t: plane.rolling * plane.rate * plane.rate, coefficients.drag, True)
 

@@ -24,7 +24,7 @@ import dataclasses
 from typing import Any
 
 from lag_envs.scenes.acrobot import link
-from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.shapes import Polygon, Shape
 
 

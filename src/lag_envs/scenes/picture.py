@@ -16,7 +16,7 @@ from lag_envs.mechanics.recording import Values
 from lag_envs.scenes.shapes import Moment, Shape, Window, extent, placed
 
 if TYPE_CHECKING:
-    from lag_envs.scenes.contract import Scene
+    from lag_envs.scenes.base import Scene
 
 Pose = tuple[float, float, float]
 

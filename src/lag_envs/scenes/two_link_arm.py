@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from lag_envs.scenes.contract import Scene, parameter
+from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.shapes import Circle, Polygon, Shape
 
 

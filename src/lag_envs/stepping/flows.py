@@ -1,15 +1,15 @@
 """The three exact flows, and how a scene's control step is put together from one of them.
 
-A scene names its flow and says how its state and held control become the flow's variables and coefficients.
-From that, this module makes the scalar ``advance`` that a single environment and `Scene.simulate` call,
-and the lines of the vectorised step. Both call the same recorded blocks with the same roundings, which is
+A scene's normal form (`lag_envs.stepping.normal_forms`) says how its state and held controls become the
+flow's variables and coefficients. From that, this module makes the scalar ``advance`` that a single
+environment and `Scene.simulate` call, and the lines of the vectorised step. Both call the same recorded blocks with the same roundings, which is
 why a batch and a single environment agree bit for bit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, cached_property
 from itertools import islice
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +19,7 @@ from lag_envs.stepping.compiling import compile_function, count_operations, reco
 from lag_envs.stepping.tracing import Trace
 
 if TYPE_CHECKING:
-    from lag_envs.scenes.base import Scene
+    from lag_envs.stepping.normal_forms import NormalForm
 
 
 class Flow(NamedTuple):
@@ -131,26 +131,30 @@ def lift_lines(n: int, angle: int | None, y: str) -> list[str]:
 class Stepper:
     """One scene's control step as lines of code.
 
-    The lines take the lifted state ``y0, y1, ...``, the control ``u0``, the step ``dt``, the bound's ``x``
-    and the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the step's
-    end.
+    The lines take the lifted state ``y0, y1, ...``, the controls ``u0, ...``, the step ``dt``, the bound's
+    ``x`` and the scene's constants (``k_`` and the name), and give the lifted state ``z0, z1, ...`` at the
+    step's end.
 
     Parameters
     ----------
-    scene : Scene
-        Its class and its control decide the code; its numbers do not.
+    form : NormalForm
+        How state and controls become the flow's variables and coefficients.
+    flow : Flow
+        The flow.
     absent : frozenset of str
         Constants that are zero: their terms are left out of the code.
     """
 
-    def __init__(self, scene: Scene, absent: frozenset[str]) -> None:
-        self._names, self._angle = scene.state_names, scene.angle
-        flow = scene.flow
+    def __init__(self, form: NormalForm, flow: Flow, absent: frozenset[str]) -> None:
+        self.flow = flow
+        self._n_state, self._angle = len(form.state_names), form.angle
+        width, controls = form.width, len(form.layout.controls)
         terms = len(flow.coefficients._fields)
-        constants = {name: 0.0 if name in absent else f"k_{name}" for name in scene.constants()}
+        constants = {name: 0.0 if name in absent else f"k_{name}" for name in form.expressions}
         self.constants = [name for name in constants.values() if isinstance(name, str)]
-        self.start = [f"y{i}" for i in range(scene.width)]
-        self.end = [f"z{i}" for i in range(scene.width)]
+        self.start = [f"y{i}" for i in range(width)]
+        self.end = [f"z{i}" for i in range(width)]
+        self.controls = [f"u{i}" for i in range(controls)]
         before = [f"before{i}" for i in range(flow.size)]
         after = [f"after{i}" for i in range(flow.size)]
 
@@ -158,12 +162,12 @@ class Stepper:
             return SimpleNamespace(**dict(zip(constants, values, strict=True)))
 
         def prepare(xp: Any, *values: Any) -> list:
-            y, (u,), rest = split(values, scene.width, 1)
-            return [*scene.unpack(y, u, k(rest)), *scene.drive(y, u, k(rest), xp)]
+            y, u, rest = split(values, width, controls)
+            return [*form.unpack(y, u, k(rest)), *form.drive(y, u, k(rest), xp)]
 
         def finish(xp: Any, *values: Any) -> Sequence:
-            moved, y, (u, dt), rest = split(values, flow.size, scene.width, 2)
-            return scene.pack(moved, y, u, dt, k(rest))
+            moved, y, u, (dt,), rest = split(values, flow.size, width, controls, 1)
+            return form.pack(moved, y, u, dt, k(rest))
 
         def move(xp: Any, *values: Any) -> tuple:
             variables, coefficients, (dt,) = split(values, flow.size, terms)
@@ -175,8 +179,8 @@ class Stepper:
 
         given = list(constants.values())
         names = [*before, *flow.coefficients._fields]
-        prepared, values = section(prepare, [*self.start, "u0", *given], names)
-        finished, _ = section(finish, [*after, *self.start, "u0", "dt", *given], self.end)
+        prepared, values = section(prepare, [*self.start, *self.controls, *given], names)
+        finished, _ = section(finish, [*after, *self.start, *self.controls, "dt", *given], self.end)
         moved, _ = section(move, [*values, "dt"], after)
         tested, (condition,) = section(within, [*values, "dt", "x"], ["within"])
         if isinstance(condition, bool):
@@ -199,26 +203,31 @@ class Stepper:
     @property
     def arguments(self) -> str:
         """The arguments of `advance`."""
-        return ", ".join([*self.start, "u0", "dt", "x", *self.constants])
+        return ", ".join([*self.start, *self.controls, "dt", "x", *self.constants])
 
     def compile(self) -> Callable:
-        """Compile ``advance(y..., u0, dt, x, constants...)`` to ``(z..., status)``.
+        """Compile ``advance(y..., u..., dt, x, constants...)`` to ``(z..., status)``.
 
         It takes any step. The status is the number of substeps, or negative where the step is refused.
         """
         body = [f"def advance({self.arguments}):", *self._any, f"return {', '.join(self.end)}, status"]
         return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
 
+    @cached_property
+    def simulation(self) -> Callable:
+        """What `compile_simulate` makes."""
+        return self.compile_simulate()
+
     def compile_simulate(self) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, x, constants...)``.
 
         It fills the trajectory's rows from the second on, and returns the row that was refused, or 0.
         """
-        n = len(self._names)
+        n = self._n_state
         load = [f"y{i} = trajectory[0, {i}]" for i in range(n)]
         load += lift_lines(n, self._angle, "y")
         loop = [
-            "u0 = controls[i]",
+            *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
             f"{', '.join(self.start)}, status = advance({self.arguments})",
             "if status < 0:",
             "    return i + 1",

@@ -7,7 +7,7 @@ Fixed slope
 
     A sum of terms without cancellation for any drag >= 0; without drag it is the quadratic.
 Turning slope
-    ``x'' = k g sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series
+    ``x'' = weight sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series
     has the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large, short
     steps are taken one after the other; where that is for the drag, the matrix of a short step is squared
     until it spans the whole one ("scaling and squaring").
@@ -142,15 +142,15 @@ def compile_slide(present: tuple[bool, ...]) -> Callable:
 class Turn(NamedTuple):
     """Coefficients of the turning slope while a control is held."""
 
-    rolling: Any  # k
-    gravity: Any  # [m/s²]
+    carry: Any  # k
+    weight: Any  # k g [m/s²]
     drag: Any  # [1/s]
     rate: Any  # Ω [rad/s]
 
 
-def rolling(x: Any, v: Any, s: Any, turn: Turn) -> Any:
+def turning(x: Any, v: Any, s: Any, turn: Turn) -> Any:
     """Return x'' on a turning slope; s is sinφ."""
-    return turn.rolling * (turn.gravity * s + x * (turn.rate * turn.rate)) - turn.drag * v
+    return turn.weight * s + turn.carry * (turn.rate * turn.rate) * x - turn.drag * v
 
 
 def turn_coefficients(
@@ -158,8 +158,8 @@ def turn_coefficients(
 ) -> tuple[list, list]:
     """Return the Taylor coefficients of x and hx'; w is hx' at the start, (c, s) are cosφ and sinφ there."""
     rate = turn.rate * h
-    carry = turn.rolling * (rate * rate)
-    weight = turn.rolling * turn.gravity * (h * h)
+    carry = turn.carry * (rate * rate)
+    weight = turn.weight * (h * h)
     drag = turn.drag * h
     X, V, S, C = [x], [w], [weight * s], [weight * c]
     for k in range(order):
@@ -203,17 +203,21 @@ def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: Turn, h: 
 
 def turns(turn: Turn, h: Any, xp: Any) -> Any:
     """Tell whether one step of the series is exact to rounding."""
-    # rolling = 1/(1 + κ) lies below 1, so its root does too.
-    return h * (2.0 * turn.drag + 3.0 * xp.abs(turn.rate)) <= SMALL_TURN
+    return h * (2.0 * turn.drag + spread(turn.carry, xp) * xp.abs(turn.rate)) <= SMALL_TURN
 
 
-def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[no-untyped-def]
+def spread(carry: Any, xp: Any) -> Any:
+    """Return 2 √k + 1, at least 3: a rolling cylinder's k lies below 1."""
+    return 1.0 + 2.0 * xp.sqrt(xp.maximum(xp.abs(carry), 1.0))
+
+
+def _turn_any(x, v, c, s, carry, weight, drag, rate, dt, _):  # type: ignore[no-untyped-def]
     """Advance by dt for any coefficients; return x, x', cosφ, sinφ, and 1, or -1 or -2 if refused."""
-    growth = dt * (2.0 * drag + 3.0 * abs(rate))
+    growth = dt * (2.0 * drag + (1.0 + 2.0 * math.sqrt(max(abs(carry), 1.0))) * abs(rate))
     n = np.ceil(max(1.0, growth / SMALL_TURN))
     if n == 1.0 or (drag <= abs(rate) and n <= 1e5):
         if n == 1.0:
-            x, v = series(x, v, c, s, rolling, gravity, drag, rate, dt)
+            x, v = series(x, v, c, s, carry, weight, drag, rate, dt)
             c, s = turn_pair(c, s, rate * dt)
         else:
             h = dt / n
@@ -222,7 +226,7 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
             x_low = c_low = s_low = 0.0
             for _i in range(int(n)):
                 x, x_low, w, w_low, c, c_low, s, s_low = substep(
-                    x, x_low, w, w_low, c, c_low, s, s_low, rolling, gravity, drag, rate, h, h_low
+                    x, x_low, w, w_low, c, c_low, s, s_low, carry, weight, drag, rate, h, h_low
                 )
             v = w / h
             v += (fma(-v, h, w) + (w_low - v * h_low)) / h
@@ -239,10 +243,10 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
     # unit matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose
     # a bit with each squaring.
     m = np.empty((2, 4))
-    m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 2], m[1, 2] = change(0.0, 0.0, 1.0, 0.0, rolling, gravity, drag, rate, h)
-    m[0, 3], m[1, 3] = change(0.0, 0.0, 0.0, 1.0, rolling, gravity, drag, rate, h)
+    m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, carry, weight, drag, rate, h)
+    m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, carry, weight, drag, rate, h)
+    m[0, 2], m[1, 2] = change(0.0, 0.0, 1.0, 0.0, carry, weight, drag, rate, h)
+    m[0, 3], m[1, 3] = change(0.0, 0.0, 0.0, 1.0, carry, weight, drag, rate, h)
     for i in range(doublings):
         angle = rate * (dt * 0.5 ** (doublings - i))
         p, q = math.cos(angle), math.sin(angle)
@@ -265,9 +269,9 @@ def _turn_any(x, v, c, s, rolling, gravity, drag, rate, dt, _):  # type: ignore[
 
 @cache
 def compile_turn(present: tuple[bool, ...]) -> Callable:
-    """Compile ``flow(x, v, c, s, rolling, gravity, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
+    """Compile ``flow(x, v, c, s, carry, weight, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
     absent = frozenset(name for name, there in zip(Turn._fields, present, strict=True) if not there)
-    arguments = "x, v, c, s, rolling, gravity, drag, rate, h"
+    arguments = "x, v, c, s, carry, weight, drag, rate, h"
     series, change = (
         compile_traced(
             name,
@@ -292,6 +296,6 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
         change,
         pair,
         compile_traced("start", "v, h, h_low", lambda xp, v, *h: twofold_parts(Twofold(*h) * v)),
-        compile_traced("substep", f"{names}, rolling, gravity, drag, rate, h, h_low", substep, absent),
+        compile_traced("substep", f"{names}, carry, weight, drag, rate, h, h_low", substep, absent),
         SMALL_TURN=SMALL_TURN,
     )

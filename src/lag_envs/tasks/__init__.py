@@ -24,7 +24,7 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 def __getattr__(name: str) -> Any:
     """Return `Task`, from which a task of one's own derives; it is loaded when it is asked for."""
     if name == "Task":
-        from lag_envs.tasks.contract import Task
+        from lag_envs.tasks.base import Task
 
         return Task
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

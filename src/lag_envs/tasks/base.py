@@ -1,35 +1,78 @@
-"""What a task adds to a scene: start, control, reward, ending, observation."""
+"""The contract of a task: what it adds to a scene, written by name."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import inspect
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType, SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.scenes.base import Scene, StepRefused, check_number
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.recording import Values, formula, twin
+from lag_envs.scenes import picture
+from lag_envs.scenes.checks import StepRefused
+from lag_envs.scenes.base import Scene, complete
+from lag_envs.scenes.checks import check_number, real_array
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
-from lag_envs.stepping.flows import Stepper, lift_lines
-from lag_envs.stepping.tracing import Trace
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.flows import lift_lines
+
+if TYPE_CHECKING:
+    from lag_envs.stepping.normal_forms import NormalForm
 
 #: Starts given by hand may be this fast at most, so that observation bounds can be proved [rad/s or m/s].
 FASTEST_START = 100.0
 #: Angle [rad] through which `Task.fastest` may turn in a step. It then needs far fewer substeps than are
 #: allowed, also after many steps have added to the speed.
 LONGEST_TURN = 5000.0
+#: Names of the formulas of a task.
+FORMULAS = ("guard", "observe", "reward", "last_reward", "terminated", "kick")
+_UNBOUNDED = float(np.finfo(np.float32).max)
 
 
-class Task(ABC):
+class Task:
     """A task on a scene.
 
-    A subclass says what its class attributes and abstract methods ask for. Formulas follow the same rules as
-    a scene's: numbers in, ``+ - * /`` and `xp`, numbers out. ``y`` is the lifted state before the step, ``z``
-    the one after it, ``u`` the control that was applied, ``g`` the target, ``k`` the constants by name.
+    A subclass says what its attributes and methods ask for; `scene`, `interval`, `steps`, `action`, `observe`
+    and `reward` at least. Formulas go by name: ``before`` and ``after`` are the state at the step's two ends,
+    with the names of ``scene.state_names``, ``control`` the controls that were applied, ``target`` the
+    targets. They use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, and functions of
+    ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum. The scene's parameters
+    and energies may be used: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
+
+    Attributes
+    ----------
+    id : str
+        Name under which `lag_envs.register` registers it.
+    scene : type
+        The scene; an instance has the scene itself here.
+    defaults : mapping
+        Parameters of the scene that differ from its own.
+    interval : float
+        Control interval [s].
+    steps : int
+        Steps of an episode.
+    action : mapping
+        For each control that is acted on its limit, (low, high), or a list of values to choose from.
+    start : mapping
+        For entries of the state a half width around 0, or (centre, half width); the others start at 0.
+    target : mapping
+        For each target (unit, half width) or (unit, centre, half width).
+    draws : int
+        Random numbers in [0, 1) that `kick` uses.
+    scaled : bool
+        Whether rewards of another `dt` are scaled by dt/interval.
+    usable : mapping
+        Ranges of parameters in which the task can be used, where they are not those that the scene declares.
+        Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
+        gives finite observations within their space, and every step is taken.
 
     Parameters
     ----------
@@ -37,54 +80,46 @@ class Task(ABC):
         Control interval [s]. The episode keeps its seconds, not its steps.
     duration : float, optional
         Length of an episode [s]; infinity for one without an end.
-    target : float, optional
-        A fixed target in place of a random one, for tasks that have one.
+    target : float, sequence or mapping, optional
+        Fixed targets in place of random ones.
     **parameters
         Parameters of the scene.
     """
 
-    scene_type: ClassVar[type[Scene]]
-    #: Parameters of the scene that differ from its own defaults.
-    defaults: ClassVar[dict[str, Any]] = {}
-    #: Control interval [s] and steps of an episode.
+    id: ClassVar[str] = ""
+    scene: Any
+    defaults: ClassVar[Mapping[str, Any]] = MappingProxyType({})
     interval: ClassVar[float] = 0.02
     steps: ClassVar[int] = 500
-    #: Names of the observation's entries.
-    observation: ClassVar[tuple[str, ...]]
-    #: Random targets lie in [-target_range, target_range]; None for a task without target.
-    target_range: ClassVar[float | None] = None
-    #: The action without control; with it a person's hands are off.
-    rest_action: ClassVar[float] = 0.0
-    #: Random numbers that one step's kick uses, at most 16.
+    action: Any = MappingProxyType({})
+    start: Any = MappingProxyType({})
+    target: Any = MappingProxyType({})
     draws: ClassVar[int] = 0
-    #: Ranges of parameters in which the task can be used, where they are not those that the scene declares.
-    #: Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
-    #: gives finite observations within their space, and every step is taken.
-    usable: ClassVar[dict[str, tuple[float, float]]] = {}
+    scaled: ClassVar[bool] = True
+    usable: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for name in ("defaults", "action", "start", "target", "usable"):
+            if isinstance(vars(cls).get(name), Mapping):
+                setattr(cls, name, MappingProxyType(dict(vars(cls)[name])))
 
     def __init__(
-        self,
-        *,
-        dt: float | None = None,
-        duration: float | None = None,
-        target: float | None = None,
-        **parameters: Any,
+        self, *, dt: float | None = None, duration: float | None = None, target: Any = None, **parameters: Any
     ) -> None:
-        known = {f.name for f in dataclasses.fields(self.scene_type)}
-        unknown = sorted(set(parameters) - known)
-        if unknown:
-            options = [
-                *sorted(known),
-                "dt",
-                "duration",
-                *(["target"] if self.target_range is not None else []),
-            ]
+        kind = type(self).scene
+        if not (isinstance(kind, type) and issubclass(kind, Scene)):
+            raise FormulaError(
+                f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}"
+            )
+        known = list(inspect.signature(kind).parameters)
+        for name in sorted(set(parameters) - set(known)):
+            options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else [])]
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
-                f"got an unexpected keyword argument {unknown[0]!r}; "
-                f"this environment takes {', '.join(options)}"
+                f"got an unexpected keyword argument {name!r}; this environment takes {', '.join(options)}"
             )
-        self.scene: Scene = self.scene_type(**(self.defaults | parameters))
+        self.scene = kind(**(dict(self.defaults) | parameters))
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")
@@ -92,12 +127,67 @@ class Task(ABC):
         self.duration = check_number("duration", seconds, "s", endless=True)
         if not self.duration >= self.dt:
             raise ValueError(f"duration must be at least dt={self.dt:g} s, got {self.duration:g} s")
-        self.target: float | None = None if target is None else self.check_target(target)
+        self.fixed_target: NDArray[np.float64] | None = None
         self.check()
         self.check_usable()
+        _ = self.formulas
+        if target is not None:
+            self.fixed_target = np.atleast_1d(self.check_target(target))
+
+    # --- what a task defines -------------------------------------------------------------------------------
+
+    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
+        """Return the controls that are applied in place of those that are wanted, by name."""
+        return wanted
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return the observation: numbers by name, in order."""
+        raise FormulaError("it is not defined; write observe(self, after, target, xp)")
+
+    def bounds(self) -> Mapping[str, Any]:
+        """Return bounds on entries of the observation, ±bound or (low, high), where they are proved."""
+        return {}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return the reward of a step of `interval`."""
+        raise FormulaError("it is not defined; write reward(self, before, after, control, target, dt, xp)")
+
+    def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return the reward of the step that terminates; by default that of any other."""
+        return self.reward(before, after, control, target, dt, xp)
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the episode has come to its end."""
+        return False
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Return what a random disturbance adds to entries of the state; draws lie in [0, 1)."""
+        return {}
 
     def check(self) -> None:
         """Raise ValueError where the parameters do not fit the task."""
+
+    def check_start(self, state: Any) -> None:
+        """Raise ValueError for a start that the task cannot have; `state` goes by name and by index."""
+
+    @property
+    def fastest(self) -> float:
+        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
+        return 0.0
+
+    @property
+    def edges(self) -> Sequence[Sequence[float]]:
+        """States at the edge of what the task reaches, in all that drives the motion but angle and rate."""
+        return [self.centre]
+
+    # --- what follows --------------------------------------------------------------------------------------
+
+    @classmethod
+    def usable_ranges(cls) -> dict[str, tuple[float, float]]:
+        """Return the range of each parameter in which the task can be used."""
+        complete(cls.scene)
+        fields = dataclasses.fields(cls.scene)
+        return {f.name: f.metadata["usable"] for f in fields if "usable" in f.metadata} | dict(cls.usable)
 
     def check_usable(self) -> None:
         """Raise ValueError where a parameter is outside the range in which the task can be used."""
@@ -114,21 +204,62 @@ class Task(ABC):
                 f"got {self.dt!r} s with {self.scene}"
             )
 
-    @property
-    def fastest(self) -> float:
-        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
-        return 0.0
+    def coefficients(self, state: Any, control: Any, xp: Any) -> Any:
+        """Return the coefficients of the scene's normal form while a control is held.
 
-    @classmethod
-    def usable_ranges(cls) -> dict[str, tuple[float, float]]:
-        """Return the range of each parameter in which the task can be used."""
-        fields = dataclasses.fields(cls.scene_type)
-        return {f.name: f.metadata["usable"] for f in fields if "usable" in f.metadata} | cls.usable
+        Parameters
+        ----------
+        state, control : Values or sequence of numbers
+            As formulas have them, or numbers.
+        xp : namespace
+            That of the formula; NumPy for numbers.
+
+        Returns
+        -------
+        pendulum.Drive, slope.Pull or slope.Turn
+            See `lag_envs.stepping.normal_forms`. In a formula they are those that the step uses.
+        """
+        form = self.scene._form if self._recording is None else self._recording.form
+        if form is None:
+            raise FormulaError(f"{type(self.scene).__name__} has no normal form; use its energies")
+        k = SimpleNamespace(**self.scene._constants()) if self._recording is None else self._recording.k
+        return form.drive(list(state), list(control), k, xp)
+
+    #: While formulas are recorded, the recorded constants.
+    _recording: Any = None
 
     @property
-    def variant(self) -> tuple:
-        """What decides the code besides class and control: the environments of a batch must agree in it."""
-        return self.scene.state_names, self.target is None
+    def centre(self) -> list[float]:
+        """Centre of the box from which the state starts."""
+        return [self.formulas.starts[name][0] for name in self.scene.state_names]
+
+    @property
+    def rest_action(self) -> Any:
+        """The action without control, or what is nearest to it; with it a person's hands are off."""
+        return self.formulas.rest_action
+
+    @property
+    def control_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The controls of the lowest and of the highest actions at the centre of the starts."""
+        return self.formulas.control_range()
+
+    def certified_speed(self) -> float | None:
+        """Return the rate of the angle up to which one series per step is certified, whatever the control.
+
+        It is below 0 where one series is never enough, and None where the scene is no driven pendulum. See
+        `NormalForm.certified_speed`.
+        """
+        form, k = self.scene._form, self.scene._constants()
+        if form is None:
+            return None
+        found = [form.certified_speed(y, u, self.dt, k) for y in self.edges for u in self.control_range]
+        return min((speed for speed in found if speed is not None), default=None)
+
+    def chance(self, per_interval: float) -> float:
+        """Return a step's chance of what has a chance per interval: a second has as many for any `dt`."""
+        if self._recording is not None:
+            return self._recording.chance(per_interval)
+        return -math.expm1(self.dt / self.interval * math.log1p(-per_interval))
 
     @property
     def limit(self) -> float:
@@ -136,70 +267,61 @@ class Task(ABC):
         steps = self.duration / self.dt
         return steps if math.isinf(steps) else float(round(steps))
 
-    def constants(self) -> dict[str, float]:
-        """Return what the compiled step needs: constants of scene, task and stepping."""
-        own = {name: float(value) for name, value in self.numbers().items()}
-        stepping = {"scale": self.dt / self.interval, "limit": self.limit}
-        goal = {} if self.target is None else {"goal": self.target}
-        return self.scene.constants() | own | stepping | goal
+    @cached_property
+    def formulas(self) -> TaskFormulas:
+        """What compiled functions are made of."""
+        return TaskFormulas(self)
 
     @property
-    def largest_x(self) -> float:
-        """The bound's x up to which one step is certified."""
-        return self.scene.largest_x(self.dt)
+    def observation(self) -> tuple[str, ...]:
+        """Names of the observation's entries."""
+        return self.formulas.observation
 
     @property
-    def control_range(self) -> tuple[float, float]:
-        """The controls of the actions -1 and 1 at the centre of the starts."""
-        k = SimpleNamespace(**self.constants())
-        y = self.scene.lift(self.centre)
-        low, high = (float(self.control(a, y, k, self.dt, np)) for a in (-1.0, 1.0))
-        return low, high
+    def variant(self) -> tuple:
+        """What decides the code besides the class: the environments of a batch must agree in it."""
+        scene, form = self.scene, self.scene._form
+        order = form.order(self.dt) if form else 0
+        return *scene._structure[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property
-    def edges(self) -> Sequence[Sequence[float]]:
-        """States at the edge of what the task reaches, in all that drives the motion but θ and θ'."""
-        return [self.centre]
-
-    def certified_speed(self) -> float | None:
-        """Return the |θ'| up to which one series per step is certified, whatever the control [rad/s].
-
-        It is below 0 where one series is never enough, and None where the scene is not stepped by one. See
-        `Scene.certified_speed`.
-        """
-        found = [
-            self.scene.certified_speed(state, u, self.dt) for state in self.edges for u in self.control_range
-        ]
-        return min((speed for speed in found if speed is not None), default=None)
-
-    def check_target(self, target: Any) -> float:
-        """Return the target as float, or raise a ValueError."""
-        if self.target_range is None:
-            raise ValueError(f"this task has no target, got target={target!r}")
-        return check_number("target", target)
-
-    def check_start(self, state: ArrayLike) -> NDArray[np.float64]:
-        """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
-        array = self.scene.check_state(state)
-        for name, unit, value in zip(self.scene.state_names, self.scene.state_units, array, strict=True):
-            if unit.endswith("/s") and abs(value) > FASTEST_START:
-                raise ValueError(
-                    f"{name} must lie within ±{FASTEST_START:g} {unit} at the start, got {value:g} {unit}"
-                )
-        self.check_safe(array)
-        return array
-
-    def check_safe(self, state: NDArray[np.float64]) -> None:
-        """Raise ValueError for a start outside the set in which the episode goes on."""
+    def target_range(self) -> tuple[float, ...] | None:
+        """Half widths of the random targets; None for a task without any."""
+        return tuple(t.half for t in self.formulas.target_boxes) or None
 
     def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
-        """Return a given start, checked; see `check_start`."""
-        return self.check_start(state)
+        """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
+        array = self.scene._check_state(state)
+        for entry, value in zip(self.scene._layout.state, array, strict=True):
+            if entry.kind != "place" and abs(value) > FASTEST_START:
+                raise ValueError(
+                    f"{entry.name} must lie within ±{FASTEST_START:g} {entry.unit} at the start, "
+                    f"got {value:g} {entry.unit}"
+                )
+        self.check_start(
+            Values("entry of the state", dict(zip(self.scene.state_names, array.tolist(), strict=True)))
+        )
+        return array
 
-    @property
-    def formulas(self) -> FlowFormulas:
-        """What compiled functions are made of."""
-        return FlowFormulas(self)
+    def check_target(self, target: Any) -> Any:
+        """Return the target as float, or an array where there are several; or raise a ValueError."""
+        names = [t.name for t in self.formulas.target_boxes]
+        if not names:
+            raise ValueError(f"this task has no target, got target={target!r}")
+        if isinstance(target, Mapping):
+            if sorted(target) != sorted(names):
+                raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
+            target = [target[name] for name in names]
+        array = np.atleast_1d(real_array("target", target))
+        if array.shape != (len(names),):
+            raise ValueError(f"target must be {', '.join(names)}, got {target!r}")
+        for name, value in zip(names, array, strict=True):
+            if not math.isfinite(value):
+                raise ValueError(f"target {name} must be finite, got {value}")
+        return float(array[0]) if len(names) == 1 else array
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "formulas"}
 
     # --- the picture ---------------------------------------------------------------------------------------
 
@@ -211,167 +333,412 @@ class Task(ABC):
         """Return the part of the plane to look at [m]."""
         return self.scene.window(now)
 
-    def share(self, control: float) -> float:
-        """Return the control as a share of the largest one."""
-        return control / self.limit_control
+    def share(self, control: Any) -> Any:
+        """Return controls as shares of their largest sizes."""
+        largest = {a.control: max(abs(a.low), abs(a.high)) for a in self.formulas.acting}
+        shares = [
+            float(value) / largest[name] if name in largest else 0.0
+            for name, value in zip(self.scene.control_names, np.atleast_1d(control), strict=True)
+        ]
+        return shares[0] if len(shares) == 1 else shares
 
-    def turning(self, state: Sequence[float]) -> float:
-        """Return the rate of a coordinate that the picture shows and the state leaves out."""
-        return self.scene.turning(state)
+    def turning(self, state: Sequence[float]) -> Any:
+        """Return the rates of the coordinates that the state leaves out."""
+        return np.array(picture.turning(self.scene, state))
 
     def control_readings(self, now: Moment) -> list[Reading]:
-        """Return what the read-out tells of the control."""
-        name, _, unit = self.scene.control_unit.rstrip("]").partition(" [")
-        return [Reading(name, now.control, unit, "action")]
+        """Return what the read-out tells of the controls."""
+        names = zip(
+            self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True
+        )
+        return [Reading(name, float(value), unit, "action") for name, value, unit in names]
 
     def readings(self, now: Moment) -> list[Reading]:
-        """Return what the read-out tells besides state and control."""
-        if now.target is None:
-            return []
-        return [Reading(self.scene.state_names[0] + "*", now.target, self.scene.state_units[0], "target")]
+        """Return what the read-out tells besides state and controls: the targets."""
+        given: Any = [] if now.target is None else np.atleast_1d(now.target)
+        return [
+            Reading(t.name, float(value), t.unit, "target")
+            for t, value in zip(self.formulas.target_boxes, given, strict=False)
+        ]
 
-    # --- what a task defines -------------------------------------------------------------------------------
 
-    @property
-    @abstractmethod
-    def limit_control(self) -> float:
-        """Largest control."""
+@dataclasses.dataclass(frozen=True)
+class TargetBox:
+    """Where a random target lies."""
 
-    @property
-    @abstractmethod
-    def start(self) -> Sequence[float]:
-        """Half widths of the box around `centre` from which the state starts."""
+    name: str
+    unit: str
+    centre: float
+    half: float
 
-    @property
-    def centre(self) -> Sequence[float]:
-        """Centre of the box from which the state starts."""
-        return [0.0] * len(self.scene.state_names)
 
-    @abstractmethod
-    def numbers(self) -> dict[str, float]:
-        """Return the constants that the task's formulas need."""
+@dataclasses.dataclass(frozen=True)
+class Acting:
+    """How a control follows from an action: ``low + (high - low)(a + 1)/2``, or one of `values`."""
 
-    @abstractmethod
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
-        """Return the control for an action in [-1, 1]."""
+    control: str
+    low: float
+    high: float
+    values: tuple[float, ...] = ()
 
-    @abstractmethod
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return the step's reward."""
 
-    def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return the reward of the step that terminates, or None where it is like any other."""
-        return None
+class _Recording(NamedTuple):
+    """What a task sees of the step while its formulas are recorded."""
 
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
-        """Tell whether the episode has come to its end."""
-        return False
+    k: Any
+    form: NormalForm | None
+    chance: Callable[[float], Any]
 
-    def kick(self, z: Sequence, draws: Sequence, k: Any, xp: Any) -> Sequence:
-        """Return the lifted state after a random kick; draws lie in [0, 1)."""
-        return z
 
-    @abstractmethod
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
-        """Return the observation's entries."""
+class _Lifted:
+    """The namespace ``xp`` where cosine and sine of angles are already known."""
 
-    @abstractmethod
-    def bounds(self) -> Sequence[float]:
-        """Return a bound on the size of each observation entry, proved for every start that is accepted."""
+    def __init__(self, xp: Any, known: Sequence[tuple[Any, Any, Any]]) -> None:
+        self._xp, self._known = xp, known
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._xp, name)
+
+    def cos(self, x: Any) -> Any:
+        """Return the cosine."""
+        for angle, c, _ in self._known:
+            if angle is x:
+                return c
+        return self._xp.cos(x)
+
+    def sin(self, x: Any) -> Any:
+        """Return the sine."""
+        for angle, _, s in self._known:
+            if angle is x:
+                return s
+        return self._xp.sin(x)
 
 
 #: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = {"scene", "dt", "duration", "target"}
+_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas"}
 
 
-class FlowFormulas:
-    """The formulas of a task on a scene with a flow of its own, as `lag_envs.envs.program` asks for them."""
+class TaskFormulas:
+    """The formulas of a task, as `lag_envs.envs.program` asks for them.
 
-    clipped = True
-    actions = controls = 1
-    choices = ()
-    trace = Trace
+    States ``y`` and ``z`` are lifted where the scene has a normal form: cosine and sine of its angle follow.
+    """
+
+    trace = ElementaryTrace
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self.state = task.scene.state_names
-        self.observation = task.observation
+        self._chances: dict[float, str] = {}
+        scene = task.scene
+        self._form = scene._form
+        #: Whether the step takes the constant ``x``: the largest one of one series, or the series' order.
+        self.bounded = self._form is None or bool(self._form.order(task.dt))
+        self.state = scene.state_names
+        self._controls = scene.control_names
+        self.controls = len(self._controls)
+        self.acting = _acting(task)
+        self.actions = len(self.acting)
+        self.choices = tuple(len(a.values) for a in self.acting if a.values)
+        if self.choices and len(self.choices) != self.actions:
+            raise FormulaError(
+                f"{type(task).__name__}.action mixes lists of values with ranges; "
+                "give each control one or each the other"
+            )
+        self.clipped = not self.choices
+        self.target_boxes = _target_boxes(task)
+        self.targets = len(self.target_boxes)
         self.draws = task.draws
-        self.targets = 0 if task.target_range is None else 1
-        self.bounded = bool(task.scene.order)
+        self.starts = _starts(task)
         self.has_last = type(task).last_reward is not Task.last_reward
+        self.observation = self._names()
+
+    # --- constants ------------------------------------------------------------------------------------------
+
+    def constants(self) -> dict[str, float]:
+        """Return every number that compiled functions take, by name."""
+        task, scene = self._task, self._task.scene
+        found = dict(scene._constants())
+        found |= {f"self_{name}": float(getattr(scene, name)) for name in scene._numbers()}
+        for i, name in enumerate(self.state):
+            found[f"centre{i}"], found[f"half{i}"] = self.starts[name]
+        if task.fixed_target is not None:
+            found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
+        found |= {name: task.chance(p) for p, name in self._chances.items()}
+        found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
+        return found | {"x": scene._limit(task.dt)}
 
     @property
     def key(self) -> tuple:
         """What decides the code: tasks of a class that agree in it differ in their numbers only."""
-        task, scene = self._task, self._task.scene
-        values = (getattr(scene, field.name) for field in dataclasses.fields(scene))
-        choices = [math.isinf(v) if isinstance(v, float) else repr(v) for v in values]
+        scene = self._task.scene
+        kind = type(self._task)
+        formulas = tuple(getattr(kind, name) for name in FORMULAS)
+        plain = (self._task.scaled, self.draws, tuple(self.acting), tuple(self.target_boxes))
         # Formulas may also name attributes of the task, which somebody may have set by hand.
-        own = [(name, repr(v)) for name, v in vars(task).items() if name not in _NUMBERS]
-        shared = [v for c in type(task).__mro__ for v in vars(c).values() if isinstance(v, int | float)]
-        return task.variant, *choices, *own, *shared
+        own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
+        shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
+        return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
 
     def refusal(self, *arguments: Any) -> StepRefused:
         """Return the error for a step that was refused."""
-        return self._task.scene.refusal(*arguments)
+        return self._task.scene._refusal(*arguments)
 
-    def box(self) -> tuple[list[float], list[float]]:
-        """Return the lowest and highest values of the observation's entries."""
-        high = list(self._task.bounds())
-        return [-b for b in high], high
-
-    def constants(self) -> dict[str, float]:
-        """Return every number that compiled functions take, by name."""
-        task = self._task
-        start = {f"centre{i}": c for i, c in enumerate(task.centre)}
-        start |= {f"half{i}": h for i, h in enumerate(task.start)}
-        return task.constants() | start | {"dt": task.dt, "x": task.largest_x}
-
-    def stepper(self, absent: frozenset[str]) -> Stepper:
+    def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
-        return Stepper(self._task.scene, absent)
+        scene = self._task.scene
+        return self._form.stepper(self._task.dt, absent) if self._form else scene._stepper.code(absent)
+
+    # --- formulas -------------------------------------------------------------------------------------------
+
+    def _self(self, k: Any) -> Task:
+        """Return a task whose numbers are those that are recorded."""
+        task = copy.copy(self._task)
+        vars(task).pop("formulas", None)
+        names = self._task.scene._numbers()
+        task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
+        task.dt = k.dt
+        task._recording = _Recording(
+            k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
+        )
+        return task
+
+    def _known(self, xp: Any, *states: Sequence) -> Any:
+        """Return the namespace that knows cosine and sine of the states' angles."""
+        if self._form is None or self._form.angle is None:
+            return xp
+        return _Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
+
+    def _state(self, y: Sequence) -> Values:
+        layout = self._task.scene._layout
+        names = dict(zip(self.state, y, strict=False))
+        rates = {e.coordinate: names[e.name] for e in layout.state if e.kind == "velocity"}
+        hidden = {} if "v" in names else {"v": Values("velocity of a coordinate", rates)}
+        return Values("entry of the state", names, hidden)
+
+    def _targets(self, g: Sequence) -> Values:
+        return Values("target", dict(zip((t.name for t in self.target_boxes), g, strict=True)))
+
+    def _applied(self, u: Sequence) -> Values:
+        return Values("control", dict(zip(self._controls, u, strict=True)))
+
+    def _call(self, name: str, k: Any, *arguments: Any) -> Any:
+        with formula(self._task, name):
+            return getattr(self._self(k), name)(*arguments)
 
     def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the controls that are applied."""
-        return [self._task.control(a[0], y, k, k.dt, xp)]
+        wanted = dict.fromkeys(self._controls, 0.0)
+        for acting, number in zip(self.acting, a, strict=True):
+            wanted[acting.control] = _control(acting, number, xp)
+        if type(self._task).guard is Task.guard:
+            return list(wanted.values())
+        given = Values("control", wanted)
+        found = self._call("guard", k, given, self._state(y), k.dt, self._known(xp, y))
+        if isinstance(found, Values):
+            return list(found)
+        if not isinstance(found, Mapping):
+            if len(self.acting) != 1:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard must return controls by name, got {found!r:.60}"
+                )
+            found = {self.acting[0].control: found}
+        for name in found:
+            if name not in wanted:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.guard: there is no control {name!r}, "
+                    f"only {', '.join(wanted)}"
+                )
+        return list((wanted | dict(found)).values())
 
     def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
         """Return the reward, and whether the episode is over."""
-        reward = self._task.reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
-        return reward, self._task.terminated(z, k, xp)
+        ended = self._call("terminated", k, self._state(z), self._targets(g), self._known(xp, z))
+        return self._reward("reward", xp, y, z, u, g, k), ended
 
     def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
         """Return the reward of a step that terminates."""
-        return self._task.last_reward(y, z, u[0], g[0] if g else 0.0, k, k.dt, xp)
+        return self._reward("last_reward", xp, y, z, u, g, k)
 
-    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> Sequence:
-        """Return the lifted state after a kick."""
-        return self._task.kick(z, draws, k, xp)
+    def _reward(self, name: str, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        xp = self._known(xp, y, z)
+        value = self._call(
+            name, k, self._state(y), self._state(z), self._applied(u), self._targets(g), k.dt, xp
+        )
+        if value is None or isinstance(value, Mapping | Sequence):
+            raise FormulaError(
+                f"{type(self._task).__name__}.{name} returns {value!r:.60}; it must return a number"
+            )
+        return k.scale * value if self._task.scaled else value
 
-    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> Sequence:
+    def kick(self, xp: Any, draws: Sequence, z: Sequence, k: Any) -> list:
+        """Return the state after a kick."""
+        added = self._call("kick", k, self._state(z), draws, self._known(xp, z))
+        after = dict(zip(self.state, z, strict=False))
+        for name, value in added.items():
+            if name not in after:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.kick: there is no entry {name!r} of the state, "
+                    f"only {', '.join(self.state)}"
+                )
+            after[name] = after[name] + value
+        angle = None if self._form is None else self._form.angle
+        if angle is None or self.state[angle] not in added:
+            return [*after.values(), *z[len(self.state) :]]
+        turned = after[self.state[angle]]
+        return [*after.values(), xp.cos(turned), xp.sin(turned)]
+
+    def observe(self, xp: Any, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the observation."""
-        return self._task.observe(y, g[0] if g else 0.0, k)
+        found = self._call("observe", k, self._state(y), self._targets(g), self._known(xp, y))
+        if not isinstance(found, Mapping) or not found:
+            raise FormulaError(
+                f"{type(self._task).__name__}.observe must return numbers by name, in order, "
+                f"got {found!r:.60}"
+            )
+        return list(found.values())
+
+    def _names(self) -> tuple[str, ...]:
+        """Run all formulas once, for their errors and for the observation's names."""
+        trace = self.trace()
+
+        class Inputs:
+            def __getattr__(self, name: str) -> Any:
+                return trace.inputs(name)[0]
+
+        k = Inputs()
+        width = len(self.state) if self._form is None else self._form.width
+        y, z = ([trace.inputs(f"{letter}{i}")[0] for i in range(width)] for letter in "yz")
+        a = [trace.inputs(f"a{i}")[0] for i in range(self.actions)]
+        u = [trace.inputs(f"u{i}")[0] for i in range(self.controls)]
+        g = [trace.inputs(f"g{i}")[0] for i in range(self.targets)]
+        self.control(trace, a, y, g, k)
+        self.judge(trace, y, z, u, g, k)
+        if self.has_last:
+            self.last(trace, y, z, u, g, k)
+        if self.draws:
+            self.kick(trace, [trace.inputs(f"d{i}")[0] for i in range(self.draws)], z, k)
+        self.observe(trace, y, g, k)
+        return tuple(self._call("observe", k, self._state(y), self._targets(g), trace))
 
     def sample_targets(self, draws: Sequence, k: Any) -> list:
         """Return targets from draws in [0, 1)."""
-        if not self.targets:
-            return []
-        if self._task.target is not None:
-            return [k["goal"]]
-        return [self._task.target_range * (2.0 * draws[0] - 1.0)]
+        if self._task.fixed_target is not None:
+            return [k[f"goal{i}"] for i in range(self.targets)]
+        return [t.centre + t.half * (2.0 * d - 1.0) for t, d in zip(self.target_boxes, draws, strict=True)]
 
     def lift(self, y: str) -> list[str]:
         """Return the lines that complete the lifted state."""
-        return lift_lines(len(self.state), self._task.scene.angle, y)
+        return lift_lines(len(self.state), self._form.angle if self._form else None, y)
+
+    @property
+    def rest_action(self) -> Any:
+        """The action whose controls are nearest to 0."""
+        if self.choices:
+            found: Any = [min(range(len(a.values)), key=lambda i, a=a: abs(a.values[i])) for a in self.acting]
+        else:
+            found = [min(1.0, max(-1.0, -(a.high + a.low) / (a.high - a.low))) for a in self.acting]
+        return found[0] if len(found) == 1 else found
+
+    def control_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the controls of the lowest and of the highest actions at the centre of the starts."""
+        k = SimpleNamespace(**self.constants())
+        y: Any = self._task.centre if self._form is None else self._form.lift(self._task.centre)
+        ends = ([0.0 for a in self.acting], [float(n - 1) for n in self.choices])
+        low, high = ends if self.choices else ([-1.0] * self.actions, [1.0] * self.actions)
+        found = (self.control(np, a, y, [0.0] * self.targets, k) for a in (low, high))
+        first, last = (np.array([float(u) for u in controls]) for controls in found)
+        return first, last
+
+    def box(self) -> tuple[list[float], list[float]]:
+        """Return the lowest and highest values of the observation's entries."""
+        given = dict(self._task.bounds())
+        for name in given:
+            if name not in self.observation:
+                raise FormulaError(
+                    f"{type(self._task).__name__}.bounds: there is no observation {name!r}, "
+                    f"only {', '.join(self.observation)}"
+                )
+        low, high = [], []
+        for name in self.observation:
+            bound = given.get(name, _UNBOUNDED)
+            pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
+            # Where an episode has no end no bound exists, and no speed times no end is no number.
+            low.append(float(pair[0]) if pair[0] > -_UNBOUNDED else -_UNBOUNDED)
+            high.append(float(pair[1]) if pair[1] < _UNBOUNDED else _UNBOUNDED)
+        return low, high
 
 
-def finite(bound: float) -> float:
-    """Return the bound, or the largest float32 where the episode has no end and so no bound exists."""
-    largest = float(np.finfo(np.float32).max)
-    return bound if bound < largest else largest  # no speed times no end is no number
+def _control(acting: Acting, a: Any, xp: Any) -> Any:
+    if acting.values:
+        value: Any = acting.values[-1]
+        for i in reversed(range(len(acting.values) - 1)):
+            value = xp.where(a < i + 0.5, acting.values[i], value)
+        return value
+    if acting.low == -acting.high:
+        return acting.high * a
+    return acting.low + (acting.high - acting.low) * (0.5 + 0.5 * a)
 
 
-def kick_chance(task: Task, chance: float) -> float:
-    """Return a step's chance of a kick such that a second has as many as at the task's own interval."""
-    return -math.expm1(task.dt / task.interval * math.log1p(-chance))
+def _numbers_of(where: str, value: Any) -> tuple[float, ...]:
+    try:
+        return tuple(check_number(where, v) for v in value)
+    except (TypeError, ValueError) as error:
+        raise FormulaError(f"{where}: {error}") from error
+
+
+def _mapping(task: Task, name: str) -> dict[str, Any]:
+    value = getattr(task if name != "target" else type(task), name)
+    if not isinstance(value, Mapping):
+        raise FormulaError(f"{type(task).__name__}.{name} must map names to numbers, got {value!r:.60}")
+    return dict(value)
+
+
+def _acting(task: Task) -> list[Acting]:
+    of, known = type(task).__name__, task.scene.control_names
+    found = []
+    for name, given in _mapping(task, "action").items():
+        where = f"{of}.action[{name!r}]"
+        if name not in known:
+            raise FormulaError(f"{where}: the scene has no such control, only {', '.join(known) or 'none'}")
+        if isinstance(given, list):
+            values = _numbers_of(where, given)
+            if len(values) < 2:
+                raise FormulaError(f"{where} must list at least two values, got {given!r}")
+            found.append(Acting(name, min(values), max(values), values))
+            continue
+        low, high = (
+            _numbers_of(where, given if isinstance(given, tuple) else (given,))
+            if isinstance(given, tuple)
+            else (-check_number(where, given), check_number(where, given))
+        )
+        if not low < high:
+            raise FormulaError(f"{where} must be a limit above 0 or (low, high), got {given!r}")
+        found.append(Acting(name, low, high))
+    if known and not found:
+        raise FormulaError(f"{of}.action must give limits of controls, as in {{{known[0]!r}: 1.0}}")
+    return found
+
+
+def _target_boxes(task: Task) -> list[TargetBox]:
+    of, found = type(task).__name__, []
+    for name, given in _mapping(task, "target").items():
+        where = f"{of}.target[{name!r}]"
+        if not isinstance(given, tuple) or len(given) not in (2, 3) or not isinstance(given[0], str):
+            raise FormulaError(f"{where} must be (unit, half width), got {given!r:.60}")
+        *centre, half = _numbers_of(where, given[1:])
+        found.append(TargetBox(name, given[0], centre[0] if centre else 0.0, half))
+    return found
+
+
+def _starts(task: Task) -> dict[str, tuple[float, float]]:
+    of, names = type(task).__name__, task.scene.state_names
+    found = dict.fromkeys(names, (0.0, 0.0))
+    for name, given in _mapping(task, "start").items():
+        where = f"{of}.start[{name!r}]"
+        if name not in found:
+            raise FormulaError(f"{where}: the state has no such entry, only {', '.join(names)}")
+        if isinstance(given, tuple) and len(given) != 2:
+            raise FormulaError(f"{where} must be a half width or (centre, half width), got {given!r}")
+        pair = _numbers_of(where, given if isinstance(given, tuple) else (0.0, given))
+        found[name] = pair[0], pair[1]
+    return found

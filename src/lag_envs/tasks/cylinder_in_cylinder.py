@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lag_envs.scenes import CylinderInCylinder
 from lag_envs.scenes.shapes import Circle, Line, Moment, Reading, Shape
 from lag_envs.stepping.tracing import clip
-from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
+from lag_envs.tasks.base import FASTEST_START, Task
 
 
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
 
-    scene: CylinderInCylinder
-    scene_type = CylinderInCylinder
+    scene = CylinderInCylinder
     interval, steps = 0.05, 200
-    limit_control: float
+    start = {"theta": 0.1, "theta_dot": 0.2}  # near the bottom, the shell at rest
+    largest: float  # acceleration of the shell [rad/s²]
     fastest_shell: float
     largest_angle: float
 
@@ -31,43 +30,39 @@ class _Shell(Task):
             raise ValueError(f"this task is controlled by 'tilt', got control={self.scene.control!r}")
 
     @property
-    def start(self) -> Sequence[float]:
-        """Near the bottom, the shell at rest."""
-        return [0.1, 0.2, 0.0]
+    def action(self) -> Mapping[str, float]:
+        """The shell's acceleration."""
+        return {"psi_ddot": self.largest}
 
     @property
     def edges(self) -> Sequence[Sequence[float]]:
         """The shell at its fastest, to either side."""
         return [[0.0, 0.0, rate] for rate in (-self.fastest_shell, self.fastest_shell)]
 
-    def numbers(self) -> dict[str, float]:
-        """Return the limits of the shell's acceleration and rate."""
-        return {"limit_control": self.limit_control, "fastest_shell": self.fastest_shell}
-
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
         """Return U·a, cut back so that the shell's rate stays within its limit at the step's end."""
-        wanted = k.limit_control * a
-        return clip(wanted, (-k.fastest_shell - y[2]) * (1.0 / dt), (k.fastest_shell - y[2]) * (1.0 / dt), xp)
+        low, high = ((rate - before.psi_dot) * (1.0 / dt) for rate in (-self.fastest_shell, self.fastest_shell))
+        return clip(wanted.psi_ddot, low, high, xp)
 
     @property
     def fastest(self) -> float:
         """Speed of a fall, of a push from one limit of the shell's rate to the other, and of drag [rad/s]."""
-        k = self.scene.constants()
-        return 2.0 * math.sqrt(k["weight"]) + (2.0 * k["push"] + 1.0) * self.fastest_shell
+        push = self.coefficients([0.0, 0.0, 0.0], [1.0], np)
+        return float(2.0 * math.sqrt(push.alpha) + (2.0 * push.delta + 1.0) * self.fastest_shell)
 
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the cylinder has been carried too high."""
-        return xp.abs(z[0]) > self.largest_angle
+        return xp.abs(after.theta) > self.largest_angle
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds on θ, θ' and ψ'; |θ'| grows by at most (weight + push U + drag ψ') a second."""
-        k = self.scene.constants()
-        pull = k["weight"] + k["push"] * self.limit_control + k["drag"] * self.fastest_shell
-        swing = FASTEST_START + pull * self.duration
-        return [
-            finite(b)
-            for b in (self.largest_angle + swing * self.dt, swing, self.fastest_shell * (1.0 + 1e-6))
-        ]
+        strongest = self.coefficients([0.0, 0.0, self.fastest_shell], [self.largest], np)
+        swing = FASTEST_START + (strongest.alpha + strongest.delta) * self.duration
+        return {
+            "theta": self.largest_angle + swing * self.dt,
+            "theta_dot": swing,
+            "psi_dot": self.fastest_shell * (1.0 + 1e-6),
+        }
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add how far the cylinder may go."""
@@ -76,15 +71,17 @@ class _Shell(Task):
         lines = [Line([scene.place(a, inner), scene.place(a, scene.shell_radius)], "limit") for a in limits]
         return [*super().shapes(now), *lines]
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start at which the episode would be over, or with the shell too fast."""
-        if abs(state[0]) > self.largest_angle:
+        if abs(state.theta) > self.largest_angle:
             raise ValueError(
-                f"the episode would be over at theta={state[0]:g} rad: "
+                f"the episode would be over at theta={state.theta:g} rad: "
                 f"|theta| must be at most {self.largest_angle} rad"
             )
-        if abs(state[2]) > self.fastest_shell:
-            raise ValueError(f"psi_dot must lie within ±{self.fastest_shell} rad/s, got {state[2]:g} rad/s")
+        if abs(state.psi_dot) > self.fastest_shell:
+            raise ValueError(
+                f"psi_dot must lie within ±{self.fastest_shell} rad/s, got {state.psi_dot:g} rad/s"
+            )
 
 
 class Tilt(_Shell):
@@ -201,24 +198,23 @@ class Tilt(_Shell):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
-    observation = ("theta", "theta_dot", "psi_dot", "target")
-    target_range = 0.3
-    limit_control, fastest_shell, largest_angle = 15.0, 6.0, 1.05
+    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
+    target = {"target": ("rad", 0.3)}
+    largest, fastest_shell, largest_angle = 15.0, 6.0, 1.05
 
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-((θ - θ*)/0.1)²) - 0.02 (u/U)²."""
-        off = 10.0 * (z[0] - g)
-        effort = u * (1.0 / k.limit_control)
-        return k.scale * (xp.exp(-(off * off)) - 0.02 * (effort * effort))
+        off = 10.0 * (after.theta - target.target)
+        effort = control.psi_ddot * (1.0 / self.largest)
+        return xp.exp(-(off * off)) - 0.02 * (effort * effort)
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return θ, θ', ψ' and the target."""
-        return [*z[:3], g]
+        return {name: after[name] for name in self.scene.state_names} | {"target": target.target}
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation."""
-        return [*super().bounds(), self.largest_angle]
+        return {**super().bounds(), "target": self.largest_angle}
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add the target."""
@@ -342,33 +338,27 @@ class Pump(_Shell):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    defaults: ClassVar = {
-        "mass": 1.0,
-        "shell_radius": 0.5,
-        "radius": 0.1,
-        "damping": 0.024,
-        "control": "tilt",
-    }
-    observation = ("theta", "theta_dot", "psi_dot")
-    usable: ClassVar = {"gravity": (1e-3, 1e6)}  # without a field no energy belongs to the amplitude
-    limit_control, fastest_shell, largest_angle = 4.0, 3.0, 1.3
+    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.024, "control": "tilt"}
+    usable = {"gravity": (1e-3, 1e6)}  # without a field no energy belongs to the amplitude
+    largest, fastest_shell, largest_angle = 4.0, 3.0, 1.3
     amplitude = 0.9
 
-    def numbers(self) -> dict[str, float]:
-        """Return the limits and E* of the amplitude 0.9 rad, per inertia [1/s²]."""
-        weight = self.scene.constants()["weight"]
-        return super().numbers() | {"wanted_energy": weight * (1.0 - math.cos(self.amplitude))}
+    def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
+        """Return E = θ'²/2 + ω₀² (1 - cosθ), and E* of the amplitude 0.9 rad, per inertia [1/s²]."""
+        weight = self.coefficients(state, [0.0], xp).alpha
+        energy = 0.5 * (state[1] * state[1]) + weight * (1.0 - xp.cos(state[0]))
+        return energy, weight * (1.0 - math.cos(self.amplitude))
 
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return exp(-|E - E*|/(0.3 E*)) - 0.02 (u/U)² with E = θ'²/2 + ω₀² (1 - cosθ)."""
-        energy = 0.5 * (z[1] * z[1]) + k.weight * (1.0 - z[-2])
-        effort = u * (1.0 / k.limit_control)
-        off = xp.abs(energy - k.wanted_energy) * (1.0 / (0.3 * k.wanted_energy))
-        return k.scale * (xp.exp(-off) - 0.02 * (effort * effort))
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return exp(-|E - E*|/(0.3 E*)) - 0.02 (u/U)²."""
+        energy, wanted = self.energies(after, xp)
+        effort = control.psi_ddot * (1.0 / self.largest)
+        off = xp.abs(energy - wanted) * (1.0 / (0.3 * wanted))
+        return xp.exp(-off) - 0.02 * (effort * effort)
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return θ, θ', ψ'."""
-        return list(z[:3])
+        return {name: after[name] for name in self.scene.state_names}
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add the turning points of a swing of the wanted energy."""
@@ -378,10 +368,8 @@ class Pump(_Shell):
 
     def readings(self, now: Moment) -> list[Reading]:
         """Tell the energy per inertia, and the wanted one."""
-        theta, theta_dot = now.state[:2]
-        energy = 0.5 * theta_dot * theta_dot + self.scene.constants()["weight"] * (1.0 - math.cos(theta))
-        wanted = self.numbers()["wanted_energy"]
-        return [Reading("E", energy, "1/s²"), Reading("E*", wanted, "1/s²", "target")]
+        energy, wanted = self.energies(now.state, np)
+        return [Reading("E", float(energy), "1/s²"), Reading("E*", float(wanted), "1/s²", "target")]
 
 
 class Damping(Task):
@@ -493,75 +481,61 @@ class Damping(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene: CylinderInCylinder
-    scene_type = CylinderInCylinder
-    defaults: ClassVar = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
-    usable: ClassVar = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
-    observation = ("theta", "theta_dot")
+    scene = CylinderInCylinder
+    defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
+    usable = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
+    action = {"drag": (0.0, 2.4)}
+    start = {"theta": 0.8, "theta_dot": 1.0}  # well up the wall, moving
     draws = 2
-    limit_control = 2.4
-    rest_action = -1.0
 
     def check(self) -> None:
         """Refuse the other control."""
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
 
-    @property
-    def start(self) -> Sequence[float]:
-        """Well up the wall, moving."""
-        return [0.8, 1.0]
+    def _weight(self, xp: Any = np) -> Any:
+        """Return ω₀², the square of small swings' angular frequency [1/s²]."""
+        return self.coefficients([0.0] * 4, [0.0], xp).alpha
 
     @property
     def fastest(self) -> float:
         """Speed of a fall [rad/s]."""
-        return 2.0 * math.sqrt(self.scene.constants()["weight"])
+        return 2.0 * math.sqrt(self._weight())
 
-    def numbers(self) -> dict[str, float]:
-        """Return the strongest brake, g/a for the contact, and the chance of a kick."""
-        scene = self.scene
-        return {
-            "limit_control": self.limit_control,
-            "hold": scene.gravity / scene.arm,
-            "chance": kick_chance(self, 0.01),
-        }
-
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
-        """Return the drag coefficient, from 0 (a = -1) to its largest (a = 1)."""
-        return k.limit_control * (0.5 + 0.5 * a)
-
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-√(θ² + θ'²/ω₀²)/0.1)."""
-        return k.scale * xp.exp(-10.0 * xp.sqrt(z[0] * z[0] + (z[1] * z[1]) * (1.0 / k.weight)))
+        theta, rate = after.theta, after.theta_dot
+        return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self._weight(xp))))
 
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the contact is lost: aθ'² + g cosθ < 0."""
-        return z[1] * z[1] + k.hold * z[2] < 0.0
+        hold = self.scene.gravity / self.scene.arm
+        return after.theta_dot * after.theta_dot + hold * xp.cos(after.theta) < 0.0
 
-    def kick(self, z: Sequence, draws: Sequence, k: Any, xp: Any) -> Sequence:
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Change θ' by ±1.5 or ±3 rad/s, now and then."""
         size = xp.where(draws[1] < 0.5, 1.5, 3.0)
         push = xp.where((draws[1] < 0.25) | (draws[1] >= 0.75), -size, size)
-        return (z[0], z[1] + xp.where(draws[0] < k.chance, push, 0.0), *z[2:])
+        return {"theta_dot": xp.where(draws[0] < self.chance(0.01), push, 0.0)}
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return θ and θ'."""
-        return list(z[:2])
+        return {"theta": after.theta, "theta_dot": after.theta_dot}
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds: θ' grows by at most ω₀² a second and 3 rad/s a kick."""
-        swing = FASTEST_START + self.scene.constants()["weight"] * self.duration + 3.0 * self.limit
-        return [finite(1e3 + swing * self.duration), finite(swing)]
+        swing = FASTEST_START + self._weight() * self.duration + 3.0 * self.limit
+        return {"theta": 1e3 + swing * self.duration, "theta_dot": swing}
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add the place of rest."""
         mark = Circle(self.scene.place(0.0), self.scene.radius, "target")
         return [*super().shapes(now), mark]
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start without contact."""
-        theta, theta_dot = state
-        normal = self.scene.forces(state)["normal"]
+        theta, theta_dot = state.theta, state.theta_dot
+        normal = self.scene.forces([theta, theta_dot])["normal"]
         if normal < 0.0:
             raise ValueError(
                 f"there is no contact at theta={theta:g} rad, theta_dot={theta_dot:g} rad/s: N={normal:g} N"

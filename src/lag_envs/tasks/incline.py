@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lag_envs.scenes import Incline
 from lag_envs.scenes.shapes import Circle, Lens, Line, Moment, Reading, Shape, Window, polar
 from lag_envs.stepping import slope
 from lag_envs.stepping.tracing import clip
-from lag_envs.tasks.base import FASTEST_START, Task, finite
+from lag_envs.tasks.base import FASTEST_START, Task
 
 
 class Tilt(Task):
@@ -126,13 +125,12 @@ class Tilt(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene: Incline
-    scene_type = Incline
-    defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
+    scene = Incline
+    defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
     interval, steps = 0.05, 200
-    target_range = 0.3
+    target = {"target": ("m", 0.3)}
     edge = 0.5
-    largest_tilt = 0.1
+    largest_tilt, largest_rate = 0.1, 0.3
 
     def check(self) -> None:
         """Refuse the damping control."""
@@ -145,59 +143,52 @@ class Tilt(Task):
         return self.scene.control == "tilt"
 
     @property
-    def observation(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the observation's entries."""
-        return (*self.scene.state_names, "target")
+    def action(self) -> Mapping[str, float]:
+        """The tilt [rad], or its rate [rad/s]."""
+        return {"phi": self.largest_tilt} if self.quasi_static else {"phi_dot": self.largest_rate}
 
     @property
-    def limit_control(self) -> float:
-        """Largest tilt [rad], or largest rate [rad/s]."""
-        return self.largest_tilt if self.quasi_static else 0.3
-
-    @property
-    def start(self) -> Sequence[float]:
+    def start(self) -> Mapping[str, float]:
         """Anywhere near, slowly rolling."""
-        return [0.4, 0.3] if self.quasi_static else [0.4, 0.3, 0.05]
+        return {"x": 0.4, "x_dot": 0.3} if self.quasi_static else {"x": 0.4, "w": 0.3, "phi": 0.05}
 
-    def numbers(self) -> dict[str, float]:
-        """Return the limits."""
-        return {"limit_control": self.limit_control, "largest_tilt": self.largest_tilt}
-
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
         """Return U·a, cut back so that the tilt stays within its limit at the step's end."""
-        wanted = k.limit_control * a
         if self.quasi_static:
             return wanted
-        return clip(wanted, (-k.largest_tilt - y[2]) * (1.0 / dt), (k.largest_tilt - y[2]) * (1.0 / dt), xp)
+        low, high = ((limit - before.phi) * (1.0 / dt) for limit in (-self.largest_tilt, self.largest_tilt))
+        return clip(wanted.phi_dot, low, high, xp)
 
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-((x - x*)/0.1)²) - 0.02 (u/U)²."""
-        off = 10.0 * (z[0] - g)
-        effort = u * (1.0 / k.limit_control)
-        return k.scale * (xp.exp(-(off * off)) - 0.02 * (effort * effort))
+        off = 10.0 * (after.x - target.target)
+        effort = control[0] * (1.0 / (self.largest_tilt if self.quasi_static else self.largest_rate))
+        return xp.exp(-(off * off)) - 0.02 * (effort * effort)
 
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the cylinder has left the plane."""
-        return xp.abs(z[0]) > self.edge
+        return xp.abs(after.x) > self.edge
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return the state and the target."""
-        return [*z[: len(self.scene.state_names)], g]
+        return {name: after[name] for name in self.scene.state_names} | {"target": target.target}
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds: inside, |w'| <= k (g sin(tilt) + |x| rate²) + drag R rate, and drag only slows."""
-        k = self.scene.constants()
-        rate = 0.0 if self.quasi_static else self.limit_control
-        radius = self.scene.radius
-        reach = self.edge + 1.0
-        gravity = k["pull"] if self.quasi_static else k["rolling"] * k["field"]
-        push = gravity * math.sin(self.largest_tilt) + reach * rate * rate + k["drag"] * radius * rate
-        speed = FASTEST_START + radius * rate + push * self.duration
-        state = [self.edge + speed * self.dt, speed]
-        return [
-            finite(b)
-            for b in (*state, *([] if self.quasi_static else [self.largest_tilt * (1.0 + 1e-6)]), self.edge)
-        ]
+        reach, speed = self.edge + 1.0, FASTEST_START
+        if self.quasi_static:
+            plane = self.coefficients([0.0, 0.0], [self.largest_tilt], np)
+            speed += plane.pull * self.duration
+        else:
+            rate, carried = self.largest_rate, self.scene.radius * self.largest_rate
+            turn = self.coefficients([0.0, 0.0, 0.0], [rate], np)
+            push = turn.weight * math.sin(self.largest_tilt) + reach * rate * rate + turn.drag * carried
+            speed += carried + push * self.duration
+        tilt = self.largest_tilt * (1.0 + 1e-6)
+        x, v = self.scene.state_names[:2]
+        return {x: self.edge + speed * self.dt, v: speed, "target": self.edge} | (
+            {} if self.quasi_static else {"phi": tilt}
+        )
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Return a plank that ends at the edges, with the target and the largest tilt."""
@@ -219,14 +210,14 @@ class Tilt(Task):
             raise ValueError(f"target must lie on the plane, within ±{self.edge} m, got {target:g} m")
         return target
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start off the plane or beyond the largest tilt."""
-        if abs(state[0]) > self.edge:
+        if abs(state.x) > self.edge:
             raise ValueError(
-                f"the episode would be over at x={state[0]:g} m: |x| must be at most {self.edge} m"
+                f"the episode would be over at x={state.x:g} m: |x| must be at most {self.edge} m"
             )
-        if not self.quasi_static and abs(state[2]) > self.largest_tilt:
-            raise ValueError(f"phi must lie within ±{self.largest_tilt} rad, got {state[2]:g} rad")
+        if not self.quasi_static and abs(state.phi) > self.largest_tilt:
+            raise ValueError(f"phi must lie within ±{self.largest_tilt} rad, got {state.phi:g} rad")
 
 
 class Brake(Task):
@@ -333,13 +324,12 @@ class Brake(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene: Incline
-    scene_type = Incline
-    defaults: ClassVar = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
-    usable: ClassVar = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
-    observation = ("distance", "v")
-    limit_control = 6.0
-    rest_action = -1.0
+    scene = Incline
+    defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
+    usable = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
+    action = {"drag": (0.0, 6.0)}
+    start = {"x": (-2.0, 1.0), "x_dot": (0.5, 0.5)}
+    scaled = False
     #: Speed that costs nothing at the line [m/s], and what each m/s above it costs.
     gentle, price = 0.5, 5.0
 
@@ -348,49 +338,30 @@ class Brake(Task):
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
 
-    @property
-    def centre(self) -> Sequence[float]:
-        """Two metres before the line, which is at x = 0."""
-        return [-2.0, 0.5]
-
-    @property
-    def start(self) -> Sequence[float]:
-        """One to three metres away, at 0 to 1 m/s."""
-        return [1.0, 0.5]
-
-    def numbers(self) -> dict[str, float]:
-        """Return the strongest brake."""
-        return {"limit_control": self.limit_control}
-
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
-        """Return the drag coefficient, from 0 (a = -1) to its largest (a = 1)."""
-        return k.limit_control * (0.5 + 0.5 * a)
-
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return minus the time that the step takes."""
         return -dt
 
-    def last_reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return minus the time to the line, and minus the price of the speed there above the gentle one."""
-        force = self.scene.drive(y, u, k, xp)
-        assert isinstance(force, slope.Pull)
-        time = slope.crossing_time(y[0], y[1], force, dt, xp)
+        force = self.coefficients(before, control, xp)
+        time = slope.crossing_time(before.x, before.x_dot, force, dt, xp)
         # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
-        speed = y[1] + force.pull * time + force.drag * y[0]
+        speed = before.x_dot + force.pull * time + force.drag * before.x
         return -time - self.price * xp.maximum(speed - self.gentle, 0.0)
 
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the line has been crossed."""
-        return z[0] >= 0.0
+        return after.x >= 0.0
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return distance to the line and speed."""
-        return [-z[0], z[1]]
+        return {"distance": -after.x, "v": after.x_dot}
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds; a start may lie at most 1000 m away."""
-        speed = FASTEST_START + self.scene.constants()["pull"] * self.duration
-        return [finite(1e3 + speed * self.duration), finite(speed)]
+        speed = FASTEST_START + self.coefficients([0.0, 0.0], [0.0], np).pull * self.duration
+        return {"distance": 1e3 + speed * self.duration, "v": speed}
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Return the slope with the line, and the cylinder magnified."""
@@ -414,9 +385,9 @@ class Brake(Task):
         """Tell the speed at which the line should be crossed."""
         return [Reading("x_dot*", self.gentle, "m/s", "target")]
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start beyond the line, or uphill."""
-        if not -1e3 <= state[0] < 0.0:
-            raise ValueError(f"x must lie before the line at 0 m, at -1000 m or later, got {state[0]:g} m")
-        if state[1] < 0.0:
-            raise ValueError(f"x_dot must be at least 0 m/s, got {state[1]:g} m/s")
+        if not -1e3 <= state.x < 0.0:
+            raise ValueError(f"x must lie before the line at 0 m, at -1000 m or later, got {state.x:g} m")
+        if state.x_dot < 0.0:
+            raise ValueError(f"x_dot must be at least 0 m/s, got {state.x_dot:g} m/s")

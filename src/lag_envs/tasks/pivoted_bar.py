@@ -3,25 +3,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.shapes import Line, Moment, Polygon, Shape, Window, polar
 from lag_envs.stepping.tracing import clip
-from lag_envs.tasks.base import FASTEST_START, Task, finite, kick_chance
+from lag_envs.tasks.base import FASTEST_START, Task
 
 
-def _speed_bound(task: Task, limit: float) -> float:
-    """Return a bound on |theta'| in an episode: start + (|field| + |drive|) · length; damping only helps."""
-    k = task.scene.constants()
-    return FASTEST_START + (k["weight"] + k["pull"] * limit) * task.duration
+class _Bar(Task):
+    """What the tasks with the bar have in common."""
+
+    scene: PivotedBar
+    largest: float  # acceleration of the support [m/s²]
+
+    @property
+    def action(self) -> Mapping[str, float]:
+        """The support's acceleration."""
+        return {"s_ddot": self.largest}
+
+    def _strength(self) -> tuple[float, float]:
+        """Return field and largest drive [1/s²]."""
+        hang = [0.0] * len(self.scene.state_names)
+        drive = self.coefficients(hang, [self.largest], np)
+        return float(drive.alpha), abs(float(drive.beta))
+
+    @property
+    def fastest(self) -> float:
+        """Speed of a fall in the field that the support makes stronger [rad/s]."""
+        return 2.0 * math.sqrt(sum(self._strength()))
+
+    def swing_bound(self) -> float:
+        """Return a bound on |theta'|: start + (|field| + |drive|) · length; damping only helps."""
+        return FASTEST_START + sum(self._strength()) * self.duration
 
 
-class SwingUp(Task):
+class SwingUp(_Bar):
     """Swing a bar up by moving its support, and hold it upright.
 
     ## Description
@@ -137,106 +157,94 @@ class SwingUp(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene: PivotedBar
-    scene_type = PivotedBar
-    defaults: ClassVar = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
-    usable: ClassVar = {"track": (1e-3, 1e9)}
-    limit_control = 5.0
+    scene = PivotedBar
+    defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
+    usable = {"track": (1e-3, 1e9)}
+    largest = 5.0
 
-    @property
-    def has_track(self) -> bool:
-        """Whether the support's place is part of the task."""
-        return self.scene.track is not None
+    def check(self) -> None:
+        """Note whether the support's place is part of the task, and whether its track ends."""
+        self.has_track = self.scene.track is not None
+        self.ends = self.has_track and math.isfinite(self.scene.track)
 
     @property
     def variant(self) -> tuple:
         """Add whether there is an end of the track to guard."""
-        return *super().variant, self.scene.track == math.inf
+        return *super().variant, self.ends
 
     @property
-    def observation(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the observation's entries."""
-        return (*(("s/S", "s_dot/2") if self.has_track else ()), "cos(theta)", "sin(theta)", "theta_dot/8")
+    def length(self) -> Any:
+        """The track's half length S, that of one without an end being 0.5 m."""
+        return self.scene.track if self.ends else 0.5
 
     @property
-    def start(self) -> Sequence[float]:
+    def start(self) -> Mapping[str, float]:
         """Hanging, nearly at rest, near the middle of the track."""
-        return [*([0.1 * self.numbers()["track"], 0.02] if self.has_track else []), 0.1, 0.1]
+        support = {"s": 0.1 * self.length, "s_dot": 0.02} if self.has_track else {}
+        return {**support, "theta": 0.1, "theta_dot": 0.1}
 
-    @property
-    def fastest(self) -> float:
-        """Speed of a fall in the field that the support makes stronger [rad/s]."""
-        k = self.scene.constants()
-        return 2.0 * math.sqrt(k["weight"] + k["pull"] * self.limit_control)
-
-    def numbers(self) -> dict[str, float]:
-        """Return the limit U of the control and the track's half length S."""
-        limit, track = {"limit_control": self.limit_control}, self.scene.track
-        return limit if track is None else {**limit, "track": track if math.isfinite(track) else 0.5}
-
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
+    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
         """Return the acceleration nearest to U·a from which the support can still stop inside the track."""
-        wanted = k.limit_control * a
-        if self.scene.track is None or math.isinf(self.scene.track):
+        if not self.ends:
             return wanted
         # With v the speed at the step's end, and braking from there at U, the support stops at
         # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, it passes S or -S where v² + |reach| > 2US.
-        s, s_dot = y[:2]
-        top, per_step = k.limit_control, k.limit_control * dt
-        ends, start = 2.0 * (top * k.track), (2.0 * top) * s + per_step * s_dot
-        v = s_dot + dt * wanted
+        s, s_dot, push = before.s, before.s_dot, wanted.s_ddot
+        top, per_step = self.largest, self.largest * dt
+        ends, start = 2.0 * (top * self.length), (2.0 * top) * s + per_step * s_dot
+        v = s_dot + dt * push
         reach = start + per_step * v
         side = xp.where(reach < 0.0, -1.0, 1.0)
         # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed allowed.
         half = 0.5 * per_step
         highest = xp.sqrt(xp.maximum(half * half + ends - side * start, 0.0)) - half
         hardest = clip((highest - side * s_dot) * (1.0 / dt), -top, top, xp)
-        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * wanted, hardest), wanted)
+        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * push, hardest), push)
 
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² - 0.02 (u/U)² with the height h = (1 - cosθ)/2."""
-        height = 0.5 - 0.5 * z[-2]
-        effort = u * (1.0 / k.limit_control)
-        return k.scale * (height * height - 0.02 * (effort * effort))
+        height = 0.5 - 0.5 * xp.cos(after.theta)
+        effort = control.s_ddot * (1.0 / self.largest)
+        return height * height - 0.02 * (effort * effort)
 
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return (s/S, s'/2,) cosθ, sinθ, θ'/8."""
-        support = [z[0] * (1.0 / k.track), 0.5 * z[1]] if self.has_track else []
-        return [*support, z[-2], z[-1], 0.125 * z[-3]]
+        support = {"s/S": after.s * (1.0 / self.length), "s_dot/2": 0.5 * after.s_dot} if self.has_track else {}
+        bar = {"cos(theta)": xp.cos(after.theta), "sin(theta)": xp.sin(after.theta)}
+        return support | bar | {"theta_dot/8": 0.125 * after.theta_dot}
 
-    def bounds(self) -> Sequence[float]:
+    def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation."""
-        u, track = self.limit_control, self.scene.track
-        support: list[float] = []
-        if track is not None:
-            fastest = FASTEST_START + u * self.duration
-            if math.isfinite(track):
-                support = [1.0 + 1e-6, 0.5 * (math.sqrt(2.0 * u * track) * (1.0 + 1e-6))]
-            else:
-                support = [finite((1e3 + fastest * self.duration) / 0.5), finite(0.5 * fastest)]
-        return [*support, 1.0, 1.0, finite(0.125 * _speed_bound(self, u))]
+        bar = {"cos(theta)": 1.0, "sin(theta)": 1.0, "theta_dot/8": 0.125 * self.swing_bound()}
+        if not self.has_track:
+            return bar
+        if self.ends:
+            fastest = math.sqrt(2.0 * self.largest * self.length) * (1.0 + 1e-6)
+            return {"s/S": 1.0 + 1e-6, "s_dot/2": 0.5 * fastest} | bar
+        fastest = FASTEST_START + self.largest * self.duration
+        return {"s/S": (1e3 + fastest * self.duration) / self.length, "s_dot/2": 0.5 * fastest} | bar
 
     def shapes(self, now: Moment) -> list[Shape]:
         """Add the upright bar."""
         s = now.state[0] if self.has_track else 0.0
         return [Polygon(self.scene.outline(s, math.pi), "target"), *super().shapes(now)]
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start from which the support cannot stop inside the track."""
-        if self.scene.track is not None:
-            s, s_dot = state[:2]
-            if math.isinf(self.scene.track):
-                if abs(s) > 1e3:
-                    raise ValueError(f"s must lie within ±1000 m at the start, got {s:g} m")
-            elif abs(s) + s_dot * s_dot / (2.0 * self.limit_control) > self.scene.track:
-                raise ValueError(
-                    f"from s={s:g} m with s_dot={s_dot:g} m/s the support cannot stop inside the track: "
-                    f"|s| + s_dot²/(2U) must be at most {self.scene.track:g} m "
-                    f"with U={self.limit_control:g} m/s²"
-                )
+        if not self.has_track:
+            return
+        s, s_dot = state.s, state.s_dot
+        if not self.ends:
+            if abs(s) > 1e3:
+                raise ValueError(f"s must lie within ±1000 m at the start, got {s:g} m")
+        elif abs(s) + s_dot * s_dot / (2.0 * self.largest) > self.length:
+            raise ValueError(
+                f"from s={s:g} m with s_dot={s_dot:g} m/s the support cannot stop inside the track: "
+                f"|s| + s_dot²/(2U) must be at most {self.length:g} m with U={self.largest:g} m/s²"
+            )
 
 
-class Balance(SwingUp):
+class Balance(_Bar):
     """Keep a bar upright against kicks by moving its support.
 
     ## Description
@@ -348,9 +356,11 @@ class Balance(SwingUp):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    limit_control = 3.0
+    scene = PivotedBar
+    defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
+    usable = {"track": (1e-3, 1e9)}
+    largest = 3.0
     draws = 2
-    observation = ("s", "s_dot", "e", "theta_dot")
     largest_angle = 0.35
 
     def check(self) -> None:
@@ -359,80 +369,60 @@ class Balance(SwingUp):
             raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
 
     @property
-    def track(self) -> float:
+    def track(self) -> Any:
         """The support's travel to either side [m]; `check` has asked for one."""
-        assert self.scene.track is not None
         return self.scene.track
 
     @property
-    def start(self) -> Sequence[float]:
+    def start(self) -> Mapping[str, Any]:
         """Nearly upright."""
-        return [0.4 * self.track, 0.2, 0.15, 0.3]
+        return {"s": 0.4 * self.track, "s_dot": 0.2, "theta": (math.pi, 0.15), "theta_dot": 0.3}
 
-    @property
-    def centre(self) -> Sequence[float]:
-        """Upright."""
-        return [0.0, 0.0, math.pi, 0.0]
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 1 - (e/0.35)²/2 - (s/S)²/2."""
+        e = (after.theta - math.pi) * (1.0 / self.largest_angle)
+        s = after.s * (1.0 / self.track)
+        return 1.0 - 0.5 * (e * e) - 0.5 * (s * s)
 
-    def numbers(self) -> dict[str, float]:
-        """Return limits, track and the chance of a kick."""
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the bar has fallen or the support has left the track."""
+        return (xp.abs(after.theta - math.pi) > self.largest_angle) | (xp.abs(after.s) > self.track)
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Change θ' by up to 1 rad/s to either side, now and then."""
+        return {"theta_dot": xp.where(draws[0] < self.chance(0.01), 2.0 * draws[1] - 1.0, 0.0)}
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return s, s', e = θ - π, θ'."""
+        e = after.theta - math.pi
+        return {"s": after.s, "s_dot": after.s_dot, "e": e, "theta_dot": after.theta_dot}
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return bounds on the observation; each step may have a kick."""
+        slide = FASTEST_START + self.largest * self.duration
+        swing = self.swing_bound() + self.limit
         return {
-            "limit_control": self.limit_control,
-            "track": self.track,
-            "chance": kick_chance(self, 0.01),
+            "s": self.track + slide * self.dt,
+            "s_dot": slide,
+            "e": self.largest_angle + swing * self.dt,
+            "theta_dot": swing,
         }
 
-    def control(self, a: Any, y: Sequence, k: Any, dt: Any, xp: Any) -> Any:
-        """Return U·a; running off the track ends the episode, so nothing guards it."""
-        return k.limit_control * a
-
-    def reward(self, y: Sequence, z: Sequence, u: Any, g: Any, k: Any, dt: Any, xp: Any) -> Any:
-        """Return 1 - (e/0.35)²/2 - (s/S)²/2."""
-        e = (z[2] - math.pi) * (1.0 / self.largest_angle)
-        s = z[0] * (1.0 / k.track)
-        return k.scale * (1.0 - 0.5 * (e * e) - 0.5 * (s * s))
-
-    def terminated(self, z: Sequence, k: Any, xp: Any) -> Any:
-        """Tell whether the bar has fallen or the support has left the track."""
-        return (xp.abs(z[2] - math.pi) > self.largest_angle) | (xp.abs(z[0]) > k.track)
-
-    def kick(self, z: Sequence, draws: Sequence, k: Any, xp: Any) -> Sequence:
-        """Change θ' by up to 1 rad/s to either side, now and then."""
-        push = xp.where(draws[0] < k.chance, 2.0 * draws[1] - 1.0, 0.0)
-        return (*z[:3], z[3] + push, *z[4:])
-
-    def observe(self, z: Sequence, g: Any, k: Any) -> Sequence:
-        """Return s, s', e = θ - π, θ'."""
-        return [z[0], z[1], z[2] - math.pi, z[3]]
-
-    def bounds(self) -> Sequence[float]:
-        """Return bounds on the observation."""
-        u = self.limit_control
-        kicks = self.limit if math.isfinite(self.limit) else math.inf
-        slide = FASTEST_START + u * self.duration
-        swing = _speed_bound(self, u) + kicks
-        return [
-            finite(self.track + slide * self.dt),
-            finite(slide),
-            finite(self.largest_angle + swing * self.dt),
-            finite(swing),
-        ]
-
     def shapes(self, now: Moment) -> list[Shape]:
-        """Add how far the bar may lean."""
-        pivot, up, reach = (now.state[0], 0.0), 0.5 * math.pi, self.scene.reach
+        """Add the upright bar, and how far it may lean."""
+        s, up, reach = now.state[0], 0.5 * math.pi, self.scene.reach
         limits = [up - self.largest_angle, up + self.largest_angle]
-        lines = [Line([polar(pivot, r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
-        return [*super().shapes(now), *lines]
+        lines = [Line([polar((s, 0.0), r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
+        return [Polygon(self.scene.outline(s, math.pi), "target"), *super().shapes(now), *lines]
 
     def window(self, now: Moment) -> Window:
         """Look at the upper half."""
         reach, side = self.scene.reach, self.track + 0.5 * self.scene.reach
         return Window(-side, -0.3 * reach, side, 1.15 * reach)
 
-    def check_safe(self, state: NDArray[np.float64]) -> None:
+    def check_start(self, state: Any) -> None:
         """Refuse a start at which the episode would be over."""
-        s, _, theta, _ = state
+        s, theta = state.s, state.theta
         if abs(theta - math.pi) > self.largest_angle or abs(s) > self.track:
             raise ValueError(
                 f"the episode would be over at s={s:g} m, theta={theta:g} rad: |theta - pi| must be at most "

@@ -1,0 +1,355 @@
+"""Equations of motion that have an exact flow of their own, recognised from what was derived.
+
+With one free coordinate of constant inertia there are three of them (`lag_envs.stepping.flows`)::
+
+    driven pendulum   q'' = -alpha sin(q) - beta cos(q) - gamma q' + delta + ramp t
+    fixed slope       x'' = pull - drag x'
+    turning slope     x'' = weight sin(phi) + carry phi'² x - drag x',  phi' held
+
+Each coefficient is a sum of constants, which the parameters make, times what is held during the step. Any
+other equation is stepped by the general series (`lag_envs.stepping.general`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lag_envs.mechanics.algebra import Atom, Expr, Monomial, evaluate
+from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.layout import Layout
+from lag_envs.mechanics.motion import Mechanics
+from lag_envs.mechanics.recording import control, parameter
+from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
+from lag_envs.stepping.general import StepBound
+
+
+class Exact:
+    """Functions of rational numbers; sums and products of them are exact, so that nothing cancels."""
+
+    Rational, mpf = Fraction, None
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda x: Fraction(getattr(math, name)(float(x)))
+
+
+class Term(NamedTuple):
+    """A part of a coefficient: a constant, by name, times what is held during the step."""
+
+    constant: str
+    held: Expr
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NormalForm:
+    """An equation of motion with an exact flow of its own.
+
+    The lifted state is the scene's, followed by cosine and sine of its angle, where it has one.
+
+    Attributes
+    ----------
+    layout : Layout
+        Names of coordinates, controls and state.
+    kind : type
+        `pendulum.Drive`, `slope.Pull` or `slope.Turn`.
+    terms : mapping
+        For each coefficient of the kind its terms.
+    expressions : mapping
+        For each constant what it is, times the inertia.
+    inertia : Expr
+        The free coordinate's entry of the mass matrix.
+    """
+
+    layout: Layout
+    kind: type[Any]
+    terms: Mapping[str, tuple[Term, ...]]
+    expressions: Mapping[str, Expr]
+    inertia: Expr
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the state's entries."""
+        return tuple(entry.name for entry in self.layout.state)
+
+    @property
+    def angle(self) -> int | None:
+        """Index of the state whose cosine and sine travel along, or None."""
+        if self.kind is slope.Pull:
+            return None
+        moving = self.layout.free[0] if self.kind is pendulum.Drive else self.layout.at("rate")[0].name
+        return self._index(moving, "place")
+
+    @property
+    def width(self) -> int:
+        """Number of entries of the lifted state."""
+        return len(self.layout.state) + (0 if self.angle is None else 2)
+
+    def _index(self, coordinate: str, *kinds: str) -> int:
+        return next(
+            i for i, e in enumerate(self.layout.state) if e.coordinate == coordinate and e.kind in kinds
+        )
+
+    def order(self, dt: float) -> int:
+        """Return the order of the pendulum's series for a control step; 0 where there is no such series.
+
+        With order 14, one series of 0.02 s is certified up to 13 rad/s; with order 20, one of 0.05 s up to
+        9.5 rad/s, where 16 would ask for two.
+        """
+        return (14 if dt <= 0.03 else 20) if self.kind is pendulum.Drive else 0
+
+    def flow(self, dt: float) -> Flow:
+        """Return the exact flow for control steps of this length."""
+        return self.stepper(dt).flow
+
+    def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
+        """Return the constants, each rounded once."""
+        values = {parameter(name): Fraction(value) for name, value in parameters.items() if _used(value)}
+        numbers = evaluate([self.inertia, *self.expressions.values()], values, Exact())
+        return {name: _float(x, numbers[0]) for name, x in zip(self.expressions, numbers[1:], strict=True)}
+
+    # --- one control step ----------------------------------------------------------------------------------
+
+    def lift(self, state: ArrayLike) -> tuple:
+        """Return the state's entries, each of shape (...), followed by cosine and sine of the angle."""
+        y = tuple(np.moveaxis(np.asarray(state, dtype=np.float64), -1, 0))
+        return y if self.angle is None else (*y, np.cos(y[self.angle]), np.sin(y[self.angle]))
+
+    def drive(self, y: Sequence, u: Sequence, k: Any, xp: Any) -> Any:
+        """Return the flow's coefficients while controls are held, from lifted state and constants."""
+        values: dict[Atom, Any] = {control(name): x for name, x in zip(self.layout.controls, u, strict=True)}
+        for entry, x in zip(self.layout.state, y, strict=False):
+            if entry.kind == "velocity":
+                values[velocity(entry.coordinate)] = x
+        found = {}
+        for name, terms in self.terms.items():
+            total: Any = 0.0
+            for term in terms:
+                constant = getattr(k, term.constant)
+                held = evaluate([term.held], values, xp)[0]
+                total = total + (constant if term.held.number == 1.0 else constant * held)
+            found[name] = total
+        if self.kind is slope.Turn:
+            found["rate"] = self._rate(u)
+        return self.kind(**found)
+
+    def _rate(self, u: Sequence) -> Any:
+        """Return the rate that is held, of the turning slope."""
+        return u[self.layout.controls.index(self.layout.at("rate")[0].control or "")]
+
+    def unpack(self, y: Sequence, u: Sequence, k: Any) -> list:
+        """Return the flow's variables: place and velocity, and cosine and sine of the angle."""
+        free = self.layout.free[0]
+        q, v = y[self._index(free, "place")], y[self._index(free, "velocity", "momentum")]
+        if self.kind is slope.Turn:
+            v = v - k.shift * self._rate(u)
+        return [q, v, *y[len(self.layout.state) :]]
+
+    def pack(self, moved: Sequence, y: Sequence, u: Sequence, dt: Any, k: Any) -> list:
+        """Return the lifted state at the step's end, from the moved variables."""
+        given = dict(zip(self.state_names, y, strict=False)) | dict(
+            zip(self.layout.controls, u, strict=True)
+        )
+        after = []
+        for entry in self.layout.state:
+            by = next((p for p in self.layout.prescribed if p.name == entry.coordinate), None)
+            if by is None and entry.kind == "place":
+                after.append(moved[0])
+            elif by is None:
+                carried = k.shift * self._rate(u) if entry.kind == "momentum" else 0.0
+                after.append(moved[1] + carried)
+            elif entry.kind == "velocity" or by.level == "rate":
+                after.append(given[entry.name] + dt * given[by.control or ""])
+            else:
+                rate, push = given[f"{by.name}_dot"], given[by.control or ""]
+                after.append(given[by.name] + dt * (rate + 0.5 * dt * push))
+        return [*after, *moved[2:]]
+
+    # --- what depends on numbers ---------------------------------------------------------------------------
+
+    def coefficients(self, state: ArrayLike, controls: Sequence, constants: Mapping[str, float]) -> Any:
+        """Return the flow's coefficients as numbers, or arrays for states of shape (..., n_state)."""
+        return self.drive(self.lift(state), controls, SimpleNamespace(**constants), np)
+
+    def largest_x(self, dt: float) -> float:
+        """Return the bound's x up to which one series is certified; closed forms do without."""
+        return pendulum.largest_x(dt, self.order(dt) or pendulum.ORDER)
+
+    def certified_speed(
+        self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
+    ) -> float | None:
+        """Return the |q'| up to which one series per step is certified, if the rest is as given [rad/s].
+
+        Up to it, and not beyond, `step_bound` reports one substep, which leaves out at most 1e-12 rad/s. It
+        is below 0 where drive, drag or field are too strong for one series at any speed, and None for a form
+        that is stepped to rounding.
+        """
+        if self.kind is not pendulum.Drive:
+            return None
+        drive = pendulum.Drive(*map(float, self.coefficients(state, controls, constants)))
+        return pendulum.certified_speed(drive, dt, self.order(dt))
+
+    def step_bound(
+        self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
+    ) -> StepBound:
+        """Return what is known of a step before it is taken; see `Scene.step_bound`."""
+        bounds = dict.fromkeys(self.state_names, 0.0)
+        if self.kind is not pendulum.Drive:
+            return StepBound(1, 0, bounds, "stepped to rounding")
+        drive = pendulum.Drive(*map(float, self.coefficients(state, controls, constants)))
+        free = self.layout.free[0]
+        moving = [self._index(free, kind) for kind in ("place", "velocity")]
+        found = pendulum.truncation_bound(np.asarray(state)[moving[1]], drive, dt, self.order(dt))
+        for i, bound in zip(moving, (found.theta, found.theta_dot), strict=True):
+            bounds[self.state_names[i]] = bound
+        return StepBound(found.substeps, found.order, bounds, "proved before the step")
+
+    def stepper(self, dt: float, absent: frozenset[str] = frozenset()) -> Stepper:
+        """Return the code of a control step; constants that are zero leave none."""
+        return _stepper(self, self.order(dt), absent)
+
+
+@cache
+def _stepper(form: NormalForm, order: int, absent: frozenset[str]) -> Stepper:
+    flow = {slope.Pull: SLIDE, slope.Turn: TURN}.get(form.kind) or pendulum_flow(order)
+    return Stepper(form, flow, absent)
+
+
+def _used(value: float) -> bool:
+    return math.isfinite(value)  # a track without an end is no part of any motion
+
+
+def _float(x: Any, divisor: Any) -> float:
+    try:
+        return float(Fraction(x) / Fraction(divisor))
+    except OverflowError:
+        return math.inf
+
+
+# --- recognition --------------------------------------------------------------------------------------------
+
+
+def normal_form(m: Mechanics) -> NormalForm | None:
+    """Return the normal form of these equations of motion, or None where they have none."""
+    if m.key not in _known:
+        _known[m.key] = _recognised(m)
+    return _known[m.key]
+
+
+_known: dict[str, NormalForm | None] = {}
+
+
+def _recognised(m: Mechanics) -> NormalForm | None:
+    rates = m.layout.at("rate")
+    if len(m.free) != 1 or not _is_constant(m.entry(0, 0)) or m.free[0] in m.layout.left_out:
+        return None
+    q = place(m.free[0])
+    of = {
+        Atom("function", "sin", Expr.of(q)): "alpha",
+        Atom("function", "cos", Expr.of(q)): "beta",
+        velocity(m.free[0]): "gamma",
+    }
+    of |= {velocity(p.name): p.name for p in m.layout.at("acceleration")}
+    if rates:
+        of |= {Atom("function", "sin", Expr.of(place(rates[0].name))): "weight", q: "carry"}
+    parts = _split(m.force[0], of)
+    if parts is None:
+        return None
+    if rates:
+        return _turning(m, parts)
+    if parts.keys() <= {"", "gamma"}:
+        terms = {"pull": parts.get("", {}), "drag": _negative(parts.get("gamma", {}))}
+        return _form(m, slope.Pull, terms)
+    if not parts.keys() & {"alpha", "beta"}:
+        return None
+    delta, ramp = dict(parts.get("", {})), {}
+    for p in m.layout.at("acceleration"):
+        for held, constant in parts.get(p.name, {}).items():
+            if held != Expr.of(1).text:
+                return None  # a product of a control and a changing rate
+            delta[Expr.of(velocity(p.name)).text] = Expr.of(velocity(p.name)), constant[1]
+            ramp[Expr.of(control(p.control or "")).text] = Expr.of(control(p.control or "")), constant[1]
+    terms = {name: _negative(parts.get(name, {})) for name in ("alpha", "beta", "gamma")}
+    return _form(m, pendulum.Drive, terms | {"delta": delta, "ramp": ramp})
+
+
+#: What is held, by its text, with the constant that multiplies it.
+_Parts = dict[str, tuple[Expr, Expr]]
+
+
+def _split(force: Expr, of: Mapping[Atom, str]) -> dict[str, _Parts] | None:
+    """Sort a force's terms by the one factor in `of` that each has, "" for none; None for others."""
+    parts: dict[str, _Parts] = {}
+    for monomial, c in force.sorted_terms():
+        constant: Monomial = ()
+        held: Monomial = ()
+        name = ""
+        for atom, n in monomial:
+            kinds = {s.kind for s in Expr.of(atom).symbols()}
+            if kinds <= {"parameter"}:
+                constant = (*constant, (atom, n))
+            elif kinds == {"control"} and n > 0:
+                held = (*held, (atom, n))
+            elif atom in of and n == 1 and not name:
+                name = of[atom]
+            else:
+                return None
+        expr, part = Expr({held: 1}), parts.setdefault(name, {})
+        known = part.get(expr.text, (expr, Expr({})))[1]
+        part[expr.text] = expr, known + Expr({constant: c})
+    return parts
+
+
+def _is_constant(expr: Expr) -> bool:
+    return all(s.kind == "parameter" for s in expr.symbols())
+
+
+def _negative(part: _Parts) -> _Parts:
+    return {text: (held, -constant) for text, (held, constant) in part.items()}
+
+
+def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
+    """Return the turning slope's form, where the rate of one coordinate is held."""
+    (rate, *others), one = m.layout.at("rate"), Expr.of(1).text
+    held = Expr.of(control(rate.control or ""))
+    wanted = {"weight": one, "carry": (held * held).text, "gamma": one}
+    if (
+        others
+        or not all(list(part) == [wanted.get(name)] for name, part in parts.items())
+        or not all(_is_constant(entry) for entry in m.coupling.values())
+        or not {rate.name} == {e.coordinate for e in m.layout.state if e.coordinate != m.free[0]}
+    ):
+        return None
+    terms = {
+        "carry": {one: (Expr.of(1), constant) for _, constant in parts.get("carry", {}).values()},
+        "weight": parts.get("weight", {}),
+        "drag": _negative(parts.get("gamma", {})),
+    }
+    return _form(m, slope.Turn, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
+
+
+def _form(
+    m: Mechanics, kind: type[Any], parts: Mapping[str, _Parts], others: Mapping[str, Expr] | None = None
+) -> NormalForm:
+    """Give names to constants; equal ones share a name."""
+    expressions: dict[str, Expr] = dict(others or {})
+    names = {expr.text: name for name, expr in expressions.items()}
+    terms = {}
+    for coefficient, part in parts.items():
+        found = []
+        for held, constant in part.values():
+            if constant.text not in names:
+                name = coefficient if held.number == 1.0 else f"{coefficient}_{len(found)}"
+                names[constant.text] = name
+                expressions[name] = constant
+            found.append(Term(names[constant.text], held))
+        terms[coefficient] = tuple(found)
+    return NormalForm(m.layout, kind, terms, expressions, m.entry(0, 0))
