@@ -26,7 +26,7 @@ from lag_envs import TASKS
 from lag_envs.controllers import CONTROLLERS
 from lag_envs.leaderboard.protocol import GOALS, make_task
 from lag_envs.leaderboard.submission import load
-from lag_envs.stepping.slope import Pull, crossing_time
+from lag_envs.stepping.slope import crossing_time
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -158,9 +158,8 @@ def crossed(played: Played) -> dict[str, float]:
     task: Any = played.task
     each = np.arange(len(played.steps))
     x, v = played.states[played.steps - 1, each].T
-    k = task.constants()
     control = task.limit_control * (0.5 + 0.5 * played.actions[played.steps - 1, each])
-    force = Pull(k["pull"], k["drag"] + k["brake"] * control)
+    force = task.coefficients([x, v], [control], np)
     with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches that are not taken
         time = crossing_time(x, v, force, task.dt, np)
     speed = v + force.pull * time + force.drag * x
@@ -181,8 +180,9 @@ def pumped(played: Played) -> dict[str, float]:
 
 def calmed(played: Played) -> dict[str, float]:
     """Measure how much of the time the cylinder is near rest, and nearer."""
+    task: Any = played.task
     theta, rate = played.states[1:, :, 0], played.states[1:, :, 1]
-    distance = np.hypot(theta, rate / np.sqrt(played.task.constants()["weight"]))
+    distance = np.hypot(theta, rate / np.sqrt(task.weight()))
     going_on = np.arange(len(theta))[:, None] < played.steps
     shares = {size: 100.0 * float((distance[going_on] <= size).mean()) for size in (0.1, 0.01)}
     return {f"time within {size:g} of rest [%]": share for size, share in shares.items()}

@@ -300,7 +300,7 @@ class Solution:
         # Not in the fingerprint: what happens between the places where the step is tried.
         parameters = {
             "schema": CACHED, "env": problem.env_id, "options": problem.options, "target": target,
-            "level": self.level, "pushes": problem.pushes, "constants": self.task.constants(),
+            "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
         }  # fmt: skip
         actions = np.linspace(-1.0, 1.0, problem.actions)
         grid = problem.grid(self.level, target)
@@ -321,7 +321,7 @@ class Solution:
     def _kick(self, points: Array) -> tuple[Array, Array]:
         """Return where no kick and kicks of all sizes lead, and how likely they are."""
         states, pushes = self.states(points), self.problem.pushes
-        chance = self.task.numbers()["chance"]
+        chance = self.task.chance(0.01)
         # The first random number decides whether there is a kick, the second one its size.
         draws = [(1.0 - 1e-9, 0.5), *((0.0, (i + 0.5) / pushes) for i in range(pushes))]
         weights = np.array([1.0 - chance, *[chance / pushes] * pushes])
@@ -595,7 +595,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "solved": source + (" with " + ", ".join(f"{k}={v:g}" for k, v in problem.options.items())
                             if problem.options else ""),
         "how": explanation(env_id, source, problem, grids),
-        "parameters": problem.task().constants(),
+        "parameters": problem.task().formulas.constants(),
         "axes": [
             {"label": a.label, "low": a.low, "high": a.high, "cells_at_level_1": a.cells,
              "even_within": a.scale, "centre": a.centre, "periodic": a.periodic}

@@ -23,9 +23,9 @@ from sympy.physics.vector import dynamicsymbols
 
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.acrobot import Acrobot
+from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
-from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
 from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar

@@ -49,17 +49,22 @@ def run_list(args: argparse.Namespace) -> int:
 
 def _line(id: str) -> tuple[str, ...]:
     task = _task(id)
-    low, high = task.control_range
-    name, _, unit = task.scene.control_unit.partition(" [")
-    control = f"{name} {low:g} to {high:g} {unit.rstrip(']')}".rstrip()
     return (
         id,
         ", ".join(task.observation),
-        control,
+        ", ".join(_controls(task)),
         f"{task.dt:g} s",
         f"{task.limit:g}",
         f"{task.duration:g} s",
     )
+
+
+def _controls(task: Task) -> list[str]:
+    """Return names, ranges and units of the controls where episodes start."""
+    scene = task.scene
+    low, high = task.control_range
+    rows = zip(scene.control_names, low, high, scene.control_units, strict=True)
+    return [f"{name} {a:g} to {b:g} {unit}".rstrip() for name, a, b, unit in rows]
 
 
 # --- info ---
@@ -76,13 +81,12 @@ def run_info(args: argparse.Namespace) -> int:
 
     task = _task(_known(args.id))
     scene = task.scene
-    low, high = task.control_range
     text = [args.id, "", *_description(task)]
     text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
     states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
     text += [f"State: {', '.join(states)}"]
     text += [
-        f"Control: {scene.control_unit}, from {low:g} (action -1) to {high:g} (action 1) where episodes start"
+        f"Control: {control}, for actions from -1 to 1 where episodes start" for control in _controls(task)
     ]
     text += [f"Step: {task.dt:g} s; episode: {task.limit:g} steps, {task.duration:g} s"]
     if task.target_range is not None:
@@ -94,7 +98,7 @@ def run_info(args: argparse.Namespace) -> int:
         [("  " + name, f"±{bound:g}") for name, bound in zip(task.observation, bounds, strict=True)]
     )
     text += ["", "Start (uniform, unless reset(options={'state': ...}))"]
-    starts = zip(scene.state_names, task.centre, task.start, scene.state_units, strict=True)
+    starts = zip(scene.state_names, task.centre, task.half_widths, scene.state_units, strict=True)
     text += _columns(
         [("  " + name, f"{centre:.4g} ± {half:g} {unit}") for name, centre, half, unit in starts]
     )
@@ -134,24 +138,28 @@ def _own_parameters(task: Task) -> list[tuple[str, ...]]:
 def _accuracy(task: Task) -> list[str]:
     """Say what is proved of a step with the largest control, and how far one substep goes."""
     scene = task.scene
-    edge = [c + h for c, h in zip(task.centre, task.start, strict=True)]
-    bounds = [scene.truncation_bound(edge, u, task.dt) for u in task.control_range]
-    first = max((b for b in bounds if b), key=lambda b: (b.substeps, b.theta_dot), default=None)
+    edge = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
+    bounds = [scene.step_bound(edge, u, task.dt) for u in task.control_range]
+    first = max(bounds, key=lambda b: (b.substeps, max(b.bounds.values())))
     speed = task.certified_speed()
-    if first is None or speed is None:
+    if not first.order:
         return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
+    units = dict(zip(scene.state_names, scene.state_units, strict=True))
+    errors = [f"{bound:.1e} {units[name]} of {name}" for name, bound in first.bounds.items() if bound]
+    text = [
+        f"Taylor series of order {first.order}",
+        f"from the edge of the starts under the largest control: {first.substeps} substep(s)",
+        f"truncation error there, {first.kind}: {', '.join(errors)}",
+    ]
+    if speed is None:
+        return text
     reach = "no step is certified for a single substep: the number follows from the bound before each step"
     if speed >= 0.0:
         shown = math.floor(10.0 * speed) / 10.0
         reach = (
             f"one substep is certified up to |theta_dot| = {shown:g} rad/s; above, the bound tells how many"
         )
-    return [
-        f"Taylor series of order {first.order}",
-        f"from the edge of the starts under the largest control: {first.substeps} substep(s)",
-        f"proved truncation error there: {first.theta:.1e} rad, {first.theta_dot:.1e} rad/s",
-        reach,
-    ]
+    return [*text, reach]
 
 
 # --- bench ---

@@ -34,9 +34,9 @@ class Constant:
 
 
 def do_nothing(of: gym.Env | Task) -> Constant:
-    """Return the agent of zero control: where the control is a damping, its action is -1."""
+    """Return the agent of zero control: where the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
-    return Constant(to_action(task, 0.0))
+    return Constant(task.rest_action)
 
 
 class Random:
@@ -81,13 +81,7 @@ class Law:
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action for each observation."""
-        return as_actions(to_action(self.task, self.control(*self.read(observation)))), state
-
-
-def to_action(task: Task, control: Any) -> Any:
-    """Return the action that asks for a control; a damping goes from 0 to its limit, others to both sides."""
-    share = control / task.limit_control
-    return 2.0 * share - 1.0 if getattr(task.scene, "control", None) == "damping" else share
+        return as_actions(self.task.formulas.action(self.control(*self.read(observation)))), state
 
 
 def as_actions(values: Array) -> NDArray[np.float32]:
@@ -108,14 +102,18 @@ class Reader:
     """
 
     def __init__(self, task: Task) -> None:
-        scene, k = task.scene, SimpleNamespace(**task.constants())
-        self.task, self._n, self._width = task, len(scene.state_names), scene.width
+        formulas, form = task.formulas, task.scene._form
+        k, angle = SimpleNamespace(**formulas.constants()), form.angle if form else None
+        self.task, self._n = task, len(task.scene.state_names)
+        self._width = form.width if form else self._n
         rows = np.vstack([np.zeros(self._width + 1), np.eye(self._width + 1)])
-        seen = np.array([task.observe(list(row[:-1]), row[-1], k) for row in rows], np.float64)
+        seen = np.array(
+            [formulas.observe(np, list(row[:-1]), [row[-1]] * formulas.targets, k) for row in rows]
+        )
         self._zero, slopes = seen[0], seen[1:] - seen[0]
         self._inverse = np.linalg.pinv(slopes)
         #: Index of an angle that is seen by its cosine and sine only, and so lies in [-π, π]; or None.
-        self.wrapped = None if scene.angle is None or slopes[scene.angle].any() else scene.angle
+        self.wrapped = None if angle is None or slopes[angle].any() else angle
 
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
         """Return states (..., n_state) and targets (...) for observations (..., n)."""

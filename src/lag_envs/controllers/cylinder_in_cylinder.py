@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import sympy
 
 from lag_envs.controllers.basic import Array, Law
 from lag_envs.controllers.ilqr import ILQR, Opening
-from lag_envs.controllers.linear import equations, linearise, regulator
+from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
 
 
@@ -31,9 +30,12 @@ class TiltLQR(Law):
         if task.scene.damping == 0.0:
             raise ValueError("without drag no rate of the shell holds the cylinder, got damping=0 N m s")
         self.gain, _ = regulator(task, [0.0, 0.0, 0.0], extra={"u": effort / task.limit_control**2})
-        (theta, theta_dot, psi_dot), u, rates = equations(task.scene)
-        (rate,) = sympy.solve(rates[1].subs({theta_dot: 0, u: 0}), psi_dot)
-        self.holding_rate = sympy.lambdify(theta, rate, "numpy")
+        #: At rest -alpha sinθ + gamma ψ' = 0.
+        self.drive = task.coefficients([0.0, 0.0, 0.0], [0.0], np)
+
+    def holding_rate(self, theta: Array) -> Array:
+        """Return the shell's rate that holds the cylinder at an angle [rad/s]."""
+        return self.drive.alpha / self.drive.gamma * np.sin(theta)
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the shell's acceleration."""
@@ -65,10 +67,9 @@ class EnergyPump(Law):
                 "turning the shell does not push a cylinder without inertia, got inertia=0 kg m²"
             )
         self.pump, self.centring = pump, centring
-        k = task.constants()
-        self.weight, self.drag, self.push, self.wanted = (
-            k[n] for n in ("weight", "drag", "push", "wanted_energy")
-        )
+        drive = task.coefficients([0.0, 0.0, 0.0], [1.0], np)
+        self.weight, self.drag, self.push = drive.alpha, drive.gamma, drive.delta
+        self.wanted = task.energies([0.0, 0.0, 0.0], np)[1]
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the shell's acceleration."""
@@ -117,7 +118,7 @@ class BrakingLine(Law):
     def __init__(self, task: Damping, *, steepness: float = 1.0, sharpness: float = 5.5) -> None:
         super().__init__(task)
         # Near the bottom θ'' = a θ + b θ', with b in proportion to the brake.
-        (free, full) = (linearise(task.scene, [0.0, 0.0], c)[0] for c in (0.0, task.limit_control))
+        (free, full) = (task.scene.linearise([0.0, 0.0], c)[0] for c in (0.0, task.limit_control))
         # Where even the full brake leaves the cylinder swinging, the real part is the rate of its decay.
         self.slope = steepness * np.abs(np.linalg.eigvals(full).real).max()
         # θ' = -s θ is a solution for b = a/s - s.

@@ -82,7 +82,7 @@ class ILQR:
         self.iterations, self.tolerance = iterations, tolerance
         self.flat = FLAT * task.dt / task.interval
         self.model, self.read = Model(task), Reader(task)
-        self._k = SimpleNamespace(**task.constants())
+        self._k = SimpleNamespace(**task.formulas.constants())
 
     def predict(
         self,
@@ -156,7 +156,9 @@ class ILQR:
         """Return the actions (n, steps) of a controller."""
         x, memory, actions = starts, None, np.empty((len(starts), self.steps))
         for t in range(self.steps):
-            seen = self.task.observe(self.task.scene.lift(x), targets, self._k)
+            form, formulas = self.task.scene._form, self.task.formulas
+            lifted = form.lift(x) if form else tuple(x.T)
+            seen = formulas.observe(np, lifted, [targets] * formulas.targets, self._k)
             observation = np.stack(np.broadcast_arrays(*seen), axis=-1)
             action, memory = guess.predict(observation, memory)
             actions[:, t] = action[:, 0]

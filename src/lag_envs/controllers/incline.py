@@ -39,9 +39,11 @@ class TiltCascade(Law):
         super().__init__(task)
         extra = {"u": effort / task.limit_control**2}
         self.gain, _ = regulator(task, [0.0] * len(task.scene.state_names), extra=extra)
-        k = task.scene.constants()
-        pull = k["pull"] if task.quasi_static else k["rolling"] * k["field"]
-        self.acceleration = braking * pull * np.sin(task.largest_tilt)
+        if task.quasi_static:
+            steepest = task.coefficients([0.0, 0.0], [task.largest_tilt], np).pull
+        else:
+            steepest = task.coefficients([0.0] * 3, [0.0], np).weight * np.sin(task.largest_tilt)
+        self.acceleration = braking * steepest
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the tilt's rate, or the tilt."""
@@ -78,10 +80,9 @@ class SwitchingLine(Law):
         super().__init__(task)
         self.speed = task.gentle if speed is None else speed
         self.model = Model(task)
-        k = task.constants()
         # No brake gets below the speed at which a full one settles.
-        rate = k["drag"] + k["brake"] * task.limit_control
-        settled = k["pull"] / rate
+        pull, rate = task.coefficients([0.0, 0.0], [task.limit_control], np)
+        settled = pull / rate
         self.speed, fastest = max(self.speed, 1.02 * settled), max(fastest, 3.0 * settled)
         # In ten times 1/rate the excess of speed falls to 5e-5 of what it was.
         run = task.scene.simulate([0.0, fastest], [task.limit_control] * POINTS, 10.0 / rate / POINTS)
@@ -141,13 +142,11 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     >>> round(float(optimal_return(Brake(), x=-2.0, v=0.5)), 4)
     -1.7373
     """
-    k = task.constants()
-    if not k["pull"] > 0.0:
+    free, full = (task.coefficients([0.0, 0.0], [c], np) for c in (0.0, task.limit_control))
+    if not free.pull > 0.0:
         raise ValueError(
             f"tilt={task.scene.tilt:g} rad and gravity={task.scene.gravity:g} m/s² pull nothing to the line"
         )
-    free = Pull(k["pull"], k["drag"])
-    full = Pull(k["pull"], k["drag"] + k["brake"] * task.limit_control)
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 
     def crossing(place: Array, speed: Array, force: Pull) -> tuple[Array, Array]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import sympy
 
 from lag_envs.controllers.basic import Array, Law
-from lag_envs.controllers.linear import equations
 from lag_envs.tasks.cylinder_in_cylinder import Tilt as ShellTilt
 from lag_envs.tasks.incline import Tilt as InclineTilt
 
@@ -18,8 +16,7 @@ class PD(Law):
     """Bring place or angle to its target like a critically damped spring.
 
     The acceleration ω² (q* - q) - 2ω q' is asked for. What is moved, the tilt of the plane or the rate of the
-    shell, has to be at a value that follows from the equation of motion, which is solved for it; the control
-    brings it there.
+    shell, has to be at a value that follows from the equation of motion; the control brings it there.
 
     Parameters
     ----------
@@ -42,31 +39,26 @@ class PD(Law):
         tuned = TUNED[type(task)]
         self.frequency = tuned[0] if frequency is None else frequency
         self.lag = max(tuned[1] if lag is None else lag, task.dt)
-        eqs = equations(task.scene)
-        place, speed = eqs.states[:2]
-        #: The tilt may be the control itself; else what is moved is the last state.
-        self.direct = len(eqs.states) == 2
-        moved = eqs.control if self.direct else eqs.states[2]
-        wanted = sympy.Symbol("wanted", real=True)
-        rate = eqs.rates[1] if self.direct else eqs.rates[1].subs(eqs.control, 0)
-        # Where the plane's tilt enters by its sine, that is what is solved for.
-        sine = sympy.Symbol("sine", real=True)
-        by_sine = rate.has(sympy.sin(moved))
-        solution = sympy.solve(
-            (rate.subs(sympy.sin(moved), sine) if by_sine else rate) - wanted, sine if by_sine else moved
-        )
-        if not solution:
+        rest = task.coefficients([0.0] * len(task.scene.state_names), [0.0], np)
+        if isinstance(task, InclineTilt):
+            steepest = task.coefficients([0.0] * len(task.scene.state_names), [task.largest_tilt], np)
+            strength = steepest.pull / np.sin(task.largest_tilt) if task.quasi_static else rest.weight
+        else:
+            strength = rest.gamma
+        if not strength > 0.0:
             raise ValueError(f"nothing that the control moves accelerates the cylinder: {task.scene}")
-        self._solved = sympy.lambdify((wanted, place, speed), solution[0], "numpy")
-        self._by_sine = by_sine
+        self.rest, self.strength = rest, float(strength)
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the control."""
         place, speed = state[..., 0], state[..., 1]
         wanted = self.frequency**2 * (target - place) - 2.0 * self.frequency * speed
-        moved = self._solved(wanted, place, speed)
-        if self._by_sine:
-            assert isinstance(self.task, InclineTilt)
+        if isinstance(self.task, InclineTilt):  # wanted = strength sin(tilt) - drag speed
             limit = np.sin(self.task.largest_tilt)
-            moved = np.arcsin(np.clip(moved, -limit, limit))
-        return moved if self.direct else (moved - state[..., 2]) / self.lag
+            sine = (wanted + self.rest.drag * speed) / self.strength
+            moved = np.arcsin(np.clip(sine, -limit, limit))
+            if self.task.quasi_static:
+                return moved
+        else:  # wanted = -alpha sin(place) - gamma (speed - the shell's rate)
+            moved = (wanted + self.rest.alpha * np.sin(place)) / self.strength + speed
+        return (moved - state[..., 2]) / self.lag

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, Law, Reader, as_actions, to_action
+from lag_envs.controllers.basic import Array, Law, Reader, as_actions
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.pivoted_bar import Balance, SwingUp
@@ -61,8 +61,7 @@ class EnergyShapingLQR:
         self.pump = tuned[1] if pump is None else pump
         self.lose, self.centring = lose, centring
         self.gain, self.cost = lqr(task)
-        constants = self.scene.constants()
-        self.weight, self.pull = constants["weight"], constants["pull"]
+        self.weight = task.coefficients([0.0] * len(self.scene.state_names), [0.0], np).alpha
         self.read = Reader(task)
 
     def predict(
@@ -76,7 +75,7 @@ class EnergyShapingLQR:
         cost = self.cost_to_go(x)
         holds = cost < np.where(holds, self.lose, self.catch)
         u = np.where(holds, -from_upright(x) @ self.gain, self.swing(x))
-        return as_actions(to_action(self.task, u)), holds
+        return as_actions(self.task.formulas.action(u)), holds
 
     def cost_to_go(self, x: Array) -> Array:
         """Return what the LQR expects to lose of the reward from states on, near upright."""
@@ -86,7 +85,8 @@ class EnergyShapingLQR:
     def swing(self, x: Array) -> Array:
         """Return the support's acceleration [m/s²] that brings the bar's energy to that of the upright rest.
 
-        Per moment of inertia the energy is E = θ'²/2 - weight·cosθ, and u changes it by -pull·u·θ'·cosθ.
+        Per moment of inertia the energy is E = θ'²/2 - weight·cosθ, and u changes it in proportion to
+        -u θ' cosθ.
         """
         theta_dot, cosine = x[..., -1], np.cos(x[..., -2])
         missing = self.weight - (0.5 * theta_dot * theta_dot - self.weight * cosine)
@@ -163,5 +163,5 @@ def lqr(task: SwingUp) -> tuple[Array, Array]:
     second order, e²/2 + 0.02 (u/U)², and for the track, which the reward does not mind, 0.02 (s/S)²: else
     nothing would call the support back.
     """
-    extra = {"s": 0.02 / task.numbers()["track"] ** 2} if task.has_track else {}
+    extra = {"s": 0.02 / task.length**2} if task.has_track else {}
     return regulator(task, UPRIGHT[-len(task.scene.state_names) :], extra=extra)

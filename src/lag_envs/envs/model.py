@@ -55,10 +55,10 @@ class Model:
         states : array_like, shape (n, n_state)
             States in the order of ``task.scene.state_names``; whether an episode would have ended there does
             not matter.
-        actions : array_like, shape (n,)
+        actions : array_like, shape (n,), or (n, n_actions) where there are several
             Actions; finite values outside [-1, 1] are clipped.
-        targets : array_like, shape (n,) or (), optional
-            Targets, for a task that has them and does not fix one.
+        targets : array_like, shape (n,) or (), or (n, n_targets) or (n_targets,) where there are several
+            Targets, for a task that has them and does not fix them.
 
         Returns
         -------
@@ -81,17 +81,19 @@ class Model:
         if states.shape != (n, self._n_state):
             raise ValueError(f"states must have shape (n, {self._n_state}), got {states.shape}")
         targets = self._targets(targets, n)
-        actions = np.ascontiguousarray(real_array("actions", actions))
-        if actions.shape != (n,):
-            raise ValueError(f"actions must have shape ({n},), got {actions.shape}")
+        actions = np.ascontiguousarray(real_array("actions", actions), np.float64)
+        count = self.task.formulas.actions
+        wanted = (n,) if count == 1 else (n, count)
+        if actions.shape != wanted:
+            raise ValueError(f"actions must have shape {wanted}, got {actions.shape}")
         for name, values in (("states", states), ("actions", actions), ("targets", targets)):
             if not np.isfinite(values).all():
                 row = int(np.argwhere(~np.isfinite(values))[0, 0])
                 raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
         ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
-        refused = self._step(states, actions[:, None], targets[:, None], self._numbers, ends, rewards, ended)
+        refused = self._step(states, actions.reshape(n, count), targets, self._numbers, ends, rewards, ended)
         if refused:
-            state, action = states[refused - 1], float(actions[refused - 1])
+            state, action = states[refused - 1], actions[refused - 1]
             raise self.task.formulas.refusal(
                 state, action, self.task.dt, None, f"the step of row {refused - 1}"
             )
@@ -107,23 +109,24 @@ class Model:
         draws : array_like, shape (task.draws, n)
             The random numbers in [0, 1) on which the kick depends.
         """
-        array = real_array("states", states)
-        rows = list(array.T)
-        angle = self.task.scene.angle
-        if angle is not None:
-            rows += [np.cos(rows[angle]), np.sin(rows[angle])]
-        kicked = self.task.kick(rows, list(real_array("draws", draws)), self._constants, np)
+        array, form = real_array("states", states), self.task.scene._form
+        rows = form.lift(array) if form else tuple(array.T)
+        kicked = self.task.formulas.kick(np, list(real_array("draws", draws)), rows, self._constants)
         return np.stack(np.broadcast_arrays(*kicked[: self._n_state]), axis=-1)
 
     def _targets(self, targets: ArrayLike | None, n: int) -> Array:
-        wants = self.task.target_range is not None
+        """Return targets of shape (n, n_targets)."""
+        count, fixed = self.task.formulas.targets, self.task.fixed_target
         if targets is None:
-            if wants and self.task.target is None:
+            if count and fixed is None:
                 raise ValueError("the task's target is random: targets must be given")
-            targets = self.task.target if wants else 0.0
-        elif not wants:
+            targets = fixed if count else np.empty(0)
+        elif not count:
             raise ValueError("this task has no target, got targets")
         array = np.asarray(targets, np.float64)
-        if array.shape not in ((), (n,)):
-            raise ValueError(f"targets must have shape ({n},) or (), got {array.shape}")
-        return np.ascontiguousarray(np.broadcast_to(array, n))
+        if count == 1 and array.shape in ((), (n,)):
+            array = array[..., None]
+        if array.shape not in ((count,), (n, count)):
+            wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
+            raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
+        return np.ascontiguousarray(np.broadcast_to(array, (n, count)))

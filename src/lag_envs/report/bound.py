@@ -195,29 +195,29 @@ def _enough(
 
 def environment(id: str, n: int) -> Iterator[Row]:
     """Yield what the bound certifies of an environment, and n of its steps at random within that."""
-    from types import SimpleNamespace
-
+    from lag_envs.report.stepped import Stepped
     from lag_envs.tasks import TASKS, load_task
 
     place, fixed = TASKS[id]
     task = load_task(place)(**fixed)
-    scene, dt, k = task.scene, task.dt, SimpleNamespace(**task.scene.constants())
-    low, high = task.control_range
+    scene, dt = task.scene, task.dt
+    stepped = Stepped(scene, dt=dt)
+    low, high = (float(u[0]) for u in task.control_range)
     reach = task.certified_speed()
     assert reach is not None
     rng = np.random.default_rng(1)
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
-        y = scene.lift(np.array(_state(task, theta, speed)))
-        drive = Drive(*map(float, scene.drive(y, u, k, math)))
-        return truncation(theta, speed, drive, dt, scene.order, digits)
+        y = stepped.lift(np.array(_state(task, theta, speed)))
+        drive = Drive(*map(float, stepped.drive(y, u, stepped.numbers(), np)))
+        return truncation(theta, speed, drive, dt, stepped.flow.order, digits)
 
     for _ in range(n):
         theta, speed, u = (float(v) for v in rng.uniform([-math.pi, -reach, low], [math.pi, reach, high]))
-        known, actual = scene.truncation_bound(_state(task, theta, speed), u, dt), left_out(theta, speed, u)
-        assert known is not None
+        known, actual = scene.step_bound(_state(task, theta, speed), u, dt), left_out(theta, speed, u)
         row = {"kind": "environment", "id": id, "order": known.order, "dt": dt, "reach": reach}
-        row |= {"theta_bound": known.theta, "theta": actual[0], "theta_dot_bound": known.theta_dot}
+        row |= {"theta_bound": known.bounds["theta"], "theta": actual[0]}
+        row |= {"theta_dot_bound": known.bounds["theta_dot"]}
         yield row | {"theta_dot": actual[1], "speed": speed, "substeps": known.substeps}
     places = [float(v) for v in rng.uniform(-math.pi, math.pi, max(4, n // 5))]
     needed = _largest(
@@ -226,13 +226,24 @@ def environment(id: str, n: int) -> Iterator[Row]:
         ),
         steps=10,
     )
-    yield {"kind": "reach", "id": id, "order": scene.order, "dt": dt, "certified": reach, "actual": needed}
+    yield {
+        "kind": "reach",
+        "id": id,
+        "order": stepped.flow.order,
+        "dt": dt,
+        "certified": reach,
+        "actual": needed,
+    }
 
 
 def _state(task: Any, theta: float, speed: float) -> list[float]:
     """Return a state with the given angle and rate, the other entries at the edge of the task's starts."""
-    state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
-    state[task.scene.angle : task.scene.angle + 2] = theta, speed
+    state = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
+    from lag_envs.report.stepped import Stepped
+
+    angle = Stepped(task.scene).angle
+    assert angle is not None
+    state[angle : angle + 2] = theta, speed
     return state
 
 

@@ -87,7 +87,7 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
         state = tuple(float(rng.uniform(-s, s)) for s in variant.spread)
         control = float(rng.uniform(*variant.controls))
         changes = {}
-        for field in dataclasses.fields(base):
+        for field in dataclasses.fields(base):  # type: ignore[arg-type]
             value = getattr(base, field.name)
             if vary and "unit" in field.metadata and value and field.name != "inertia":
                 changes[field.name] = value * 2.0 ** float(rng.uniform(-1, 1))
@@ -102,14 +102,14 @@ def scales(case: Case, dt: float) -> list[float]:
 
     Angles and lengths max(1, |q|, |q'| dt), their rates max(1, |q'|, what the field adds).
     """
-    from types import SimpleNamespace
-
+    from lag_envs.report.stepped import Stepped
     from lag_envs.stepping import pendulum
 
     scene, state, u = case
-    y = scene.lift(np.asarray(state))
-    coefficients = scene.drive(y, u, SimpleNamespace(**scene.constants()), np)
-    q, v = (float(x) for x in scene.unpack(y, u, SimpleNamespace(**scene.constants()))[:2])
+    stepped = Stepped(scene)
+    y, k = stepped.lift(np.asarray(state)), stepped.numbers()
+    coefficients = stepped.drive(y, u, k, np)
+    q, v = (float(x) for x in stepped.unpack(y, u, k)[:2])
     if isinstance(coefficients, pendulum.Drive):
         gain = math.sqrt(math.hypot(coefficients.alpha, coefficients.beta))
     else:

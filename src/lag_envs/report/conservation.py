@@ -13,7 +13,8 @@ from lag_envs.report import reference
 from lag_envs.report.cases import VARIANTS
 from lag_envs.report.content import Claim, Content, Picture, Table
 from lag_envs.report.runner import Job, Result, Row
-from lag_envs.report.steppers import METHODS, comparison, with_flow
+from lag_envs.report.stepped import Stepped
+from lag_envs.report.steppers import METHODS, comparison
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function
@@ -45,7 +46,7 @@ class Free(NamedTuple):
 
 _BAR = PivotedBar(track=None)
 _SHELL = CylinderInCylinder(control="damping")
-_TOP = 2.0 * math.sqrt(_BAR.constants()["weight"])  #: speed at the bottom that reaches the top [rad/s]
+_TOP = 2.0 * math.sqrt(_BAR._constants()["alpha"])  #: speed at the bottom that reaches the top [rad/s]
 
 FREE = {
     "bar, 0.1 rad": Free(_BAR, (0.1, 0.0)),
@@ -92,7 +93,7 @@ def marks(steps: int) -> NDArray[np.int64]:
     return np.unique(np.round(np.geomspace(1, steps, count)).astype(np.int64))
 
 
-def march(scene: Scene) -> Callable:
+def march(scene: Stepped) -> Callable:
     """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
 
     Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
@@ -119,19 +120,20 @@ def march(scene: Scene) -> Callable:
 
 def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the lifted states after these numbers of steps; fewer rows where a step was refused."""
-    scene = problem.scene
-    stepped = scene if method == OURS else with_flow(scene, comparison(method, scene.flow))
-    out = np.empty((len(at) + 1, scene.width))
-    out[-1] = scene.lift(np.array(problem.state))
-    present = [float(v) for v in scene.constants().values() if v != 0.0]
-    filled = march(stepped)(out, at, problem.dt, scene.largest_x(problem.dt), *present)
+    stepped = Stepped(problem.scene, dt=problem.dt)
+    largest = stepped.largest_x(problem.dt)
+    if method != OURS:
+        stepped = Stepped(problem.scene, comparison(method, stepped.flow))
+    out = np.empty((len(at) + 1, stepped.width))
+    out[-1] = stepped.lift(np.array(problem.state))
+    filled = march(stepped)(out, at, problem.dt, largest, *stepped.present())
     return out[:filled]
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
     """Yield drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
     problem = FREE[name]
-    scene, angle = problem.scene, problem.scene.angle
+    scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
     states = run(problem, method, at)
     at = at[: len(states)]

@@ -109,7 +109,10 @@ def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int
     environment's own random numbers, which are a function of seed, episode and step. They are multiples of
     2**-52, so they are exact.
     """
-    k, choose = SimpleNamespace(**task.constants()), SimpleNamespace(where=lambda c, a, b: a if c else b)
+    k, choose = (
+        SimpleNamespace(**task.formulas.constants()),
+        SimpleNamespace(where=lambda c, a, b: a if c else b),
+    )
     key = np.uint64(episode_key(np.uint64(seed), np.uint64(1)))  # a plain integer would be taken as signed
 
     def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
@@ -117,7 +120,7 @@ def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int
         state = reference._once(task.scene, state, control, task.dt, digits)
         with mp.workdps(digits + 30):
             draws = [float(uniform(key, np.uint64(number), np.uint64(i))) for i in range(task.draws)]
-            return list(task.kick(state, draws, k, choose))
+            return list(task.formulas.kick(choose, draws, state, k))
 
     return step
 
@@ -160,7 +163,7 @@ def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) 
                 for a, b in zip(x, y, strict=True)
             )
         )
-    order = task.scene.order
+    order = task.scene._order(task.dt)
     row |= {
         "ours": True,
         "integrator": f"Taylor series, order {order}" if order else "exact flow",

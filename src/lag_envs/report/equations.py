@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.report.cases import Case
+from lag_envs.report.stepped import Stepped
 from lag_envs.report.steppers import METHODS, comparison, explicit, rate
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import SLIDE, TURN, pendulum_flow
@@ -127,8 +128,8 @@ class Problems:
 
     def __init__(self, cases: Sequence[Case]) -> None:
         self.cases = list(cases)
-        scene = self.cases[0].scene
-        constants = [case.scene.constants() for case in self.cases]
+        self._stepped = scene = Stepped(self.cases[0].scene)
+        constants = [case.scene._constants() for case in self.cases]
         self._k = SimpleNamespace(**{name: np.array([k[name] for k in constants]) for name in constants[0]})
         self._u = np.array([case.control for case in self.cases])
         states = np.array([case.state for case in self.cases])
@@ -155,7 +156,6 @@ class Problems:
 
     def states(self, y: Array, span: float) -> Array:
         """Return the scene's states, one per line, of unknowns after the control was held for some time."""
-        scene = self.cases[0].scene
         moved = [*y[:2], *self._variables[2:]]
-        ends = scene.pack(moved, self._lifted, self._u, span, self._k)
-        return np.stack(ends[: len(scene.state_names)], axis=1)
+        ends = self._stepped.pack(moved, self._lifted, self._u, span, self._k)
+        return np.stack(ends[: len(self._stepped.form.state_names)], axis=1)

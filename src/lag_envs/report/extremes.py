@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from lag_envs import scenes
 from lag_envs.report import reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.runner import Row
+from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
@@ -171,8 +171,8 @@ def _floor(case: Case, entry: int) -> float:
     if scene.state_units[entry] == "rad":
         return 1.0
     if scene.state_names[entry] == "theta_dot":
-        k = SimpleNamespace(**scene.constants())
-        drive = scene.drive(scene.lift(np.asarray(state)), control, k, np)
+        stepped = Stepped(scene)
+        drive = stepped.drive(stepped.lift(np.asarray(state)), control, stepped.numbers(), np)
         return math.sqrt(math.hypot(drive[0], drive[1]))
     return 0.0
 
@@ -180,9 +180,10 @@ def _floor(case: Case, entry: int) -> float:
 def substeps(case: Case, dt: float) -> int:
     """Return how many substeps the step takes; negative where it is refused."""
     scene, state, control = case
-    numbers = [float(v) for v in scene.constants().values() if v]
-    y = map(float, scene.lift(np.asarray(state, dtype=np.float64)))
-    *_, status = scene.stepper().compile()(*y, control, dt, scene.largest_x(dt), *numbers)
+    stepped = Stepped(scene, dt=dt)
+    y = map(float, stepped.lift(np.asarray(state, dtype=np.float64)))
+    advance = stepped.stepper().compile()
+    *_, status = advance(*y, control, dt, stepped.largest_x(dt), *stepped.present())
     return int(status)
 
 

@@ -13,12 +13,13 @@ from lag_envs.envs.program import Program, constants_of
 from lag_envs.report.cases import Case
 from lag_envs.report.content import Claim, Content, Picture, Table
 from lag_envs.report.runner import Job, Result, Row
-from lag_envs.report.steppers import plain_series, with_flow
+from lag_envs.report.stepped import Stepped
+from lag_envs.report.steppers import plain_series
 from lag_envs.report.timing import Kernels, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.flows import pendulum_flow
+from lag_envs.stepping.flows import Flow, pendulum_flow
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -33,9 +34,17 @@ class Pair(NamedTuple):
     """A scene without something, and the same one with it; a control step of both, on the same state."""
 
     left_out: str
-    without: Scene
-    having: Scene
+    without: Scene | Stepped
+    having: Scene | Stepped
     dt: float = 0.02
+
+    def stepped(self) -> tuple[Stepped, Stepped]:
+        """Return both with their flows."""
+        without, having = (
+            given if isinstance(given, Stepped) else Stepped(given, dt=self.dt)
+            for given in (self.without, self.having)
+        )
+        return without, having
 
 
 _FREE = PivotedBar(track=None, damping=0.001)
@@ -43,8 +52,8 @@ PAIRS = (
     Pair("drag of the bar", PivotedBar(track=None), _FREE),
     Pair("support in the bar's state (track=None)", _FREE, PivotedBar(damping=0.001)),
     Pair("gravity of the bar", PivotedBar(track=None, damping=0.001, gravity=0.0), _FREE),
-    Pair("orders 15 to 20 of the bar's series", _FREE, with_flow(_FREE, pendulum_flow(20))),
-    Pair("test of the certificate (never left out)", with_flow(_FREE, plain_series(14)), _FREE),
+    Pair("orders 15 to 20 of the bar's series", _FREE, Stepped(_FREE, pendulum_flow(20))),
+    Pair("test of the certificate (never left out)", Stepped(_FREE, plain_series(14)), _FREE),
     Pair("drag in a turning shell", CylinderInCylinder(), CylinderInCylinder(damping=0.024), 0.05),
     Pair(
         "turning of the shell", CylinderInCylinder(control="damping"), CylinderInCylinder(damping=0.024), 0.05
@@ -96,7 +105,8 @@ def carried(task: Task) -> Row:
     numbers = constants_of(task)
     absent = frozenset(name for name, value in numbers.items() if value == 0.0)
     program = Program(task, absent)
-    code = scene.stepper()
+    stepped = Stepped(scene, dt=task.dt)
+    code = stepped.stepper()
     lines = [*program.control, *program.fast, *program.judge, *program.last, *program.kick, *program.move]
     lines += program.observe
     ends = [*program.moved, "r", "over", "within", *program.o]
@@ -105,10 +115,10 @@ def carried(task: Task) -> Row:
     given = [*program.y, *program.g, *program.a, *constants]
     return {
         "scene": type(scene).__name__,
-        "state": list(scene.state_names) + (["cos", "sin"] if scene.angle is not None else []),
+        "state": list(scene.state_names) + (["cos", "sin"] if stepped.angle is not None else []),
         "terms": [name for name, there in code.terms.items() if there],
         "left_out": [name for name, there in code.terms.items() if not there],
-        "stages": stages(scene),
+        "stages": stages(stepped.flow),
         "constants": program.constants,
         "zero": sorted(absent),
         "operations": code.operations,
@@ -117,11 +127,11 @@ def carried(task: Task) -> Row:
     }
 
 
-def stages(scene: Scene) -> str:
+def stages(flow: Flow) -> str:
     """Say how a step is taken."""
-    kind = scene.flow.coefficients
+    kind = flow.coefficients
     if kind is pendulum.Drive:
-        return f"one Taylor series of order {scene.order}, no trigonometry"
+        return f"one Taylor series of order {flow.order}, no trigonometry"
     return "closed form" if kind is slope.Pull else f"series of order {slope.TURN_ORDER}, summed to rounding"
 
 
@@ -158,15 +168,16 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
     """Yield operations and times of a step without something and with it, in a batch, in turn."""
     samples = {}
     for pair in PAIRS[:count]:
-        for name, scene in (("without", pair.without), ("having", pair.having)):
+        for name, stepped in zip(("without", "having"), pair.stepped(), strict=True):
+            scene = stepped.scene
             state = tuple(0.1 * (i + 1) for i in range(len(scene.state_names)))
             cases = [Case(scene, state, 0.1)] * BATCH
-            samples[f"{pair.left_out}, {name}"] = at_once(Kernels(scene, scene.flow), cases, 8, pair.dt)
+            samples[f"{pair.left_out}, {name}"] = at_once(Kernels(scene, stepped.flow), cases, 8, pair.dt)
     times = interleaved(samples, rounds)
     for pair in PAIRS[:count]:
         yield {
             "kind": "savings", "left_out": pair.left_out,
-            "operations": [pair.without.stepper().operations, pair.having.stepper().operations],
+            "operations": [stepped.stepper().operations for stepped in pair.stepped()],
             "ns": [times[f"{pair.left_out}, {name}"] for name in ("without", "having")],
         }  # fmt: skip
 

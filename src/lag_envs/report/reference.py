@@ -15,7 +15,6 @@ the same, stiff                                 Taylor through the boundary laye
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
@@ -25,15 +24,16 @@ from math import ceil, log10
 from operator import mul
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from mpmath import mp, mpf
 
+from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.recording import parameter
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum as pendulum_stepping
 from lag_envs.stepping import slope as slope_stepping
 
-S = TypeVar("S", bound=Scene)
 MAX_STEPS = 20_000
 
 
@@ -283,15 +283,15 @@ def pendulum(p, theta, rate, dt, digits):
 # --- scenes ------------------------------------------------------------------------------------
 
 
-def exact(scene: S) -> S:
-    """Return a copy of the scene whose parameters are mpmath numbers of the same values."""
-    twin = object.__new__(type(scene))
-    for field in dataclasses.fields(scene):
-        value = getattr(scene, field.name)
-        if "unit" in field.metadata and value is not None:
-            value = mpf(value)
-        object.__setattr__(twin, field.name, value)
-    return twin
+def constants(scene: Scene) -> SimpleNamespace:
+    """Return the constants of a scene's normal form as mpmath numbers, from its parameters taken as exact."""
+    form = scene._form
+    assert form is not None
+    values = {parameter(name): mpf(getattr(scene, name)) for name in scene._numbers()}
+    inertia, *numbers = evaluate([form.inertia, *form.expressions.values()], values, mp)
+    return SimpleNamespace(
+        **{name: mpf(x) / inertia for name, x in zip(form.expressions, numbers, strict=True)}
+    )
 
 
 def flow(scene: Scene, state: Sequence[Any], control: Any, dt: Any, digits: int = 30) -> list[mpf]:
@@ -363,14 +363,15 @@ def errors(states: Sequence[float], exact: Sequence[mpf]) -> list[float]:
 
 def _once(scene: Scene, state: Sequence[Any], control: Any, dt: Any, digits: int) -> list[mpf]:
     with mp.workdps(digits + 30):
-        k = SimpleNamespace(**exact(scene).constants())
+        form, k = scene._form, constants(scene)
+        assert form is not None
         y = [mpf(value) for value in state]
-        u, dt = mpf(control), mpf(dt)
-        if scene.angle is not None:
-            y += [mp.cos(y[scene.angle]), mp.sin(y[scene.angle])]
-        coefficients = scene.drive(y, u, k, mp)
-        moved = _moved(coefficients, scene.unpack(y, u, k), dt, digits)
-        return list(scene.pack(moved, y, u, dt, k))[: len(scene.state_names)]
+        u, dt = [mpf(control)], mpf(dt)
+        if form.angle is not None:
+            y += [mp.cos(y[form.angle]), mp.sin(y[form.angle])]
+        coefficients = form.drive(y, u, k, mp)
+        moved = _moved(coefficients, form.unpack(y, u, k), dt, digits)
+        return list(form.pack(moved, y, u, dt, k))[: len(scene.state_names)]
 
 
 def _moved(coefficients: Any, variables: Sequence[mpf], dt: mpf, digits: int) -> list[mpf]:

@@ -119,7 +119,7 @@ class Ours(Rival):
         cases = problems.cases
         count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
         length = dt * steps / count
-        kernels = Kernels(cases[0].scene, cases[0].scene.flow)
+        kernels = Kernels(cases[0].scene, dt=length)
         alike: dict[Scene, list[Case]] = {}
         for case in cases:
             alike.setdefault(case.scene, []).append(case)

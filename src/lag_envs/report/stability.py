@@ -15,8 +15,11 @@ from lag_envs.report.cases import VARIANTS, Case, scales
 from lag_envs.report.content import Claim, Content, Picture, Table
 from lag_envs.report.extremes import EXACT
 from lag_envs.report.runner import Job, Result, Row, describe
+from lag_envs.report.stepped import Stepped
 from lag_envs.report.steppers import comparison
+from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.stepping import pendulum
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,8 +57,15 @@ class Map(NamedTuple):
 
 def _damped(name: str, decay: float, dt: float) -> Case:
     variant = VARIANTS[name]
-    per_drag = variant.scene(damping=1.0).constants()["drag"]
+    per_drag = _drag(variant.scene(damping=1.0))
     return Case(variant.scene(damping=decay / dt / per_drag), *STARTS[name])
+
+
+def _drag(scene: Scene) -> float:
+    """Return the rate at which drag alone would slow the motion down, without control [1/s]."""
+    stepped = Stepped(scene)
+    found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
+    return float(found.gamma if isinstance(found, pendulum.Drive) else found.drag)
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
@@ -185,7 +195,7 @@ def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
     the product; "ours, float32" the formula of its series, with the substeps that the bound asks for.
     """
     ends: dict[str, list[Any]] = {OURS: [_ours(case, dt) for case in found]}
-    flow = found[0].scene.flow
+    flow = Stepped(found[0].scene, dt=dt).flow
     with np.errstate(all="ignore"):
         for precision, dtype in PRECISIONS.items():
             more = "" if precision == "float64" else f", {precision}"
@@ -214,13 +224,14 @@ def _ours(case: Case, dt: float) -> Any:
 def _count(case: Case, dt: float) -> float:
     """Return the number of plain substeps that are accurate: what the bound says, or what `within` says."""
     scene, state, control = case
-    bound = scene.truncation_bound(state, control, dt)
-    if bound is not None:
+    bound = scene.step_bound(state, control, dt)
+    if bound.order:
         return float(bound.substeps)
-    y, k = scene.lift(np.array(state)), SimpleNamespace(**scene.constants())
-    coefficients, variables = scene.drive(y, control, k, np), scene.unpack(y, control, k)
+    stepped = Stepped(scene, dt=dt)
+    y, k = stepped.lift(np.array(state)), stepped.numbers()
+    coefficients, variables = stepped.drive(y, control, k, np), stepped.unpack(y, control, k)
     n = 1.0
-    while n <= MOST_SUBSTEPS and not scene.flow.within(variables, coefficients, dt / n, 0.0, np):
+    while n <= MOST_SUBSTEPS and not stepped.flow.within(variables, coefficients, dt / n, 0.0, np):
         n *= 2.0
     return n
 
@@ -243,8 +254,8 @@ def march(
     dtype : type
         Precision of everything: constants, state, arithmetic.
     """
-    scene = found[0].scene
-    constants = [case.scene.constants() for case in found]
+    scene = Stepped(found[0].scene)
+    constants = [case.scene._constants() for case in found]
     k = SimpleNamespace(**{key: np.array([c[key] for c in constants], dtype) for key in constants[0]})
     u = np.array([case.control for case in found], dtype)
     h = (dt / counts).astype(dtype)
@@ -257,7 +268,7 @@ def march(
         y = [np.where(i < counts, a, b) for a, b in zip(new, y, strict=True)]
         if any(a.dtype != dtype for a in y):
             raise TypeError(f"{[str(a.dtype) for a in y]} is not {dtype.__name__}")
-    return np.transpose(y[: len(scene.state_names)]).astype(float).tolist()
+    return np.transpose(y[: len(scene.form.state_names)]).astype(float).tolist()
 
 
 # --- showing ---

@@ -7,30 +7,19 @@ ours, so that times compare methods and not compilers. A comparison stepper take
 Cosine and sine are computed at every stage, or *carried*: an explicit Runge-Kutta method has them as two more
 unknowns, c' = -s q' and s' = c q', and calls no function at all; the others turn the pair that the step began
 with by two short polynomials. Carried is faster and errs a little differently, so the report has both.
-
-Examples
---------
->>> from lag_envs.scenes import PivotedBar
->>> bar = with_flow(PivotedBar(track=None), comparison("RK4", PivotedBar(track=None).flow))
->>> bar.simulate([2.0, 0.0], [0.0] * 4, 0.005)[-1].round(6).tolist()
-[1.995538, -0.446313]
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import compile_function, compile_traced
 from lag_envs.stepping.flows import Flow, pendulum_flow
 from lag_envs.stepping.tracing import polynomial, sum_of_products
-
-S = TypeVar("S", bound=Scene)
 
 #: π/2 in three parts, of which the first two have zeros to spare (Cody and Waite).
 _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
@@ -151,7 +140,7 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
             s = variables[3] * c + variables[2] * s
         return slope.turning(q, 0.0, s, plane)
 
-    return Problem(rolling, lambda q, t: plane.rolling * plane.rate * plane.rate, coefficients.drag, True)
+    return Problem(rolling, lambda q, t: plane.carry * plane.rate * plane.rate, coefficients.drag, True)
 
 
 # --- methods: (q, v) after one step of length h ---
@@ -396,15 +385,3 @@ def _always(flow: Flow, fast: Callable, order: int) -> Flow:
         return compile_function("flow", source, step)
 
     return flow._replace(order=order, fast=fast, within=lambda *args: True, compile=compile)
-
-
-def with_flow(scene: S, flow: Flow) -> S:
-    """Return the scene stepped by another flow."""
-    kind = _variant(type(scene), flow)
-    values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
-    return kind(**values)
-
-
-@cache
-def _variant(kind: type[S], flow: Flow) -> type[S]:
-    return type(kind.__name__, (kind,), {"flow": flow})

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.report.cases import Case
-from lag_envs.report.steppers import with_flow
+from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.flows import Flow
@@ -33,8 +33,10 @@ class Kernels:
     ----------
     scene : Scene
         Which of its constants are zero decides the code; problems on the same kind of scene share it.
-    flow : Flow
-        Ours or a comparison stepper.
+    flow : Flow, optional
+        Ours for steps of `dt`, or a comparison stepper.
+    dt : float
+        Control step [s].
 
     Examples
     --------
@@ -43,24 +45,24 @@ class Kernels:
     >>> bar = PivotedBar(track=None)
     >>> case = Case(bar, (3.0, 0.0), 1.0)
     >>> end = bar.simulate(case.state, [case.control] * 50, 0.02)[-1]
-    >>> Kernels(bar, bar.flow).end(case, 0.02, 50).tolist() == end.tolist()
+    >>> Kernels(bar).end(case, 0.02, 50).tolist() == end.tolist()
     True
     """
 
-    def __init__(self, scene: Scene, flow: Flow) -> None:
-        self.scene = with_flow(scene, flow)
-        self._code = self.scene.stepper()
+    def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
+        self.stepped = Stepped(scene, flow, dt)
+        self._code = self.stepped.stepper()
         self._names = [name.removeprefix("k_") for name in self._code.constants]
         #: Whether every step is an ordinary one, as those of the comparison steppers.
         self.plain = any(line == "within = True" for line in self._code.fast)
 
     def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
         """Return what the compiled functions take behind states and controls."""
-        constants = scene.constants()
+        constants = scene._constants()
         present = [name for name, value in constants.items() if value != 0.0]
         if present != self._names:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")
-        return (dt, self.scene.largest_x(dt), *(float(constants[name]) for name in present))
+        return (dt, self.stepped.largest_x(dt), *(float(constants[name]) for name in present))
 
     @cached_property
     def simulate(self) -> Callable:
@@ -71,7 +73,9 @@ class Kernels:
         """Return the state after some steps with the control held; NaN where a step was refused."""
         trajectory = np.empty((steps + 1, len(case.state)))
         trajectory[0] = case.state
-        refused = self.simulate(trajectory, np.full(steps, case.control), *self.arguments(case.scene, dt))
+        refused = self.simulate(
+            trajectory, np.full((steps, 1), case.control), *self.arguments(case.scene, dt)
+        )
         return np.full(len(case.state), np.nan) if refused else trajectory[-1]
 
     @cached_property
@@ -137,15 +141,15 @@ class Kernels:
         """Return the rows of a batch; the last block is filled up with its first state."""
         count = -(-len(cases) // BLOCK)
         padded = [*cases, *[cases[0]] * (count * BLOCK - len(cases))]
-        y = self.scene.lift(np.array([case.state for case in padded]))
+        y = self.stepped.lift(np.array([case.state for case in padded]))
         columns = np.array([*y, [case.control for case in padded], np.ones(len(padded))])
         return columns.reshape(len(columns), count, BLOCK).transpose(1, 0, 2).ravel()
 
     def states(self, rows: Array, count: int) -> Array:
         """Return the states of a batch, one per line."""
-        width = self.scene.width + 2
+        width = self.stepped.width + 2
         columns = rows.reshape(-1, width, BLOCK).transpose(0, 2, 1).reshape(-1, width)
-        return columns[:count, : len(self.scene.state_names)]
+        return columns[:count, : len(self.stepped.form.state_names)]
 
 
 class Sample(NamedTuple):
@@ -180,7 +184,8 @@ def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: flo
     several, arguments = kernels.several, kernels.arguments(cases[0].scene, dt)
     paths = np.full((len(cases), controls.shape[1] + 1, len(cases[0].state)), np.nan)
     paths[:, 0] = [case.state for case in cases]
-    return Sample(lambda: several(paths, controls, *arguments), controls.size, ends=lambda: paths[:, -1])
+    given = controls[..., None]
+    return Sample(lambda: several(paths, given, *arguments), controls.size, ends=lambda: paths[:, -1])
 
 
 def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> Sample:

@@ -22,6 +22,7 @@ from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.rivals import Compiled, Ours, Rival
 from lag_envs.report.runner import Job, Row, describe
+from lag_envs.report.stepped import Stepped
 from lag_envs.report.steppers import METHODS, comparison, plain_series
 from lag_envs.report.timing import Kernels, Sample, interleaved
 from lag_envs.report.verdicts import MODES, ROUNDING, content
@@ -123,9 +124,9 @@ def problems(variant: str, horizon: str, cases: Sequence[Case]) -> list[Case]:
 
 
 def _undamped(scene: Scene) -> Scene:
-    if scene.flow.coefficients is not pendulum.Drive:
+    if Stepped(scene).flow.coefficients is not pendulum.Drive:
         return scene
-    return dataclasses.replace(scene, damping=0.0)  # type: ignore[call-arg]
+    return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
 
 
 class Truth(NamedTuple):
@@ -353,12 +354,12 @@ class Series(NamedTuple):
 
 def series(scene: Scene, quick: bool = False) -> list[Series]:
     """Return all methods that have an order: the series of ours at several, and the usual steppers."""
-    found = []
-    if scene.flow.coefficients is pendulum.Drive:
+    found, flow = [], Stepped(scene).flow
+    if flow.coefficients is pendulum.Drive:
         found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
     forms = {"": False, Compiled.CARRIED: True}
     found += [
-        Series(name + form, comparison(name, scene.flow, carried), method.order)
+        Series(name + form, comparison(name, flow, carried), method.order)
         for name, method in METHODS.items()
         for form, carried in forms.items()
         if not quick or name + form in QUICK_METHODS

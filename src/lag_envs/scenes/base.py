@@ -145,7 +145,7 @@ def complete(cls: type) -> None:
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(parameter,))
+@dataclass_transform(frozen_default=True, kw_only_default=True)
 class Scene(metaclass=SceneType):
     """A mechanical scene: parameters and energies, from which all else is derived. Immutable.
 
@@ -702,7 +702,7 @@ class Scene(metaclass=SceneType):
         start, dt = self._check_state(state), check_step(dt)
         held = self._check_controls(control, 1).reshape(-1)
         if self._form:
-            return self._form.step_bound(start, held, dt, self._constants())
+            return self._form.step_bound(start, list(held), dt, self._constants())
         code, constants = self._code(dt), self._constants()
         numbers = [constants[name.removeprefix("k_")] for name in code.constants]
         order = self._order(dt)
@@ -767,8 +767,8 @@ class Scene(metaclass=SceneType):
         error = StepRefused(
             f"{where} was refused: from ({start}) with "
             f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s it could not be "
-            "taken within the largest number of substeps, or has no finite result; take a smaller dt or milder "
-            "parameters"
+            "taken within the largest number of substeps, or has no finite result; take a smaller dt or "
+            "milder parameters"
         )
         error.trajectory = None if trajectory is None else trajectory.copy()
         return error

@@ -116,8 +116,8 @@ class PivotedBar(Scene):
 
     def outline(self, s: float, theta: float) -> list[Point]:
         """Return the corners of the bar [m]."""
-        (bar,) = shapes.placed([x for x in self.bodies()["bar"] if isinstance(x, Polygon)], (s, 0.0, theta))
-        return bar.points
+        placed = shapes.placed(self.bodies()["bar"], (s, 0.0, theta))
+        return next(list(shape.points) for shape in placed if isinstance(shape, Polygon))
 
     @property
     def reach(self) -> float:

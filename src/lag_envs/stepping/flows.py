@@ -2,8 +2,8 @@
 
 A scene's normal form (`lag_envs.stepping.normal_forms`) says how its state and held controls become the
 flow's variables and coefficients. From that, this module makes the scalar ``advance`` that a single
-environment and `Scene.simulate` call, and the lines of the vectorised step. Both call the same recorded blocks with the same roundings, which is
-why a batch and a single environment agree bit for bit.
+environment and `Scene.simulate` call, and the lines of the vectorised step. Both call the same recorded
+blocks with the same roundings, which is why a batch and a single environment agree bit for bit.
 """
 
 from __future__ import annotations

@@ -155,9 +155,7 @@ class NormalForm:
 
     def pack(self, moved: Sequence, y: Sequence, u: Sequence, dt: Any, k: Any) -> list:
         """Return the lifted state at the step's end, from the moved variables."""
-        given = dict(zip(self.state_names, y, strict=False)) | dict(
-            zip(self.layout.controls, u, strict=True)
-        )
+        given = dict(zip(self.state_names, y, strict=False)) | dict(zip(self.layout.controls, u, strict=True))
         after = []
         for entry in self.layout.state:
             by = next((p for p in self.layout.prescribed if p.name == entry.coordinate), None)
@@ -316,6 +314,12 @@ def _negative(part: _Parts) -> _Parts:
     return {text: (held, -constant) for text, (held, constant) in part.items()}
 
 
+def _unheld(part: _Parts) -> _Parts:
+    """Return the one constant of a coefficient that is multiplied by what is held elsewhere."""
+    constants = [constant for _, constant in part.values()]
+    return {Expr.of(1).text: (Expr.of(1), constants[0])} if constants else {}
+
+
 def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
     """Return the turning slope's form, where the rate of one coordinate is held."""
     (rate, *others), one = m.layout.at("rate"), Expr.of(1).text
@@ -329,7 +333,7 @@ def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
     ):
         return None
     terms = {
-        "carry": {one: (Expr.of(1), constant) for _, constant in parts.get("carry", {}).values()},
+        "carry": _unheld(parts.get("carry", {})),
         "weight": parts.get("weight", {}),
         "drag": _negative(parts.get("gamma", {})),
     }
@@ -344,7 +348,7 @@ def _form(
     names = {expr.text: name for name, expr in expressions.items()}
     terms = {}
     for coefficient, part in parts.items():
-        found = []
+        found: list[Term] = []
         for held, constant in part.values():
             if constant.text not in names:
                 name = coefficient if held.number == 1.0 else f"{coefficient}_{len(found)}"

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes import picture
-from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.base import Scene, complete
-from lag_envs.scenes.checks import check_number, real_array
+from lag_envs.scenes.checks import StepRefused, check_number, real_array
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
@@ -234,6 +233,17 @@ class Task:
         return [self.formulas.starts[name][0] for name in self.scene.state_names]
 
     @property
+    def half_widths(self) -> list[float]:
+        """Half widths of the box from which the state starts."""
+        return [self.formulas.starts[name][1] for name in self.scene.state_names]
+
+    @property
+    def limit_control(self) -> Any:
+        """Largest size of the control; an array where there are several."""
+        largest = [max(abs(a.low), abs(a.high)) for a in self.formulas.acting]
+        return largest[0] if len(largest) == 1 else np.array(largest)
+
+    @property
     def rest_action(self) -> Any:
         """The action without control, or what is nearest to it; with it a person's hands are off."""
         return self.formulas.rest_action
@@ -285,9 +295,10 @@ class Task:
         return *scene._structure[1:3], scene.mechanics.zeros, order, self.fixed_target is None
 
     @property
-    def target_range(self) -> tuple[float, ...] | None:
-        """Half widths of the random targets; None for a task without any."""
-        return tuple(t.half for t in self.formulas.target_boxes) or None
+    def target_range(self) -> Any:
+        """Half width of the random target, a tuple where there are several; None for a task without any."""
+        half = tuple(t.half for t in self.formulas.target_boxes)
+        return half[0] if len(half) == 1 else half or None
 
     def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
         """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
@@ -525,6 +536,13 @@ class TaskFormulas:
         with formula(self._task, name):
             return getattr(self._self(k), name)(*arguments)
 
+    def action(self, control: Any) -> Any:
+        """Return the action, unclipped, that asks for a control; for tasks with one."""
+        (acting,) = self.acting
+        if acting.low == -acting.high:
+            return control / acting.high
+        return 2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0
+
     def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the controls that are applied."""
         wanted = dict.fromkeys(self._controls, 0.0)
@@ -553,7 +571,11 @@ class TaskFormulas:
     def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
         """Return the reward, and whether the episode is over."""
         ended = self._call("terminated", k, self._state(z), self._targets(g), self._known(xp, z))
-        return self._reward("reward", xp, y, z, u, g, k), ended
+        return self.reward(xp, y, z, u, g, k), ended
+
+    def reward(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
+        """Return the reward of a step that goes on."""
+        return self._reward("reward", xp, y, z, u, g, k)
 
     def last(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> Any:
         """Return the reward of a step that terminates."""
@@ -634,7 +656,7 @@ class TaskFormulas:
     def rest_action(self) -> Any:
         """The action whose controls are nearest to 0."""
         if self.choices:
-            found: Any = [min(range(len(a.values)), key=lambda i, a=a: abs(a.values[i])) for a in self.acting]
+            found: Any = [int(np.argmin(np.abs(a.values))) for a in self.acting]
         else:
             found = [min(1.0, max(-1.0, -(a.high + a.low) / (a.high - a.low))) for a in self.acting]
         return found[0] if len(found) == 1 else found

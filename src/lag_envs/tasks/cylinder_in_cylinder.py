@@ -17,7 +17,7 @@ from lag_envs.tasks.base import FASTEST_START, Task
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
 
-    scene = CylinderInCylinder
+    scene: Any = CylinderInCylinder
     interval, steps = 0.05, 200
     start = {"theta": 0.1, "theta_dot": 0.2}  # near the bottom, the shell at rest
     largest: float  # acceleration of the shell [rad/s²]
@@ -41,7 +41,9 @@ class _Shell(Task):
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
         """Return U·a, cut back so that the shell's rate stays within its limit at the step's end."""
-        low, high = ((rate - before.psi_dot) * (1.0 / dt) for rate in (-self.fastest_shell, self.fastest_shell))
+        low, high = (
+            (rate - before.psi_dot) * (1.0 / dt) for rate in (-self.fastest_shell, self.fastest_shell)
+        )
         return clip(wanted.psi_ddot, low, high, xp)
 
     @property
@@ -345,7 +347,7 @@ class Pump(_Shell):
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
         """Return E = θ'²/2 + ω₀² (1 - cosθ), and E* of the amplitude 0.9 rad, per inertia [1/s²]."""
-        weight = self.coefficients(state, [0.0], xp).alpha
+        weight = self.coefficients([0.0] * 5, [0.0], xp).alpha
         energy = 0.5 * (state[1] * state[1]) + weight * (1.0 - xp.cos(state[0]))
         return energy, weight * (1.0 - math.cos(self.amplitude))
 
@@ -481,7 +483,7 @@ class Damping(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene = CylinderInCylinder
+    scene: Any = CylinderInCylinder
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
     usable = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
     action = {"drag": (0.0, 2.4)}
@@ -493,19 +495,19 @@ class Damping(Task):
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
 
-    def _weight(self, xp: Any = np) -> Any:
+    def weight(self, xp: Any = np) -> Any:
         """Return ω₀², the square of small swings' angular frequency [1/s²]."""
         return self.coefficients([0.0] * 4, [0.0], xp).alpha
 
     @property
     def fastest(self) -> float:
         """Speed of a fall [rad/s]."""
-        return 2.0 * math.sqrt(self._weight())
+        return 2.0 * math.sqrt(self.weight())
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-√(θ² + θ'²/ω₀²)/0.1)."""
         theta, rate = after.theta, after.theta_dot
-        return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self._weight(xp))))
+        return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self.weight(xp))))
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the contact is lost: aθ'² + g cosθ < 0."""
@@ -524,7 +526,7 @@ class Damping(Task):
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds: θ' grows by at most ω₀² a second and 3 rad/s a kick."""
-        swing = FASTEST_START + self._weight() * self.duration + 3.0 * self.limit
+        swing = FASTEST_START + self.weight() * self.duration + 3.0 * self.limit
         return {"theta": 1e3 + swing * self.duration, "theta_dot": swing}
 
     def shapes(self, now: Moment) -> list[Shape]:

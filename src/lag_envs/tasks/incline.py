@@ -125,7 +125,7 @@ class Tilt(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene = Incline
+    scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
     interval, steps = 0.05, 200
     target = {"target": ("m", 0.3)}
@@ -324,7 +324,7 @@ class Brake(Task):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene = Incline
+    scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
     usable = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
     action = {"drag": (0.0, 6.0)}

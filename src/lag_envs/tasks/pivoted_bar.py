@@ -17,7 +17,7 @@ from lag_envs.tasks.base import FASTEST_START, Task
 class _Bar(Task):
     """What the tasks with the bar have in common."""
 
-    scene: PivotedBar
+    scene: Any
     largest: float  # acceleration of the support [m/s²]
 
     @property
@@ -157,7 +157,7 @@ class SwingUp(_Bar):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene = PivotedBar
+    scene: Any = PivotedBar
     defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
     usable = {"track": (1e-3, 1e9)}
     largest = 5.0
@@ -209,7 +209,9 @@ class SwingUp(_Bar):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return (s/S, s'/2,) cosθ, sinθ, θ'/8."""
-        support = {"s/S": after.s * (1.0 / self.length), "s_dot/2": 0.5 * after.s_dot} if self.has_track else {}
+        support = (
+            {"s/S": after.s * (1.0 / self.length), "s_dot/2": 0.5 * after.s_dot} if self.has_track else {}
+        )
         bar = {"cos(theta)": xp.cos(after.theta), "sin(theta)": xp.sin(after.theta)}
         return support | bar | {"theta_dot/8": 0.125 * after.theta_dot}
 
@@ -356,7 +358,7 @@ class Balance(_Bar):
     - v0: first version (lag_envs 0.1.0).
     """
 
-    scene = PivotedBar
+    scene: Any = PivotedBar
     defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
     usable = {"track": (1e-3, 1e9)}
     largest = 3.0

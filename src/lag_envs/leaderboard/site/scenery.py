@@ -40,9 +40,8 @@ def describe(env_id: str) -> dict[str, Any]:
         return {}
     place, fixed = TASKS[env_id]
     task = load_task(place)(**fixed)
-    name, _, unit = task.scene.control_unit.partition(" [")
-    # A brake's control has no sign: its action -1 is off.
-    low = 0.0 if getattr(task.scene, "control", None) == "damping" else -task.limit_control
+    (acting,) = task.formulas.acting
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     return {
         "title": (inspect.getdoc(type(task)) or env_id).partition("\n")[0],
         "scene": type(task.scene).__name__,
@@ -52,10 +51,10 @@ def describe(env_id: str) -> dict[str, Any]:
         "start": [float(x) for x in task.centre],
         "dt": task.dt,
         "control": {
-            "name": name,
-            "unit": unit.rstrip("]"),
-            "low": low,
-            "high": task.limit_control,
+            "name": acting.control,
+            "unit": units[acting.control],
+            "low": acting.low,
+            "high": acting.high,
             "limit": task.limit_control,
         },
     }

@@ -1,0 +1,89 @@
+"""A scene in its normal form together with a flow that steps it: ours, or one to compare it with."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping import pendulum
+from lag_envs.stepping.flows import Flow, Stepper
+
+
+class Stepped:
+    """A scene with one control, and a flow.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene with a normal form.
+    flow : Flow, optional
+        What steps it; by default our own flow for control steps of `dt`.
+    dt : float
+        Control step [s].
+
+    Examples
+    --------
+    >>> from lag_envs.report.steppers import comparison
+    >>> from lag_envs.scenes import PivotedBar
+    >>> bar = PivotedBar(track=None)
+    >>> rk4 = Stepped(bar, comparison("RK4", Stepped(bar).flow))
+    >>> rk4.simulate([2.0, 0.0], [0.0] * 4, 0.005)[-1].round(6).tolist()
+    [1.995538, -0.446313]
+    """
+
+    def __init__(self, scene: Scene, flow: Flow | None = None, dt: float = 0.02) -> None:
+        form = scene._form
+        if form is None:
+            raise ValueError(f"{type(scene).__name__} has no normal form")
+        self.scene, self.form = scene, form
+        self.flow: Flow = form.flow(dt) if flow is None else flow
+        self.angle, self.width = form.angle, form.width
+
+    def constants(self) -> dict[str, float]:
+        """Return the numbers that a step takes."""
+        return self.scene._constants()
+
+    def numbers(self) -> SimpleNamespace:
+        """Return them by attribute."""
+        return SimpleNamespace(**self.constants())
+
+    def lift(self, state: ArrayLike) -> tuple:
+        """Return the lifted state."""
+        return self.form.lift(state)
+
+    def drive(self, y: Any, u: Any, k: Any, xp: Any) -> Any:
+        """Return the flow's coefficients."""
+        return self.form.drive(y, [u], k, xp)
+
+    def unpack(self, y: Any, u: Any, k: Any) -> list:
+        """Return the flow's variables."""
+        return self.form.unpack(y, [u], k)
+
+    def pack(self, moved: Any, y: Any, u: Any, dt: Any, k: Any) -> list:
+        """Return the lifted state at the end."""
+        return self.form.pack(moved, y, [u], dt, k)
+
+    def largest_x(self, dt: float) -> float:
+        """Return the bound's x up to which one series is certified."""
+        return pendulum.largest_x(dt, self.flow.order or pendulum.ORDER, self.flow.tolerance)
+
+    def stepper(self) -> Stepper:
+        """Return the code of a step; constants that are zero leave none."""
+        absent = frozenset(name for name, value in self.constants().items() if value == 0.0)
+        return Stepper(self.form, self.flow, absent)
+
+    def present(self) -> list[float]:
+        """Return the constants that the code takes."""
+        return [value for value in self.constants().values() if value != 0.0]
+
+    def simulate(self, state: ArrayLike, controls: ArrayLike, dt: float) -> NDArray[np.float64]:
+        """Step as `Scene.simulate` does; rows after a refused step are NaN."""
+        given = np.asarray(controls, np.float64)
+        trajectory = np.full((len(given) + 1, self.width - (2 if self.angle is not None else 0)), np.nan)
+        trajectory[0] = state
+        self.stepper().compile_simulate()(trajectory, given[:, None], dt, self.largest_x(dt), *self.present())
+        return trajectory
