@@ -18,7 +18,6 @@ from lag_envs.controllers import (
     make_controller,
 )  # fmt: skip
 from lag_envs.controllers.basic import Reader
-from lag_envs.controllers.linear import discretise, equations, linearise
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.scores import KNOWN_RETURNS, score
@@ -117,13 +116,14 @@ def observations():
     def make(env_id, n):
         rng = np.random.default_rng(0)
         task = make_task(env_id)
-        centre, start = np.array(task.centre), np.array(task.start)
+        centre, start = np.array(task.centre), np.array(task.half_widths)
         states = centre + start * rng.uniform(-1.0, 1.0, (n, len(centre)))
         if env_id in (BAR, FREE):
             states[n // 2 :, -2:] = [3.0, 0.1]  # where the LQR takes over
         goal = 0.0 if task.target_range is None else task.target_range * rng.uniform(-1.0, 1.0, n)
         read = Reader(task)
-        seen = task.observe(task.scene.lift(states), goal, SimpleNamespace(**task.constants()))
+        k = SimpleNamespace(**task.formulas.constants())
+        seen = task.formulas.observe(np, task.scene._form.lift(states), [goal] * task.formulas.targets, k)
         values = np.stack(np.broadcast_arrays(*seen), axis=-1).astype(np.float32)
         np.testing.assert_allclose(read(values)[0], states, atol=1e-6)
         np.testing.assert_allclose(read(values)[1], goal, atol=1e-6)
@@ -195,7 +195,7 @@ def test_linearisation_is_the_slope_of_the_model(env_id):
     task = make_task(env_id)
     rest, n, h = np.array(REST[env_id]), len(REST[env_id]), 1e-4
     control = 0.5 * task.limit_control if env_id == DAMPING else 0.0
-    a, b = discretise(*linearise(task.scene, rest, control), task.dt)
+    a, b = task.scene.jacobian(rest, control, task.dt)
     model, goal = Model(task), None if task.target_range is None else 0.0
     moves = h * np.vstack([np.eye(n + 1), -np.eye(n + 1)])
     ends = model(rest + moves[:, :n], moves[:, n], goal)[0]
@@ -203,13 +203,6 @@ def test_linearisation_is_the_slope_of_the_model(env_id):
     np.testing.assert_allclose(slopes[:, :n], a, rtol=1e-5, atol=1e-6)
     per_action = task.limit_control * (0.5 if env_id == DAMPING else 1.0)
     np.testing.assert_allclose(slopes[:, n], per_action * b[:, 0], rtol=1e-5, atol=1e-6)
-
-
-def test_equations_of_every_control():
-    for env_id, options in [(e, {}) for e in TASKS] + [(INCLINE, {"control": "tilt"})]:
-        eqs = equations(make_task(env_id, **options).scene)
-        assert len(eqs.rates) == len(eqs.states)
-        assert all(rate.free_symbols <= {*eqs.states, eqs.control} for rate in eqs.rates)
 
 
 # --- mistakes ---

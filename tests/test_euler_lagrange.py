@@ -207,3 +207,75 @@ def test_energy_balance_of_a_step(case):
     balance = scene.energy_balance(state, held, 0.02)
     size = max(1.0, *(abs(balance[name]) for name in ("change", "work", "loss")))
     assert abs(balance["residual"]) < 1e-12 * size
+
+
+FORMS = {
+    "PivotedBar": "Drive",
+    "Incline-damping": "Pull",
+    "Incline-tilt": "Pull",
+    "Incline-tilt_rate": "Turn",
+    "CylinderInCylinder-damping": "Drive",
+    "CylinderInCylinder-tilt": "Drive",
+    "Chain-1": "Drive",
+}
+
+
+@pytest.mark.parametrize("case", PACKAGE, ids=IDS[: len(PACKAGE)])
+def test_normal_form_is_the_derived_equation(case):
+    """What the exact flows step is Lagrange's equation, as is what the general series steps."""
+    scene = complete(case)
+    form, mechanics = scene._form, scene.mechanics
+    key = "-".join([type(scene).__name__, *(str(v) for v in case[1].values() if v is not None)])
+    assert (form and form.kind.__name__) == FORMS.get(key)
+    if form is None:
+        return
+    oracle, generator = _oracle(scene), np.random.default_rng(6)
+    free = mechanics.free[0]
+    with mpmath.workdps(40):
+        for _ in range(5):
+            point = oracle.point(scene, generator)
+            values = symbols(point)
+            inertia, *numbers = evaluate([form.inertia, *form.expressions.values()], values, mpmath)
+            names = dict(zip(form.expressions, (x / inertia for x in numbers), strict=True))
+            k = type("Constants", (), names)
+            rates = {p.name: point.u[p.control] for p in form.layout.at("rate")}
+            y = []
+            for entry in form.layout.state:
+                if entry.kind == "momentum":
+                    y.append(point.v[free] + k.shift * next(iter(rates.values())))
+                else:
+                    y.append((point.q if entry.kind == "place" else point.v)[entry.coordinate])
+            if form.angle is not None:
+                y += [mpmath.cos(y[form.angle]), mpmath.sin(y[form.angle])]
+            u = [point.u[name] for name in form.layout.controls]
+            c = form.drive(y, u, k, mpmath)
+            q, v, *pair = form.unpack(y, u, k)
+            assert abs(v - point.v[free]) < 1e-30 and q == point.q[free]
+            if form.kind.__name__ == "Drive":
+                found = c.delta - c.alpha * pair[1] - c.beta * pair[0] - c.gamma * v
+            elif form.kind.__name__ == "Turn":
+                found = c.weight * pair[1] + c.carry * c.rate**2 * q - c.drag * v
+            else:
+                found = c.pull - c.drag * v
+            point.a |= {free: found}
+            residual, size = oracle.residual(free, point)
+            assert abs(residual) < 1e-25 * size
+
+
+@pytest.mark.parametrize("case", PACKAGE, ids=IDS[: len(PACKAGE)])
+def test_exact_flow_and_general_series_agree(case):
+    """Each is the other's oracle, over steps in which the controls change."""
+    scene = complete(case)
+    if scene._form is None:
+        return
+    generator = np.random.default_rng(7)
+    code, stepper = scene._stepper.code(), scene._stepper
+    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
+    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    for dt in (0.005, 0.02, 0.05):
+        state = generator.uniform(-2.0, 2.0, len(scene.state_names))
+        given = generator.uniform(0.0, 2.0, (40, len(scene.control_names)))
+        ours = scene.simulate(state, given, dt)
+        theirs = ours.copy()
+        assert code.simulation(theirs, given, dt, 20.0, *numbers) == 0
+        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-11 * np.abs(ours).max())

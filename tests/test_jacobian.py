@@ -7,7 +7,7 @@ from contract_scenes import ChargedParticle, RotatingHoop
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
-from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum, StepRefused, TwoLinkArm
+from lag_envs.scenes import Acrobot, CartPole, Chain, CylinderInCylinder, RotaryPendulum, StepRefused, TwoLinkArm
 from lag_envs.scenes.incline import Incline
 from lag_envs.stepping.lowering import ELAPSED
 from lag_envs.stepping.series import Plain, Series
@@ -21,6 +21,7 @@ CASES = {
     "arm": (TwoLinkArm(), [0.2, 1.0, 2.0, -3.0], [0.4, -0.2], 0.02),
     "charge": (ChargedParticle(), [0.2, 1.0, 2.0, -3.0], [], 0.1),
     "hoop": (RotatingHoop(), [0.4, 1.0], [0.01], 0.05),
+    "turning shell": (CylinderInCylinder(damping=0.24), [0.3, 1.0, 4.0], [9.0], 0.05),
     "turning plane": (Incline(control="tilt_rate", damping=0.03), [0.1, 0.2, 0.05], [0.3], 0.05),
 }
 
@@ -47,7 +48,7 @@ def exact_step(scene, state, control, dt):
     return mpmath.matrix(state)
 
 
-FAST = ("cart_pole", "turning plane")
+FAST = ("cart_pole", "turning plane", "turning shell")
 
 
 @pytest.mark.parametrize(

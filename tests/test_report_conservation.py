@@ -97,7 +97,7 @@ def test_what_is_left_out_saves_operations():
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, problem in conservation.FREE.items() if problem.scene.angle is not None]
+    "name", [name for name, problem in conservation.FREE.items() if problem.scene._form.angle is not None]
 )
 def test_cosine_and_sine_stay_a_pair(name):
     """c² + s² does not grow; θ leaves the pair's angle by no more than its own roundings add up to."""

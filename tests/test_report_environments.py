@@ -12,7 +12,8 @@ from rollouts import actions
 from lag_envs import TASKS
 from lag_envs.report import environments, reference
 from lag_envs.report.runner import Result
-from lag_envs.report.steppers import comparison, with_flow
+from lag_envs.report.stepped import Stepped
+from lag_envs.report.steppers import comparison
 
 #: Limit on the error of one second of any environment, relative to the state's size; measured 5.3e-16.
 ONE_SECOND = 2e-15
@@ -223,7 +224,7 @@ def test_a_worse_stepper_breaks_the_claims(rows):
     env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
     env.reset(seed=0)
     episode = environments.play(env, environments.random_actions(env, 0))
-    scene = with_flow(env.scene, comparison("RK4", env.scene.flow))
+    scene = Stepped(env.scene, comparison("RK4", Stepped(env.scene).flow))
     worse = episode._replace(states=scene.simulate(episode.states[0], episode.controls, env.task.dt))
     row = environments.against_exact(env.task, worse, seed=0) | {"case": "RK4", "seed": 0}
     first, second, *_ = environments.content([*rows, row], []).claims

@@ -201,11 +201,12 @@ def test_float32_of_ordinary_steps():
 
 def test_formulas_on_arrays_are_the_compiled_ones():
     """The comparison steppers, run as NumPy formulas, give what they give as compiled flows."""
-    from lag_envs.report.steppers import comparison, with_flow
+    from lag_envs.report.stepped import Stepped
+    from lag_envs.report.steppers import comparison
 
     case = Case(PivotedBar(track=None, damping=0.01), (2.0, 3.0), 3.0)
-    flow = comparison("RK4", case.scene.flow)
-    compiled = with_flow(case.scene, flow).simulate(case.state, [case.control] * 16, 0.1 / 16)[-1]
+    flow = comparison("RK4", Stepped(case.scene).flow)
+    compiled = Stepped(case.scene, flow).simulate(case.state, [case.control] * 16, 0.1 / 16)[-1]
     (formula,) = stability.march(flow.fast, [case], 0.1, np.array([16]), np.float64)
     assert formula == pytest.approx(compiled.tolist(), rel=1e-13)
 

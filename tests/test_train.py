@@ -292,6 +292,8 @@ def test_help_is_quick():
 
 
 @pytest.mark.slow
+# Other tests load JAX, which warns of any fork in this process; Ray's forks only start programs.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_on_a_local_ray_cluster(command, config, tmp_path):
     arguments = (ENV, "--seeds", "2", "--config", str(config))
     status, output = command(*arguments, "--ray", "local")

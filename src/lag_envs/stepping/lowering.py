@@ -216,10 +216,10 @@ class Lowering:
     def _make(self, atom: Atom) -> int:
         if atom.argument is None:
             if atom.name in self._prescribed:
-                weights = [self.scalar(e) for e in self._prescribed[atom.name]]
+                terms = list(self._prescribed[atom.name])
                 if atom.kind == "velocity":
-                    weights = [k * w for k, w in enumerate(weights)][1:]
-                return self._node("polynomial", (), weights)
+                    terms = [e * k for k, e in enumerate(terms)][1:]
+                return self._node("polynomial", (), [self.scalar(e) for e in terms])
             return self._node(atom.kind, index=self._free.index(atom.name))
         if atom.function == "sum":
             return self.series(atom.argument)

@@ -205,7 +205,7 @@ class NormalForm:
         drive = pendulum.Drive(*map(float, self.coefficients(state, controls, constants)))
         free = self.layout.free[0]
         moving = [self._index(free, kind) for kind in ("place", "velocity")]
-        found = pendulum.truncation_bound(np.asarray(state)[moving[1]], drive, dt, self.order(dt))
+        found = pendulum.truncation_bound(float(np.asarray(state)[moving[1]]), drive, dt, self.order(dt))
         for i, bound in zip(moving, (found.theta, found.theta_dot), strict=True):
             bounds[self.state_names[i]] = bound
         return StepBound(found.substeps, found.order, bounds, "proved before the step")

@@ -9,8 +9,8 @@ Fixed slope
 Turning slope
     ``x'' = weight sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor
     series has the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large,
-    short steps are taken one after the other; where that is for the drag, the matrix of a short step is squared
-    until it spans the whole one ("scaling and squaring").
+    short steps are taken one after the other; where that is for the drag, the matrix of a short step is
+    squared until it spans the whole one ("scaling and squaring").
 
 References
 ----------
