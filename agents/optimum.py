@@ -560,6 +560,12 @@ def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
     return float(values[-1] + steps[-1] / (2.0**order - 1.0)), float(abs(steps[-1])), order
 
 
+def parameters(task: Task) -> dict[str, float]:
+    """Return the numbers of a task's scene, its step [s] and the steps of an episode."""
+    scene = task.scene
+    return {name: getattr(scene, name) for name in scene._numbers()} | {"dt": task.dt, "limit": task.limit}
+
+
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
     """Solve what an environment needs, and return its numbers."""
     source, entries = RELAXATIONS.get(env_id, (env_id, None))
@@ -595,7 +601,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "solved": source + (" with " + ", ".join(f"{k}={v:g}" for k, v in problem.options.items())
                             if problem.options else ""),
         "how": explanation(env_id, source, problem, grids),
-        "parameters": problem.task().formulas.constants(),
+        "parameters": parameters(problem.task()),
         "axes": [
             {"label": a.label, "low": a.low, "high": a.high, "cells_at_level_1": a.cells,
              "even_within": a.scale, "centre": a.centre, "periodic": a.periodic}

@@ -3,39 +3,28 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-import sympy
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS, actions
 from scipy.integrate import solve_ivp
-from toy_pendulum import Pendulum
+from toy_pendulum import Pendulum, Swing
 
-from lag_envs import lagrange
-from lag_envs.lagrange import coordinates, symbolic
+from lag_envs import register
 
 ID = "ToySwing-v0"
 
 
 @pytest.fixture(autouse=True)
 def registered():
-    gym.register(
-        ID,
-        entry_point="lag_envs.envs.single:LagrangianEnv",
-        vector_entry_point="lag_envs.envs.vector:LagrangianVectorEnv",
-        kwargs={"task": "toy_pendulum:Swing"},
-    )
+    register(Swing)
     yield
     del gym.registry[ID]
 
 
-def test_drive_is_euler_lagrange():
-    scene, u = Pendulum(), sympy.Symbol("u")
-    twin, q, v = symbolic(scene), *coordinates(scene)
-    k = sympy.Dict(twin.constants())
-    drive = twin.drive((), u, type("K", (), {str(a): b for a, b in k.items()}), sympy)
-    stepped = drive.delta - drive.alpha * sympy.sin(q.theta) - drive.gamma * v.theta
-    # The torque is the generalised force of theta.
-    equation = lagrange.euler_lagrange(scene, "theta") - u
-    assert sympy.simplify(sympy.nsimplify(equation.subs(v.theta.diff(lagrange.t), stepped))) == 0
+def test_it_is_recognised_as_a_driven_pendulum():
+    scene = Pendulum(mass=0.7, length=0.4, damping=0.05)
+    drive = scene._form.coefficients([0.3, 1.0], [2.0], scene._constants())
+    per_torque = 1.0 / (0.7 * 0.4**2)
+    assert drive == pytest.approx((9.81 / 0.4, 0.0, 0.05 * per_torque, 2.0 * per_torque, 0.0), rel=1e-15)
 
 
 def test_simulate_against_scipy():

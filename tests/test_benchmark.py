@@ -59,7 +59,7 @@ def test_list_has_a_line_for_each_environment(capsys):
 def test_list_shows_the_control_in_its_unit(capsys):
     out = call(capsys, "list")[1]
     (line,) = [line for line in out.splitlines() if line.startswith("PivotedBar-v0")]
-    assert "  s'' -5 to 5 m/s²  0.02 s  500  10 s" in re.sub(" {2,}", "  ", line)
+    assert "  s_ddot -5 to 5 m/s²  0.02 s  500  10 s" in re.sub(" {2,}", "  ", line)
 
 
 @pytest.mark.parametrize("id", TASKS)

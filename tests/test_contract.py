@@ -395,7 +395,8 @@ def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same(
     """In a denominator or a function it is put in at once; elsewhere code leaves out what it multiplies."""
     damped = RotaryPendulum(damping=0.1)
     assert damped.mechanics.key == RotaryPendulum(damping=0.2, mass=3.0).mechanics.key
-    assert RotaryPendulum()._code() is not damped._code() is RotaryPendulum(damping=0.2, mass=3.0)._code()
+    assert RotaryPendulum()._code(0.02) is not damped._code(0.02)
+    assert damped._code(0.02) is RotaryPendulum(damping=0.2, mass=3.0)._code(0.02)
 
     class Soft(cart(False)):
         width: float = parameter(0.5, "m", least=0.0)

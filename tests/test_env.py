@@ -717,7 +717,7 @@ def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
     monkeypatch.setattr(Program, "_record", count)
     monkeypatch.setattr(program, "_programs", {})
     for i in range(5):
-        make("PivotedBar-v0", mass=0.1 + 0.1 * i, dt=0.01 + 0.01 * i)
+        make("PivotedBar-v0", mass=0.1 + 0.1 * i, dt=0.01 + 0.005 * i)
         gym.make_vec("PivotedBar-v0", num_envs=3, track=0.4 + 0.1 * i)
     assert len(recorded) == 1
     others = [{"track": None}, {"track": math.inf}, {"damping": 0.0}, {"gravity": 0.0}]

@@ -7,7 +7,15 @@ from contract_scenes import ChargedParticle, RotatingHoop
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
-from lag_envs.scenes import Acrobot, CartPole, Chain, CylinderInCylinder, RotaryPendulum, StepRefused, TwoLinkArm
+from lag_envs.scenes import (
+    Acrobot,
+    CartPole,
+    Chain,
+    CylinderInCylinder,
+    RotaryPendulum,
+    StepRefused,
+    TwoLinkArm,
+)
 from lag_envs.scenes.incline import Incline
 from lag_envs.stepping.lowering import ELAPSED
 from lag_envs.stepping.series import Plain, Series

@@ -402,7 +402,7 @@ def test_committed_results_are_consistent(file):
         list(problem.grid(level, 0.0).shape) for level in problem.levels
     ]
     # The caches' names hang together with nodes, step and reward as they are now: none is out of date.
-    assert result["parameters"] == pytest.approx(problem.task().constants())
+    assert result["parameters"] == pytest.approx(optimum.parameters(problem.task()))
     assert problem.actions == result["actions"] and list(problem.targets) == result["targets"]
     if result["lower"] is not None:
         low, high = result["lower"]["interval"]
@@ -446,8 +446,10 @@ def test_known_answers_come_out():
 
 def brute_force(task, x, v):
     """Return the largest return of rolling freely and then braking fully, by trying moments of the switch."""
-    k = task.constants()
-    pull, weak, strong = k["pull"], k["drag"], k["drag"] + k["brake"] * task.limit_control
+    scene = task.scene
+    mass = scene.mass + scene.inertia / scene.radius**2
+    pull = scene.mass * scene.gravity * math.sin(scene.tilt) / mass
+    weak, strong = scene.damping / mass, (scene.damping + 6.0) / mass
 
     def later(x, v, drag, t):
         if drag == 0.0:

@@ -229,7 +229,9 @@ def test_mistakes_in_a_task(changes, message):
 
 
 def test_unknown_keyword():
-    with pytest.raises(TypeError, match="unknown keyword 'wind'; this environment takes gravity, load_mass"):
+    with pytest.raises(
+        TypeError, match="unexpected keyword argument 'wind'; this environment takes gravity, load_mass"
+    ):
         gym.make("OwnCrane-v0", wind=1.0)
 
 

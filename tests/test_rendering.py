@@ -42,7 +42,7 @@ def picture(env_id, state=None, action=0.5, **options):
 
 
 def moment(task, share=0.5, **changes):
-    state = [c + h for c, h in zip(task.centre, task.start, strict=True)]
+    state = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
     return Moment(state, share * task.limit_control, share, task.target_range and 0.1)._replace(**changes)
 
 

@@ -118,7 +118,7 @@ def test_every_constant_changes_something(id):
     """Move each constant, 1e-3 where not said otherwise: a compiled start or step comes out differently."""
     env = gym.make(id).unwrapped
     env.reset(seed=1)
-    program, rows, angle = env._program, env._rows.copy(), env.task.scene.angle
+    program, rows, angle = env._program, env._rows.copy(), env.task.scene._form.angle
     first, n = len(program.kept + program.scratch), len(program.y)
     rng = np.random.default_rng(2)
     starts = []

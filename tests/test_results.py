@@ -457,10 +457,9 @@ def test_how_agents_act_by_hand():
     """Constant brakes: nothing has to be learnt, and time and speed have closed forms."""
     played = behaviour.play(ENV, Constant(1.0), 50)
     measured = behaviour.crossed(played)
-    k = played.task.constants()
     x, v = played.states[0].T
-    rate = k["brake"] * 6.0
-    settled = k["pull"] / rate
+    rate = 6.0 * 2.0 / 3.0  # a solid cylinder of 1 kg
+    settled = 2.0 / 3.0 * 9.81 * np.sin(np.radians(15.0)) / rate
 
     def place(t):
         return x + settled * t + (v - settled) * (1.0 - np.exp(-rate * t)) / rate

@@ -350,7 +350,7 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
     for env_id, (place, fixed) in TASKS.items():
         task, board = load_task(place)(**fixed), describe(env_id)
         for _ in range(3):
-            state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.start).tolist()
+            state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
             share = float(rng.uniform(0 if board["control"]["low"] == 0 else -1, 1))
             target, turned = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
             now = Moment(state, share * task.limit_control, share, target, turned)

@@ -258,7 +258,7 @@ def test_every_environment_has_a_goal_and_disturbances():
         names = protocol.disturbances(env)
         assert len(names) >= 8 and all(name.endswith("20 %") for name in names)
         goal, task = protocol.GOALS[env], protocol.make_task(env)
-        states = np.array([task.centre, np.array(task.centre) + 0.9 * np.array(task.start)])
+        states = np.array([task.centre, np.array(task.centre) + 0.9 * np.array(task.half_widths)])
         inside = goal.inside(task, states, np.zeros(2))
         assert inside.shape == (2,) and inside.dtype == np.bool_
 

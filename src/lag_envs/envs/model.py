@@ -117,16 +117,14 @@ class Model:
     def _targets(self, targets: ArrayLike | None, n: int) -> Array:
         """Return targets of shape (n, n_targets)."""
         count, fixed = self.task.formulas.targets, self.task.fixed_target
-        if targets is None:
-            if count and fixed is None:
-                raise ValueError("the task's target is random: targets must be given")
-            targets = fixed if count else np.empty(0)
-        elif not count:
+        if targets is not None and not count:
             raise ValueError("this task has no target, got targets")
+        if targets is None and count and fixed is None:
+            raise ValueError("the task's target is random: targets must be given")
+        if targets is None:
+            return np.ascontiguousarray(np.broadcast_to(fixed if count else np.empty(0), (n, count)))  # type: ignore[arg-type]
         array = np.asarray(targets, np.float64)
-        if count == 1 and array.shape in ((), (n,)):
-            array = array[..., None]
-        if array.shape not in ((count,), (n, count)):
+        if array.shape not in ([(), (n,)] if count == 1 else [(count,), (n, count)]):
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
             raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
-        return np.ascontiguousarray(np.broadcast_to(array, (n, count)))
+        return np.ascontiguousarray(np.broadcast_to(array.reshape(-1, count), (n, count)))

@@ -90,12 +90,12 @@ def linear(gamma, delta, slope, x, v, dt):
 def turning(turn, variables, dt):
     """Return (x, x') after dt on a plane that turns at a constant rate; variables are (x, x', cos, sin).
 
-    x'' = k (g sin(phi) + x rate^2) - drag x' is linear in (x, x', cos, sin).
+    x'' = weight sin(phi) + carry rate^2 x - drag x' is linear in (x, x', cos, sin).
     """
-    k, g, drag, rate = (mpf(value) for value in turn)
+    carry, weight, drag, rate = (mpf(value) for value in turn)
     rows = [
         [0, 1, 0, 0],
-        [k * rate**2, -drag, 0, k * g],
+        [carry * rate**2, -drag, 0, weight],
         [0, 0, 0, -rate],
         [0, 0, rate, 0],
     ]

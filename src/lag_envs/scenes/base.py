@@ -26,6 +26,7 @@ from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import SMALLEST, StepRefused, check_number, check_step, real_array, shown
 from lag_envs.scenes.shapes import Moment, Shape, Window
+from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
     import sympy
@@ -290,9 +291,10 @@ class Scene(metaclass=SceneType):
         made = [f for f in fields.values() if f.metadata["made"] and getattr(self, f.name) is None]
         for field in (*(f for f in fields.values() if f not in made), *made):
             value = getattr(self, field.name)
-            if field in made:
+            if field in made:  # where it is out of range, those that it is made from are
                 value = field.metadata["made"](self)
-            if value is not None or not (field.metadata["optional"] or field in made):
+                value = None if value is None else check_number(field.name, value)
+            elif value is not None or not field.metadata["optional"]:
                 value = _check_range(field, value)
             object.__setattr__(self, field.name, value)
         self.check()
@@ -394,7 +396,7 @@ class Scene(metaclass=SceneType):
         array = self._check_states(state)
         if array.ndim != 1:
             raise ValueError(
-                f"state must be ({', '.join(self.state_names)}), got an array of shape {array.shape}"
+                f"state must be ({', '.join(self.state_names)}), got shape {array.shape}: {shown(state)}"
             )
         return array
 
@@ -402,7 +404,7 @@ class Scene(metaclass=SceneType):
         """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
         array, names = real_array("state", states), self.state_names
         if array.shape[-1:] != (len(names),):
-            raise ValueError(f"state must be ({', '.join(names)}), got an array of shape {array.shape}")
+            raise ValueError(f"state must be ({', '.join(names)}), got shape {array.shape}: {shown(states)}")
         bad = ~np.isfinite(array)
         if bad.any():
             row = array[tuple(np.argwhere(bad)[0][:-1])]
@@ -764,11 +766,13 @@ class Scene(metaclass=SceneType):
         """Return the error for a step that was refused."""
         start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
         held = zip(self.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
+        why = "it could not be certified within the largest number of substeps"
+        if self._form is not None:
+            why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
         error = StepRefused(
             f"{where} was refused: from ({start}) with "
-            f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s it could not be "
-            "taken within the largest number of substeps, or has no finite result; take a smaller dt or "
-            "milder parameters"
+            f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
+            "finite result; take a smaller dt or milder parameters"
         )
         error.trajectory = None if trajectory is None else trajectory.copy()
         return error

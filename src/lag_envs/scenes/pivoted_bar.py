@@ -133,7 +133,7 @@ class PivotedBar(Scene):
             *self._rail(s),
             Line([(s, 0.0), (s, -0.4 * reach)], "guide"),
             Line(shapes.arc((s, 0.0), 0.25 * reach, -0.5 * math.pi, turn - 0.5 * math.pi), "guide"),
-            *super().shapes(now),
+            *super().shapes(now if self.track is not None else now._replace(turned=0.0)),
             Arrow([(edge, 0.0), (edge + 0.45 * reach * now.share, 0.0)]),
         ]
 

@@ -101,10 +101,13 @@ class NormalForm:
     def order(self, dt: float) -> int:
         """Return the order of the pendulum's series for a control step; 0 where there is no such series.
 
-        With order 14, one series of 0.02 s is certified up to 13 rad/s; with order 20, one of 0.05 s up to
-        9.5 rad/s, where 16 would ask for two.
+        With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
+        strong, call for order 20: with it one of 0.05 s is certified up to 9.5 rad/s, where 16 takes two.
         """
-        return (14 if dt <= 0.03 else 20) if self.kind is pendulum.Drive else 0
+        if self.kind is not pendulum.Drive:
+            return 0
+        brakes = any(term.held.number is None for term in self.terms["gamma"])
+        return 20 if brakes or dt > 0.03 else 14
 
     def flow(self, dt: float) -> Flow:
         """Return the exact flow for control steps of this length."""

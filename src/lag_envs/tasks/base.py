@@ -323,6 +323,8 @@ class Task:
             if sorted(target) != sorted(names):
                 raise ValueError(f"target must give {', '.join(names)}, got {dict(target)!r}")
             target = [target[name] for name in names]
+        elif len(names) == 1:
+            return check_number("target", target)
         array = np.atleast_1d(real_array("target", target))
         if array.shape != (len(names),):
             raise ValueError(f"target must be {', '.join(names)}, got {target!r}")
