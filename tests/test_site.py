@@ -353,6 +353,7 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
             state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
             share = float(rng.uniform(0 if board["control"]["low"] == 0 else -1, 1))
             target, turned = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
+            turned = turned if "psi" in task.scene.left_out else 0.0
             now = Moment(state, share * task.limit_control, share, target, turned)
             given = json.dumps({"state": state, "share": share, "target": target, "turned": turned})
             board_text = json.dumps(board)
