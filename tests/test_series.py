@@ -10,6 +10,7 @@ import time
 import types
 from collections import Counter
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import flint
@@ -26,7 +27,16 @@ from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt
-from lag_envs.stepping.series import LARGEST_ORDER, SMALLEST_ORDER, TOLERANCE, Lane, Plain, Series
+from lag_envs.stepping.series import (
+    LARGEST_ORDER,
+    SMALLEST_ORDER,
+    SMALLEST_SIZE,
+    TOLERANCE,
+    TRIES,
+    Lane,
+    Plain,
+    Series,
+)
 from lag_envs.stepping.tracing import evaluate
 
 NAMES = [system.name for system in SYSTEMS]
@@ -656,3 +666,18 @@ def test_bits_do_not_depend_on_fused_instructions():
         results.append(one)
     assert results[0][layout.left] < 0.02
     np.testing.assert_array_equal(*results)
+
+
+def test_numbers_in_the_documentation():
+    path = Path(__file__).parents[1] / "docs" / "engine.md"
+    text = " ".join(path.read_text(encoding="utf-8").split())
+    orders = [general.usual_order(dt) for dt in (0.03, 0.1, 0.2)]
+    said = [
+        f"N is {orders[0]} up to dt = 0.03 s, {orders[1]} up to 0.1 s, else {orders[2]}",
+        f"E_v is {TOLERANCE:.0e} of a size",
+        f"counts as {SMALLEST_SIZE:.0e} at least",
+        f"up to {TRIES} shorter ones",
+        f"refused after {driver.LARGEST_COUNT:,} attempts",
+        f"would fall below {driver.SMALLEST_PART:.0e} of it".replace("e-0", "e-"),
+    ]
+    assert [words for words in said if words not in text] == []

@@ -10,7 +10,7 @@ order (sums termwise, products by convolution, functions by z' = w x'), with q_{
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
-with one factorisation M_0 = L D Lᵀ.
+with M_0⁻¹ found once, as numbers. docs/engine.md derives all of this.
 
 **Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
 above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
@@ -124,7 +124,7 @@ class Factor(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What an expansion knows beside its slots: coefficients of order 0, the factors of M_0, weights."""
+    """What an expansion knows beside its slots: coefficients of order 0, the inverse of M_0, weights."""
 
     zero: dict[int, Any]
     inverse: Inverse
