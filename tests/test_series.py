@@ -26,6 +26,7 @@ from lag_envs.stepping import compiling, driver, general, machine
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
+from lag_envs.stepping.lowering import ELAPSED
 from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt
 from lag_envs.stepping.series import (
     LARGEST_ORDER,
@@ -33,6 +34,7 @@ from lag_envs.stepping.series import (
     SMALLEST_SIZE,
     TOLERANCE,
     TRIES,
+    Certificate,
     Lane,
     Plain,
     Series,
@@ -222,6 +224,52 @@ def plain_attempt(system, case, order, tolerance, target=Plain):
     given, q, v = inputs(system, *case[:2])
     done, h, *_, bounds = series.attempt(target(series.slots), given, q, v, case[2], order, tolerance)
     return (h if done else 0.0), bounds
+
+
+def exact_nodes(record, scalars, q, v, h, order):
+    """Return the exact series of all nodes of a record, up to an order."""
+    flint.ctx.cap, values = order, []
+
+    def weight(w):
+        return flint.arb(scalars[w] if isinstance(w, str) else w)
+
+    for node in record.nodes:
+        args = [values[a] for a in node.args if a < len(values)]  # of a function, the first counts
+        match node.op:
+            case "place":
+                value = q[node.index]
+            case "velocity":
+                value = v[node.index]
+            case "polynomial":
+                value = flint.arb_series([weight(w) * flint.arb(h) ** k for k, w in enumerate(node.weights)])
+            case "sum":
+                total = sum(weight(w) * x for w, x in zip(node.weights[:-1], args, strict=True))
+                value = total + weight(node.weights[-1])
+            case "product":
+                value = args[0] * args[1]
+            case "reciprocal":
+                value = 1 / args[0]
+            case function:
+                value = getattr(EXACT, function)(args[0])
+        values.append(value)
+    return values
+
+
+@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
+def test_every_rule_bounds_its_tail(system):
+    generator, order, tolerance, found = np.random.default_rng(15), 8, 1e-7, []
+    record = record_of(system)
+    series = Series(record)
+    while len(found) < 8:
+        state, control, h = draw(system, generator, order, tolerance)
+        t, (given, q, v) = Plain(series.slots), inputs(system, state, control)
+        given[ELAPSED] = 0.0
+        certificate = Certificate(series, t, series.expand(t, given, q, v, h, order), h, order, tolerance)
+        if certificate.check()[0]:
+            exact = taylor(system, state, control, h, order + 18)
+            nodes = exact_nodes(record, t.scalars(record, given), *exact, h, order + 18)
+            found.append([(tail, sums([nodes[n]], order)[0]) for n, tail in certificate._tails.items()])
+    assert all(true <= bound for tails in found for bound, true in tails)
 
 
 def test_tails_cut_one_order_later_than_sums_are_found_out():
