@@ -460,8 +460,11 @@ def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypa
     assert all(type(x) is float for x in python.flat)
 
 
-@pytest.mark.parametrize("system", SYSTEMS[1:4:2], ids=NAMES[1:4:2])
-@pytest.mark.parametrize(("width", "fused"), [(4, True), (8, False), (16, True)])
+@pytest.mark.parametrize(
+    ("system", "width", "fused"),
+    [(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), (SYSTEMS[3], 8, False)],
+    ids=["4", "16", "8 unfused"],
+)
 def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width, fused):
     generator = np.random.default_rng(8)
     cases = [system.draw(generator, 10.0 ** generator.uniform(-2, 0.3)) for _ in range(41)]
@@ -510,10 +513,10 @@ POLAR = System(Polar(), None, (1.0, 3.1), (1.0, 6.0), (), (1.5, 0.0))
 @pytest.mark.parametrize(
     ("system", "trouble"),
     [
-        (SYSTEMS[2], {3: {3: math.nan}, 7: {3: math.inf}, 11: {3: 1e200}, 12: {5: -1e308}, 13: {2: 1e300}}),
+        (SYSTEMS[1], {3: {1: math.nan}, 7: {1: math.inf}, 11: {1: 1e200}, 12: {3: -1e308}, 13: {0: 1e300}}),
         (POLAR, {2: {0: 0.0}, 3: {0: 1e-300}, 9: {0: 1e200}, 17: {0: 0.1, 1: -100.0, 3: 0.0}}),
     ],
-    ids=["DoublePendulum", "Polar"],
+    ids=["Acrobot", "Polar"],
 )
 def test_trouble_in_one_lane_leaves_the_others_alone(system, trouble):
     generator = np.random.default_rng(9)
@@ -522,7 +525,7 @@ def test_trouble_in_one_lane_leaves_the_others_alone(system, trouble):
     for lane, changes in trouble.items():
         state = [changes.get(i, x) for i, x in enumerate(cases[lane][0])]
         cases[lane] = state, cases[lane][1]
-    found = block_steps(system, cases, 0.02, 16)
+    found = block_steps(system, cases, 0.02, 16, width=16)
     well = np.array([lane not in trouble for lane in range(20)])
     np.testing.assert_array_equal(found[well], alone[well])
     assert (found[~well, -1] < 0).all()
@@ -609,12 +612,11 @@ def step_error(system, state, control, dt, order):
     scale = np.ones(n)
     scale[first + 1 :: 2] = sizes(system, state, v)
     scale[first::2] = np.maximum(np.maximum(1.0, np.abs(state[first::2])), scale[first + 1 :: 2] * dt)
-    derivatives, refused = stepper(system.scene)[0].jacobian(
-        np.array([state]), np.array([control]), vars(system.scene), dt, order
-    )
-    assert not refused
-    condition = np.linalg.norm(derivatives[0, :, :n] * scale / scale[:, None], 2)
-    return np.max(np.abs(errors) / scale) / max(1.0, condition)
+    slopes, little = np.empty((n, n)), flint.arb(1e-15)
+    for j in range(n):
+        moved = exact_step(system, [*state[:j], state[j] + little * scale[j], *state[j + 1 :]], control, dt)
+        slopes[:, j] = [float((a - b) / little) for a, b in zip(moved, exact, strict=True)] / scale
+    return np.max(np.abs(errors) / scale) / max(1.0, np.linalg.norm(slopes, 2))
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
