@@ -938,7 +938,7 @@ class Plain:
         try:
             return a / b
         except ZeroDivisionError:
-            return a * math.inf if a == a and a != 0 else self.number(math.nan)
+            return a * math.copysign(math.inf, b) if a == a and a != 0 else self.number(math.nan)
 
     def fma(self, a: Any, b: Any, c: Any) -> Any:
         return a * b + c
