@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import re
+import threading
+import time
 import types
+from collections import Counter
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import flint
 import numpy as np
 import pytest
+from contract_scenes import Trolley
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System, acceleration
 
-from lag_envs.scenes.base import Scene
-from lag_envs.stepping import driver, machine
+from lag_envs.scenes import Chain, StepRefused
+from lag_envs.scenes.base import Scene, parameter
+from lag_envs.stepping import compiling, driver, general, machine
 from lag_envs.stepping.compiling import compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
+from lag_envs.stepping.lowering import ELAPSED
 from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt
-from lag_envs.stepping.series import LARGEST_ORDER, SMALLEST_ORDER, TOLERANCE, Lane, Plain, Series
+from lag_envs.stepping.series import (
+    LARGEST_ORDER,
+    SMALLEST_ORDER,
+    SMALLEST_SIZE,
+    TOLERANCE,
+    TRIES,
+    Certificate,
+    Lane,
+    Plain,
+    Series,
+)
+from lag_envs.stepping.tracing import evaluate
 
 NAMES = [system.name for system in SYSTEMS]
 FLOATS = types.SimpleNamespace(
@@ -71,29 +90,31 @@ def taylor(system, state, control, h, end):
 
 def sums(series, first):
     """Return the sums of absolute coefficients from an order on."""
-    return [sum(abs(float(c)) for c in x.coeffs()[first:]) for x in series]
+    return [sum(float(c.abs_upper()) for c in x.coeffs()[first:]) for x in series]
 
 
 # --- what is tested -----------------------------------------------------------------------------------------
 
 
 @cache
-def stepper(system: System):
-    """Return the system's stepper, its constants and its code."""
-    found = SeriesStepper(system.scene.mechanics)
-    numbers = {name: getattr(system.scene, name) for name in system.scene._numbers()}
-    constants = found.constants(numbers)
-    return found, constants, found.code(frozenset(name for name, value in constants.items() if value == 0.0))
+def stepper(scene: Scene, fused: bool = True):
+    """Return the scene's stepper, its constants and its code."""
+    found = SeriesStepper(scene.mechanics)
+    constants = found.constants({name: getattr(scene, name) for name in scene._numbers()})
+    zero = frozenset(name for name, value in constants.items() if value == 0.0)
+    return found, constants, found.code(zero, fused)
+
+
+def record_of(system, fused=True):
+    return stepper(system.scene, fused)[2].record
 
 
 def inputs(system, state, control):
     """Return the inputs of the series by name, places and velocities."""
-    found, constants, code = stepper(system)
+    found, constants, code = stepper(system.scene)
     given = constants | found.prepare(FLOATS, state, control, constants)
-    n = code.record.size
-    return {name: given[name] for name in code.record.given}, *(
-        [given[f"{x}{i}"] for i in range(n)] for x in "qv"
-    )
+    q, v = ([given[f"{x}{i}"] for i in range(code.record.size)] for x in "qv")
+    return {name: given[name] for name in code.record.given}, q, v
 
 
 def _run(rows, dt, order, tolerance):
@@ -107,7 +128,7 @@ def compiled(record, lanes=1, fused=True):
 
 def attempts(system, cases, order, tolerance):
     """Return for each case (state, control, h) the certified length, 0 if none, and bounds on the tails."""
-    record = stepper(system)[2].record
+    record = record_of(system)
     layout, n = Layout(record), record.size
     run, results = compiled(record), []
     for state, control, h in cases:
@@ -150,23 +171,23 @@ def judge(system, case, order, tolerance, h, bounds):
     return Judged(max(ratios), max(t / a for t, a in zip(found, allowed, strict=True)))
 
 
-def draw(system, generator, count):
-    """Return cases whose certified steps are mostly limited by the tolerance."""
-    cases = []
-    for _ in range(count):
-        state, control = system.draw(generator, 10.0 ** generator.uniform(-2.0, 0.2))
-        cases.append((state, control, 10.0 ** generator.uniform(-2.5, -0.5)))
-    return cases
+def draw(system, generator, order, tolerance):
+    """Return a case (state, control, h) with h about the longest step that is certified as a whole."""
+    state, control = system.draw(generator, 10.0 ** generator.uniform(-2.0, 0.2))
+    h = 1e-4
+    while h < 10.0 and attempts(system, [(state, control, h)], order, tolerance)[0][0] == h:
+        h *= 1.5
+    return state, control, h * 10.0 ** generator.uniform(-0.3, 0.3)
 
 
 def certified(system, generator, order, tolerance, count):
     """Return `count` certified steps, judged."""
     found = []
     while len(found) < count:
-        cases = draw(system, generator, count - len(found))
-        for case, (h, bounds) in zip(cases, attempts(system, cases, order, tolerance), strict=True):
-            if h > 0.0:
-                found.append(judge(system, case, order, tolerance, h, bounds))
+        case = draw(system, generator, order, tolerance)
+        ((h, bounds),) = attempts(system, [case], order, tolerance)
+        if h > 0.0:
+            found.append(judge(system, case, order, tolerance, h, bounds))
     return found
 
 
@@ -199,17 +220,64 @@ def test_certificate_bounds_the_tail_of_ten_thousand(system):
 
 def plain_attempt(system, case, order, tolerance, target=Plain):
     """Return the length that `Series.attempt` certifies in Python, 0 if none, and its bounds."""
-    series = Series(stepper(system)[2].record)
+    series = Series(record_of(system))
     given, q, v = inputs(system, *case[:2])
     done, h, *_, bounds = series.attempt(target(series.slots), given, q, v, case[2], order, tolerance)
     return (h if done else 0.0), bounds
+
+
+def exact_nodes(record, scalars, q, v, h, order):
+    """Return the exact series of all nodes of a record, up to an order."""
+    flint.ctx.cap, values = order, []
+
+    def weight(w):
+        return flint.arb(scalars[w] if isinstance(w, str) else w)
+
+    for node in record.nodes:
+        args = [values[a] for a in node.args if a < len(values)]  # of a function, the first counts
+        match node.op:
+            case "place":
+                value = q[node.index]
+            case "velocity":
+                value = v[node.index]
+            case "polynomial":
+                value = flint.arb_series([weight(w) * flint.arb(h) ** k for k, w in enumerate(node.weights)])
+            case "sum":
+                total = sum(weight(w) * x for w, x in zip(node.weights[:-1], args, strict=True))
+                value = total + weight(node.weights[-1])
+            case "product":
+                value = args[0] * args[1]
+            case "reciprocal":
+                value = 1 / args[0]
+            case function:
+                value = getattr(EXACT, function)(args[0])
+        values.append(value)
+    return values
+
+
+@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
+def test_every_rule_bounds_its_tail(system):
+    generator, order, tolerance, found = np.random.default_rng(15), 8, 1e-7, []
+    record = record_of(system)
+    series = Series(record)
+    while len(found) < 8:
+        state, control, h = draw(system, generator, order, tolerance)
+        t, (given, q, v) = Plain(series.slots), inputs(system, state, control)
+        given[ELAPSED] = 0.0
+        certificate = Certificate(series, t, series.expand(t, given, q, v, h, order), h, order, tolerance)
+        if certificate.check()[0]:
+            exact = taylor(system, state, control, h, order + 18)
+            nodes = exact_nodes(record, t.scalars(record, given), *exact, h, order + 18)
+            found.append([(tail, sums([nodes[n]], order)[0]) for n, tail in certificate._tails.items()])
+    assert all(true <= bound for tails in found for bound, true in tails)
 
 
 def test_tails_cut_one_order_later_than_sums_are_found_out():
     # A certificate for the order N + 1, taken for that of sums up to N, leaves v_{N+1} unbounded.
     system, generator, order = SYSTEMS[2], np.random.default_rng(6), 8
     found = []
-    for case in draw(system, generator, 12):
+    for _ in range(12):
+        case = draw(system, generator, order + 1, 1e-9)
         h, bounds = plain_attempt(system, case, order + 1, 1e-9)
         if h > 0.0:
             found.append(judge(system, case, order, 1e-9, h, bounds).excess)
@@ -224,6 +292,9 @@ class Vanishing(Scene):
     def kinetic(self, q, v, xp):
         return 0.5 * (1 - q.x) * v.x**2
 
+    def potential(self, q, xp):
+        return 0.0
+
     def applied(self, q, v, u, xp):
         return {"x": -0.5 * v.x**2}
 
@@ -235,27 +306,55 @@ def test_where_the_mass_vanishes_within_the_step_only_less_will_do():
 
     system = System(Vanishing(), lambda *_: ([[1.0]], [0.0]), (1.0,), (1.0,))
     case = ([0.0, 1.0], [], 1.0)  # at its end the mass is 0, and any acceleration solves the equation
-    assert stepper(system)[2].record.force == (-1,)
+    assert record_of(system).force == (-1,)
     assert plain_attempt(system, case, 8, 1e-20)[0] < 1.0
     assert plain_attempt(system, case, 8, 1e-20, Lenient)[0] == 1.0
     assert plain_attempt(system, ([0.0, 1.0], [], 0.9), 8, 1e-20)[0] == 0.9
 
 
-#: Equilibria: states at rest under forces that balance, by name of the system.
+#: States at rest under forces that balance, but for roundings.
 AT_REST = {
-    "CartPole": ([0.5, 0.0, 0.0, 0.0], [0.0]),
-    "Acrobot": ([0.0] * 4, [0.0]),
-    "DoublePendulum": ([0.1, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0]),
-    "TriplePendulum": ([0.1] + [0.0] * 7, [0.0]),
-    "RotaryPendulum": ([1.0, 0.0, 0.0, 0.0], [0.0]),
-    "TurningFrame": ([0.0] * 4, [0.0, 0.0]),
+    "CartPole": [0.5, 0.0, math.pi, 0.0],
+    "Acrobot": [0.0] * 4,
+    "DoublePendulum": [0.1, 0.0, math.pi, 0.0, 0.0, 0.0],
+    "TriplePendulum": [0.1] + [0.0] * 7,
+    "RotaryPendulum": [1.0, 0.0, 0.0, 0.0],
+    "ElasticPendulum": [0.1, 0.0, 0.1, 0.0, -0.4 - 0.3 * 9.81 / 40.0, 0.0],
+    "TurningFrame": [0.0] * 4,
+    "Lattice": [0.0] * 4,
 }
 
 
-@pytest.mark.parametrize("system", [s for s in SYSTEMS if s.name in AT_REST], ids=lambda system: system.name)
+@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
 def test_rest_at_an_equilibrium_is_certified_in_one_step(system):
-    state, control = AT_REST[system.name]
-    assert attempts(system, [(state, control, 0.05)], 16, TOLERANCE)[0][0] == 0.05
+    control = [0.0] * len(system.push)
+    assert attempts(system, [(AT_REST[system.name], control, 0.02)], 16, TOLERANCE)[0][0] == 0.02
+
+
+def count_operations(system, order):
+    """Return how many sums, products and quotients an attempt takes that is certified as a whole."""
+    counts = Counter()
+
+    def counting(slots):
+        target = Plain(slots)
+        for name in ("add", "sub", "mul", "div", "fma"):
+
+            def counted(*numbers, name=name):
+                counts[name] += 1
+                return getattr(Plain, name)(target, *numbers)
+
+            setattr(target, name, counted)
+        return target
+
+    state, control = system.draw(np.random.default_rng(1))
+    assert plain_attempt(system, (state, control, 1e-3), order, TOLERANCE, counting)[0] == 1e-3
+    return counts.total()
+
+
+def test_operations_grow_no_faster_than_the_cube_of_the_number_of_links():
+    chains = [System(Chain(bars=n), None, (1.0,) * n, (1.0,) * n, (1.0,)) for n in range(1, 7)]
+    counts = [count_operations(chain, 16) / (n + 1) ** 3 for n, chain in enumerate(chains)]
+    assert counts == sorted(counts, reverse=True)
 
 
 # --- bits ---------------------------------------------------------------------------------------------------
@@ -263,7 +362,7 @@ def test_rest_at_an_equilibrium_is_certified_in_one_step(system):
 
 def rows_of(system, cases):
     """Return a block of rows: for each case inputs, places and velocities."""
-    record = stepper(system)[2].record
+    record = record_of(system)
     layout, n = Layout(record), record.size
     rows = np.zeros((2 * layout.bounds + 1, BLOCK))
     for lane, (state, control) in enumerate(cases):
@@ -274,20 +373,21 @@ def rows_of(system, cases):
     return rows
 
 
-def block_steps(system, cases, dt, order, **options):
+def block_steps(system, cases, dt, order, fused=True, **options):
     """Return places, velocities and the status of each lane after a control step of a block."""
-    record = stepper(system)[2].record
+    record = record_of(system, fused)
     layout, rows = Layout(record), rows_of(system, cases)
-    refused = compile_advance_block(record, **options)(rows.reshape(-1), 0, len(cases), dt, order)
+    advance = compile_advance_block(record, fused=fused, **options)
+    refused = advance(rows.reshape(-1), 0, len(cases), dt, order)
     assert refused == (rows[layout.status, : len(cases)] < 0).sum()
     return rows[layout.q : layout.status + 1, : len(cases)].T
 
 
-def single_steps(system, cases, dt, order, **options):
+def single_steps(system, cases, dt, order, fused=True):
     """Return the same from the function for a single lane."""
-    record = stepper(system)[2].record
+    record = record_of(system, fused)
     layout, rows = Layout(record), rows_of(system, cases)
-    advance, results = compile_advance(record, **options), []
+    advance, results = compile_advance(record, fused=fused), []
     for lane in range(len(cases)):
         one = np.zeros(layout.rows)
         one[: layout.status] = rows[: layout.status, lane]
@@ -296,9 +396,38 @@ def single_steps(system, cases, dt, order, **options):
     return np.array(results)
 
 
-def python_steps(system, cases, dt, order):
-    """Return the same from Python's floats: the driver's own code on `Plain`."""
-    record = stepper(system)[2].record
+def simulate(scene, start, controls, dt, order, fused=True):
+    """Return a trajectory, from compiled code or from what stands in its place; as objects."""
+    _, constants, code = stepper(scene, fused)
+    given = [constants[name.removeprefix("k_")] for name in code.constants]
+    trajectory = np.zeros((len(controls) + 1, len(start)))
+    trajectory[0] = start
+    run = code.compile_simulate()
+    if isinstance(run, types.FunctionType):  # Python's own, which is to meet Python's own numbers
+        trajectory, controls = trajectory.astype(object), np.array(controls, dtype=object)
+    assert not run(trajectory, np.asarray(controls), dt, order, *given)
+    return trajectory
+
+
+def in_python(name, source, *helpers, **constants):
+    """Stand in for `compile_function`: run the source by Python, and what was recorded too."""
+
+    def block(operations, inputs, outputs):
+        def run(*values):
+            known = evaluate(operations, dict(zip(inputs, values, strict=True)))
+            return tuple(known[name] for name in outputs)
+
+        return run
+
+    numpy = types.SimpleNamespace(zeros=lambda n: [0.0] * n, int64=int)
+    scope = {"np": numpy, **constants, **{helper.__name__: helper for helper in helpers}}
+    scope |= {name: block(*parts) for name, parts in compiling._blocks.items()}
+    exec(source, scope)
+    return scope[name]
+
+
+def advance_in_python(record, tolerance=TOLERANCE, fused=False):
+    """Stand in for `compile_advance`: the driver's own code on `Plain`."""
     series, layout, n = Series(record), Layout(record), record.size
 
     def attempt(rows, at, dt, order, tolerance):
@@ -311,51 +440,143 @@ def python_steps(system, cases, dt, order):
             rows[row] += bound
         return not after.left > 0.0
 
-    names = driver._numbers(record, TOLERANCE) | {"attempt": attempt, "np": np}
-    advance = types.FunctionType(driver._advance.__code__, names)
-    rows, results = rows_of(system, cases), []
-    for lane in range(len(cases)):
-        one = [0.0] * layout.rows
-        one[: layout.status] = rows[: layout.status, lane].tolist()
-        status = advance(one, dt, order)
-        results.append([*one[layout.q : layout.status], status])
-    return np.array(results)
+    names = driver._numbers(record, tolerance) | {"attempt": attempt, "np": np}
+    return types.FunctionType(driver._advance.__code__, names, "advance_lane")
 
 
-@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
-def test_unfused_bits_are_those_of_plain_numbers(system):
-    # The records' own scalars have to be unfused too: `SeriesStepper.code(absent, fused=False)`.
-    generator = np.random.default_rng(7)
-    cases = [system.draw(generator) for _ in range(3)]
-    python = python_steps(system, cases, 0.03, 10)
-    np.testing.assert_array_equal(single_steps(system, cases, 0.03, 10, fused=False), python)
-    np.testing.assert_array_equal(block_steps(system, cases, 0.03, 10, fused=False, width=8), python)
+#: Scenes with states and controls that take several substeps; the last holds two rates.
+WITH_SUBSTEPS = [(system.scene, *system.draw(np.random.default_rng(7))) for system in SYSTEMS]
+WITH_SUBSTEPS.append((Trolley(), [0.2, 0.1, 1.0, 9.0, -0.5, -8.0], [0.7, 0.2, 0.3]))
 
 
-@pytest.mark.parametrize("system", SYSTEMS[1:4:2], ids=NAMES[1:4:2])
-@pytest.mark.parametrize("width", (4, 16))
-def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width):
+@pytest.mark.parametrize(("scene", "state", "control"), WITH_SUBSTEPS, ids=[*NAMES, "Trolley"])
+def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypatch):
+    assert len(state) == len(scene.state_names)
+    compiled = simulate(scene, state, [control] * 3, 0.04, 10, fused=False)
+    monkeypatch.setattr(general, "compile_function", in_python)
+    monkeypatch.setattr(driver, "compile_advance", advance_in_python)
+    python = simulate(scene, state, [control] * 3, 0.04, 10, fused=False)
+    np.testing.assert_array_equal(compiled, python.astype(float))
+    assert all(type(x) is float for x in python.flat)
+
+
+@pytest.mark.parametrize(
+    ("system", "width", "fused"),
+    [(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), (SYSTEMS[3], 8, False)],
+    ids=["4", "16", "8 unfused"],
+)
+def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width, fused):
     generator = np.random.default_rng(8)
     cases = [system.draw(generator, 10.0 ** generator.uniform(-2, 0.3)) for _ in range(41)]
-    alone = single_steps(system, cases, 0.02, 16)
+    alone = single_steps(system, cases, 0.02, 16, fused)
     assert len(set(alone[:, -1])) > 1, "all took as many substeps"
-    np.testing.assert_array_equal(block_steps(system, cases, 0.02, 16, width=width), alone)
     order = generator.permutation(len(cases))
-    shuffled = block_steps(system, [cases[i] for i in order], 0.02, 16)
+    shuffled = block_steps(system, [cases[i] for i in order], 0.02, 16, fused, width=width)
     np.testing.assert_array_equal(shuffled, alone[order])
+    for lane in (0, 20, 40):
+        state, control = cases[lane]
+        end = simulate(system.scene, state, [control], 0.02, 16, fused)[1, 2 * system.driven :]
+        np.testing.assert_array_equal([*end[::2], *end[1::2]], alone[lane, :-1])
 
 
-def test_one_lane_in_trouble_leaves_the_others_alone():
-    system, generator = SYSTEMS[2], np.random.default_rng(9)
+class Polar(Scene):
+    """A ball on a spring in polar coordinates: at r = 0 the mass matrix is singular."""
+
+    coordinates = {"r": "m", "phi": "rad"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.r**2 + (q.r * v.phi) ** 2)
+
+    def potential(self, q, xp):
+        return 2.0 * q.r**2
+
+
+class Sled(Scene):
+    """Sliding with a drag that is far too heavy for a series."""
+
+    drag: float = parameter(1e9, "N s/m", least=0.0)
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.drag * v.x**2
+
+
+POLAR = System(Polar(), None, (1.0, 3.1), (1.0, 6.0), (), (1.5, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("system", "trouble"),
+    [
+        (SYSTEMS[1], {3: {1: math.nan}, 7: {1: math.inf}, 11: {1: 1e200}, 12: {3: -1e308}, 13: {0: 1e300}}),
+        (POLAR, {2: {0: 0.0}, 3: {0: 1e-300}, 9: {0: 1e200}, 17: {0: 0.1, 1: -100.0, 3: 0.0}}),
+    ],
+    ids=["Acrobot", "Polar"],
+)
+def test_trouble_in_one_lane_leaves_the_others_alone(system, trouble):
+    generator = np.random.default_rng(9)
     cases = [system.draw(generator) for _ in range(20)]
     alone = single_steps(system, cases, 0.02, 16)
-    for lane, x in zip((3, 7, 11, 12), (math.nan, math.inf, 1e200, -1e308), strict=True):
-        cases[lane] = ([*cases[lane][0][:3], x, *cases[lane][0][4:]], cases[lane][1])
-    found = block_steps(system, cases, 0.02, 16)
-    well = np.ones(20, bool)
-    well[[3, 7, 11, 12]] = False
+    for lane, changes in trouble.items():
+        state = [changes.get(i, x) for i, x in enumerate(cases[lane][0])]
+        cases[lane] = state, cases[lane][1]
+    found = block_steps(system, cases, 0.02, 16, width=16)
+    well = np.array([lane not in trouble for lane in range(20)])
     np.testing.assert_array_equal(found[well], alone[well])
     assert (found[~well, -1] < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("scene", "state"),
+    [
+        (Polar(), [0.0, 0.1, 0.0, 1.0]),  # singular from the start
+        (Polar(), [0.1, -100.0, 0.0, 0.0]),  # in mid-step
+        (Sled(), [0.0, 1.0]),  # more substeps than are allowed
+    ],
+)
+def test_step_that_cannot_be_certified_is_refused(scene, state):
+    _, constants, code = stepper(scene)
+    given = [constants[name.removeprefix("k_")] for name in code.constants]
+    trajectory = np.full((3, len(state)), 7.0)
+    trajectory[0] = state
+    assert code.simulation(trajectory, np.zeros((2, 0)), 0.02, 16, *given) == 1
+    np.testing.assert_array_equal(trajectory, [state] + [[7.0] * len(state)] * 2)
+
+
+def test_refusal_of_a_scene_brings_what_went_before():
+    with pytest.raises(StepRefused, match="step 2 of 4") as refusal:
+        Polar().simulate([0.5, -10.0, 0.0, 0.0], 4, 0.02)
+    assert refusal.value.trajectory.shape == (3, 4)
+
+
+def test_threads_share_a_scene_and_run_side_by_side():
+    scene = Chain(bars=2, gravity=0.0, damping=0.01)  # nobody else's: both threads find nothing compiled
+    controls = np.random.default_rng(10).uniform(-5.0, 5.0, 200_000)
+    starts = [[0.0, 0.0, 1.0, 2.0, -1.0, x] for x in (3.0, -4.0)]
+    found, turns = {}, 0
+
+    def work(i):
+        found[i] = scene.simulate(starts[i], controls, 0.02)
+
+    threads = [threading.Thread(target=work, args=[i]) for i in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    thread = threading.Thread(target=work, args=[2])
+    starts.append(starts[0])
+    thread.start()
+    while thread.is_alive():  # a kernel that kept the interpreter's lock would leave one turn or two
+        time.sleep(1e-3)
+        turns += 1
+    assert turns > 10
+    for i, start in enumerate(starts):
+        np.testing.assert_array_equal(found[i], scene.simulate(start, controls, 0.02))
 
 
 # --- errors -------------------------------------------------------------------------------------------------
@@ -383,23 +604,19 @@ def exact_step(system, state, control, dt):
 
 def step_error(system, state, control, dt, order):
     """Return the worst error of a control step, as a part of condition times size."""
-    found, constants, code = stepper(system)
-    given = [constants[name.removeprefix("k_")] for name in code.constants]
-    trajectory = np.array([state, state])
-    assert not code.compile_simulate()(trajectory, np.array([control]), dt, order, *given)
+    end = simulate(system.scene, state, [control], dt, order)[1]
     exact = exact_step(system, state, control, dt)
     first, n = 2 * system.driven, len(state)
-    errors = np.array([float(z - flint.arb(x)) for x, z in zip(trajectory[1], exact, strict=True)])
+    errors = np.array([float(z - flint.arb(x)) for x, z in zip(end, exact, strict=True)])
     _, v = taylor(system, state, control, dt, 8)
     scale = np.ones(n)
     scale[first + 1 :: 2] = sizes(system, state, v)
     scale[first::2] = np.maximum(np.maximum(1.0, np.abs(state[first::2])), scale[first + 1 :: 2] * dt)
-    derivatives, refused = found.jacobian(
-        np.array([state]), np.array([control]), vars(system.scene), dt, order
-    )
-    assert not refused
-    condition = np.linalg.norm(derivatives[0, :, :n] * scale / scale[:, None], 2)
-    return np.max(np.abs(errors) / scale) / max(1.0, condition)
+    slopes, little = np.empty((n, n)), flint.arb(1e-15)
+    for j in range(n):
+        moved = exact_step(system, [*state[:j], state[j] + little * scale[j], *state[j + 1 :]], control, dt)
+        slopes[:, j] = [float((a - b) / little) for a, b in zip(moved, exact, strict=True)] / scale
+    return np.max(np.abs(errors) / scale) / max(1.0, np.linalg.norm(slopes, 2))
 
 
 @pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
@@ -408,55 +625,109 @@ def test_error_of_a_control_step(system):
     assert max(step_error(system, *system.draw(generator), 0.02, 16) for _ in range(2)) < 1e-12
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("system", SYSTEMS, ids=NAMES)
+@pytest.mark.parametrize(("dt", "order"), [(0.02, 12), (0.05, 20)])
+def test_error_of_many_control_steps(system, dt, order):
+    generator = np.random.default_rng(12)
+    assert max(step_error(system, *system.draw(generator), dt, order) for _ in range(20)) < 1e-12
+
+
 @pytest.mark.parametrize("order", range(SMALLEST_ORDER, LARGEST_ORDER + 1))
 def test_every_order(order):
     system = SYSTEMS[2]
     case = system.draw(np.random.default_rng(13), 0.3)
     best = single_steps(system, [case], 0.02, 20)
-    np.testing.assert_allclose(single_steps(system, [case], 0.02, order)[:, :-1], best[:, :-1], rtol=2e-13)
+    found = single_steps(system, [case], 0.02, order)
+    # Low orders take hundreds of substeps.
+    np.testing.assert_allclose(found[:, :-1], best[:, :-1], rtol=1e-13 + 1e-14 * found[0, -1])
 
 
-@pytest.mark.slow
-def test_undamped_pendulum_keeps_its_energy_for_a_thousand_seconds():
+@pytest.mark.parametrize("start", [[0.0, 0.0, 2.0, 0.0, 2.5, 0.0], [0.0, 0.0, 3.0, 5.0, -2.0, -9.0]])
+def test_undamped_pendulum_keeps_its_energy_for_a_thousand_seconds(start):
     scene = type(SYSTEMS[2].scene)(friction=0.0)
-    system = System(scene, SYSTEMS[2].motion, (3.0, 3.0), (1.0, 1.0), (1.0,))
-    _, constants, code = stepper(system)
-    simulate = code.compile_simulate()
-    given = [constants[name.removeprefix("k_")] for name in code.constants]
+    trajectory = simulate(scene, start, np.zeros((50_000, 1)), 0.02, 16)
+    energy = scene.energy(trajectory[::100])["total"]
     scale = 4 * scene.mass * scene.gravity * scene.length
-    for start in ([0.0, 0.0, 2.0, 0.0, 2.5, 0.0], [0.0, 0.0, 3.0, 5.0, -2.0, -9.0]):
-        trajectory = np.zeros((50_001, 6))
-        trajectory[0] = start
-        assert not simulate(trajectory, np.zeros((50_000, 1)), 0.02, 16, *given)
-        energy = scene.energy(trajectory[::500])["total"]
-        assert np.max(np.abs(energy - energy[0])) < 1e-9 * max(scale, energy[0])
+    assert np.max(np.abs(energy - energy[0])) < 1e-9 * max(scale, energy[0])
 
 
 # --- code for other processors ------------------------------------------------------------------------------
 
 
+def attempt_for(target, machine_code, fused, lanes):
+    """Return the module of an attempt for another processor, and its assembly."""
+    record = record_of(SYSTEMS[1], fused)  # sine, cosine, arc tangent, reciprocal
+    module = ir.Module()
+    module.triple = target
+    double, whole = ir.DoubleType(), ir.IntType(64)
+    kind = ir.FunctionType(whole, [double.as_pointer(), double, whole, double])
+    machine._write(module, "attempt", kind, record, lanes, fused)
+    parsed = binding.parse_assembly(str(module))
+    return parsed, machine_code.emit_assembly(parsed)
+
+
+@pytest.mark.parametrize("lanes", [1, 8])
+@pytest.mark.parametrize("fused", [False, True])
 @pytest.mark.parametrize(
     ("target", "features"),
     [
         ("x86_64-unknown-linux-gnu", ""),
-        ("x86_64-pc-windows-msvc", "+avx2,+fma"),
         ("x86_64-unknown-linux-gnu", "+avx512f,+avx512dq,+fma"),
+        ("x86_64-pc-windows-msvc", "+avx2,+fma"),
         ("aarch64-apple-darwin", "+neon"),
     ],
 )
-def test_code_for_every_processor_calls_nothing_and_fuses_only_where_asked(target, features):
+def test_code_for_every_processor(target, features, fused, lanes):
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
-    found = binding.Target.from_triple(target).create_target_machine(features=features, opt=2)
-    for fused in (False, True) if features else (False,):  # without features: a processor without fma
-        record = stepper(SYSTEMS[1])[0].code(fused=fused).record  # sine, cosine, arc tangent, reciprocal
-        for lanes in (1, 8):
-            module = ir.Module()
-            module.triple = target
-            double, whole = ir.DoubleType(), ir.IntType(64)
-            kind = ir.FunctionType(whole, [double.as_pointer(), double, whole, double])
-            machine._write(module, "attempt", kind, record, lanes, fused)
-            assembly = found.emit_assembly(binding.parse_assembly(str(module)))
-            calls = set(re.findall(r"^\s+(?:callq?|bl)\s+(\S+)", assembly, re.MULTILINE))
-            assert calls <= ({"__chkstk"} if "windows" in target else set())  # it touches the stack's pages
-            assert fused == bool(re.search(r"^\s+v?fn?m(la|ls|add|sub)", assembly, re.MULTILINE))
+    found = binding.Target.from_triple(target)
+    machine_code = found.create_target_machine(features=features, opt=2, codemodel="small")
+    _, assembly = attempt_for(target, machine_code, fused, lanes)
+    calls = set(re.findall(r"^\s+(?:callq?|bl)\s+([\w*%]+)", assembly, re.MULTILINE))
+    if fused and not features:  # a processor without fused instructions: the C library has them
+        assert calls == {"fma"}
+    else:
+        assert calls <= ({"__chkstk"} if "windows" in target else set())  # touches a large stack's pages
+    fuses = re.search(r"^\s+v?fn?m(la|ls|add|sub)\d*[sp]?d?\b", assembly, re.MULTILINE)
+    assert bool(fuses) == bool(fused and features)
+
+
+def test_bits_do_not_depend_on_fused_instructions():
+    system, order = SYSTEMS[1], 12
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    triple = binding.get_process_triple()
+    machine_code = binding.Target.from_triple(triple).create_target_machine(opt=2, jit=True)
+    module, assembly = attempt_for(triple, machine_code, True, 1)
+    assert "x86_64" not in triple or not re.search(r"^\s+vfn?m", assembly, re.MULTILINE)
+    engine = binding.create_mcjit_compiler(module, machine_code)
+    engine.finalize_object()
+    kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_double)
+    attempt = kind(engine.get_function_address("attempt"))
+    layout, rows = Layout(record_of(system)), rows_of(system, [system.draw(np.random.default_rng(14))])
+    results = []
+    for run in (attempt, compiled(record_of(system))):
+        one = np.zeros(layout.rows)
+        one[: layout.status] = rows[: layout.status, 0]
+        one[layout.left] = one[layout.wish] = 0.02
+        given = one.ctypes.data if run is attempt else one
+        run(given, 0.02, order, TOLERANCE)
+        results.append(one)
+    assert results[0][layout.left] < 0.02
+    np.testing.assert_array_equal(*results)
+
+
+def test_numbers_in_the_documentation():
+    path = Path(__file__).parents[1] / "docs" / "engine.md"
+    text = " ".join(path.read_text(encoding="utf-8").split())
+    orders = [general.usual_order(dt) for dt in (0.03, 0.1, 0.2)]
+    said = [
+        f"N is {orders[0]} up to dt = 0.03 s, {orders[1]} up to 0.1 s, else {orders[2]}",
+        f"E_v is {TOLERANCE:.0e} of a size",
+        f"counts as {SMALLEST_SIZE:.0e} at least",
+        f"up to {TRIES} shorter ones",
+        f"refused after {driver.LARGEST_COUNT:,} attempts",
+        f"would fall below {driver.SMALLEST_PART:.0e} of it".replace("e-0", "e-"),
+    ]
+    assert [words for words in said if words not in text] == []

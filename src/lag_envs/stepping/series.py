@@ -10,7 +10,7 @@ order (sums termwise, products by convolution, functions by z' = w x'), with q_{
 
     M_0 a_k = r_k - Σ_{j=1..k} M_j a_{k-j}
 
-with one factorisation M_0 = L D Lᵀ.
+with M_0⁻¹ found once, as numbers. docs/engine.md derives all of this.
 
 **Certificate.** |x| is the sum of absolute coefficients, E_x a bound on the sum of those of order N and
 above. Known are the coefficients below N of every node, and v_N. Suppose that the velocities' beyond N sum
@@ -124,7 +124,7 @@ class Factor(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What an expansion knows beside its slots: coefficients of order 0, the factors of M_0, weights."""
+    """What an expansion knows beside its slots: coefficients of order 0, the inverse of M_0, weights."""
 
     zero: dict[int, Any]
     inverse: Inverse
@@ -535,13 +535,16 @@ class Series:
             return t.negated(t.all(passed if wanted is None else t.either(passed, t.negated(wanted))))
 
         def retry(count: Any, carried: Sequence) -> tuple[Any, list]:
-            passed, part, power, *_ = carried
-            part, power = certificate.shorten(passed, part, power)
+            passed, part, power, factor, *_ = carried
+            factor = t.select(passed, one, factor)
+            part = t.mul(factor, part)
+            (power,) = t.loop(t.index(0), order, [power], lambda k, value: [t.mul(factor, value[0])])
             passed, bounds = certificate.check(part, power)
-            return going(passed), [passed, part, power, *bounds]
+            return going(passed), [passed, part, power, certificate.factor(), *bounds]
 
         def shorten() -> list:
-            passed, part, _, *bounds = t.repeat(TRIES, [done, one, one, *bounds_of_all], retry)
+            first = [done, one, one, certificate.factor(), *bounds_of_all]
+            passed, part, _, _, *bounds = t.repeat(TRIES, first, retry)
             self.shorten(t, part, order)
             return [passed, part, *bounds]
 
@@ -722,8 +725,8 @@ class Certificate:
             passed = t.both(passed, t.both(t.less(new, g), t.less(bound, rest)))
         return passed, self._bounds
 
-    def shorten(self, passed: Any, part: Any, power: Any) -> tuple[Any, Any]:
-        """Return a smaller part of the step that will probably be certified, where this one was not."""
+    def factor(self) -> Any:
+        """Return what part of the step just checked will probably be certified, where it was not."""
         t = self._t
         # Bounds grow with the power N + 1 of the step. Where there are none, the last terms have to do.
         bounds = terms = t.number(0.0)
@@ -731,17 +734,14 @@ class Certificate:
             slot = self._series._slots["v", i]
             last = t.add(self._size(slot, self._order), t.mul(t.number(0.1), self._last_but_one(slot)))
             bounds, terms = self._larger(bounds, t.mul(bound, root)), self._larger(terms, t.mul(last, root))
-        excess = t.select(self._fine, bounds, t.mul(power, terms))
+        excess = t.select(self._fine, bounds, self._powered(terms))
         excess = t.div(excess, t.mul(self._tolerance, self._largest))
         logarithm = t.mul(self._per_next, t.elementary("rough log2", excess))
         safety = t.select(self._fine, t.number(0.98), t.number(0.9))
         found = t.mul(safety, t.elementary("rough exp2", t.neg(logarithm)))
         largest = t.number(0.85)
         found = t.select(t.less(found, largest), found, largest)
-        found = t.select(t.less(t.number(0.02), found), found, t.number(0.02))
-        found = t.select(passed, t.number(1.0), found)
-        (raised,) = t.loop(t.index(0), self._order, [power], lambda k, carried: [t.mul(found, carried[0])])
-        return t.mul(found, part), raised
+        return t.select(t.less(t.number(0.02), found), found, t.number(0.02))
 
     def _size(self, slot: int, k: Any) -> Any:
         return self._t.abs(self._t.load(slot, k))
@@ -938,7 +938,7 @@ class Plain:
         try:
             return a / b
         except ZeroDivisionError:
-            return a * math.inf if a == a and a != 0 else self.number(math.nan)
+            return a * math.copysign(math.inf, b) if a == a and a != 0 else self.number(math.nan)
 
     def fma(self, a: Any, b: Any, c: Any) -> Any:
         return a * b + c
