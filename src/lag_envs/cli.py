@@ -283,7 +283,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sections",
         metavar="NAME,...",
-        help="only these: environments, work_precision, bound, stability, conservation, leave_out",
+        help="only these: environments, work_precision, general, bound, stability, conservation, leave_out",
     )
     parser.add_argument(
         "--processes", metavar="N", type=_count, default=os.cpu_count() or 1,
@@ -299,7 +299,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
 
 def run_report(args: argparse.Namespace) -> int:
     """Measure errors and write the page."""
-    for package in ("jinja2", "matplotlib", "mpmath", "scipy", "sympy"):
+    for package in ("flint", "jinja2", "matplotlib", "mpmath", "scipy", "sympy"):
         if find_spec(package) is None:
             raise UserError(f'{package} is missing: pip install "lag-envs[report]"')
     from lag_envs.report.report import SECTIONS, NotAReport, Settings, make_report

@@ -16,7 +16,7 @@ from lag_envs.report.content import Content
 from lag_envs.report.runner import Result, module, run_jobs, versions
 
 #: Modules of this package, in the order of the page.
-SECTIONS = ("environments", "work_precision", "bound", "stability", "conservation", "leave_out")
+SECTIONS = ("environments", "work_precision", "general", "bound", "stability", "conservation", "leave_out")
 FILE = "report.json"
 
 

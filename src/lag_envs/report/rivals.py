@@ -23,7 +23,7 @@ from lag_envs.report.steppers import METHODS, Arithmetic
 from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
-from lag_envs.stepping.tracing import Trace
+from lag_envs.stepping.elementary import ElementaryTrace
 
 
 class Rival(ABC):
@@ -207,7 +207,7 @@ def _names(equation: Equation) -> tuple[list[str], list[str]]:
 def _step(equation: Equation, method: str, carried: bool) -> list[str]:
     """Return the lines that take the unknowns y0, y1, ... one step of length h further, from the time t."""
     y, p = _names(equation)
-    trace = Trace()
+    trace = ElementaryTrace()
     given = trace.inputs(*y, *p, "t", "h")
     formula = equation.stepper(method, carried)
     moved = formula(given[: len(y)], given[len(y) : -2], *given[-2:], Arithmetic(trace))
