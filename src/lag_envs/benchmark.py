@@ -34,6 +34,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 import lag_envs
+from lag_envs.own_files import registered
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -55,7 +56,7 @@ times.append(perf_counter())
 import numba
 times.append(perf_counter())
 import lag_envs
-env = gymnasium.make({id!r})
+{load}env = gymnasium.make({id!r})
 times.append(perf_counter())
 env.reset(seed=1)
 times.append(perf_counter())
@@ -103,6 +104,7 @@ class Settings:
     """What is measured, and for how long."""
 
     ids: tuple[str, ...] = tuple(TASKS)
+    files: tuple[str, ...] = ()  #: users' own, which register some of the ids
     sizes: tuple[int, ...] = SIZES
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
@@ -153,6 +155,17 @@ def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
     return list(np.random.default_rng(0).uniform(-scale, scale, (count, n, 1)).astype(np.float32))
 
 
+def actions_of(space: gym.Space, n: int) -> list[NDArray]:
+    """Return batches of n random actions of a space: uniform numbers, or choices."""
+    some = random_actions(n)
+    if isinstance(space, gym.spaces.Discrete):
+        return [((a[:, 0] + 1.0) * 0.5 * int(space.n)).astype(np.int64).clip(0, space.n - 1) for a in some]
+    if isinstance(space, gym.spaces.Box) and space.shape == (1,):
+        return [float(space.high[0]) * a for a in some]
+    space.seed(0)
+    return [np.array([space.sample() for _ in range(n)]).reshape(n, *(space.shape or ())) for _ in some[:64]]
+
+
 def made(id: str) -> Run:
     """Prepare one environment as users make it, in Gymnasium's default wrappers."""
     return single(gym.make(id))
@@ -165,12 +178,8 @@ def unwrapped(id: str) -> Run:
 
 def single(env: gym.Env) -> Run:
     """Prepare one environment of Gymnasium's interface."""
-    actions: list[Any]
-    if isinstance(env.action_space, gym.spaces.Discrete):
-        actions = [int(a[0, 0] > 0.0) for a in random_actions(1)]
-    else:
-        actions = [a[0] for a in random_actions(1, float(env.action_space.high[0]))]  # type: ignore[attr-defined]
-    endless = cycle(actions)
+    # A choice as Python's int, as users give it.
+    endless = cycle([a[0].item() if a.ndim == 1 else a[0] for a in actions_of(env.action_space, 1)])
     env.reset(seed=0)
 
     def run(steps: int) -> int:
@@ -198,7 +207,7 @@ def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
 def ours(id: str, n: int) -> Run:
     """Prepare a native vector environment."""
     envs = gym.make_vec(id, num_envs=n)
-    actions = random_actions(n)
+    actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     spread_out(envs, actions)
     return batch(envs.step, actions)
@@ -297,12 +306,14 @@ PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
 
 def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
+    for name in settings.files:
+        registered(name)
     rows = contestants(settings.ids, settings.sizes) if settings.speed else []
     stages: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
-        complete = cold_starts(settings.ids[0], settings.cold_starts, stages)
+        complete = cold_starts(settings.ids[0], settings.cold_starts, stages, settings.files)
     cold = {name: [sum(one) for one in many] for name, many in stages.items()}
     results = [summary(row, rows) for row in rows]
     report: dict[str, Any] = {
@@ -390,25 +401,26 @@ def rate(run: Run, steps: int, clock: Clock) -> float:
     return taken / (clock() - start)
 
 
-def cold_starts(id: str, count: int, times: dict[str, list[list[float]]]) -> bool:
+def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files: Sequence[str] = ()) -> bool:
     """Time the stages of whole processes into `times`; return False where the user broke it off."""
     empty = (count + 1) // 2
     with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
         try:
             for i in range(empty):
                 advance("cold start, cache empty")
-                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}"))
+                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}", files))
             for _ in range(count):
                 advance("cold start, cache filled")
-                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0"))
+                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0", files))
         except KeyboardInterrupt:
             return False
     return True
 
 
-def cold_start(id: str, cache: str) -> list[float]:
+def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     """Return the seconds of each of `STAGES` of a process that takes one step."""
-    command = [sys.executable, "-P", "-c", COLD_START.format(id=id)]
+    load = "".join(f"from lag_envs.own_files import registered; registered({name!r})\n" for name in files)
+    command = [sys.executable, "-P", "-c", COLD_START.format(id=id, load=load)]
     start = time.perf_counter()
     done = subprocess.run(
         command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True, text=True

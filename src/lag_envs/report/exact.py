@@ -224,14 +224,15 @@ class Motion:
         with flint.ctx.workprec(BITS):
             cap = flint.ctx.cap
             try:
-                pieces = 4
-                coarse = self._end(state, controls, dt, pieces)
-                while pieces < MOST_PIECES:
-                    pieces *= 2
-                    fine = self._end(state, controls, dt, pieces)
-                    if all(_agree(a, b) for a, b in zip(coarse, fine, strict=True)):
+                pieces, coarse = 4, None
+                while pieces <= MOST_PIECES:
+                    try:
+                        fine = self._end(state, controls, dt, pieces)
+                    except (ValueError, ZeroDivisionError):
+                        fine = None  # a ball in a denominator, or under a root, has grown over 0
+                    if coarse and fine and all(_agree(a, b) for a, b in zip(coarse, fine, strict=True)):
                         return fine
-                    coarse = fine
+                    pieces, coarse = 2 * pieces, fine
             finally:
                 flint.ctx.cap = cap
         raise Unresolved(f"{MOST_PIECES} pieces do not resolve the motion from {tuple(state)}")

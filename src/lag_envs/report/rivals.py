@@ -266,7 +266,7 @@ def blocks(columns: Array, width: int) -> Array:
     rows, count = columns.shape
     missing = -count % width
     filled = np.concatenate([columns, np.repeat(columns[:, :1], missing, axis=1)], axis=1)
-    return np.ascontiguousarray(filled.reshape(rows, -1, width).transpose(1, 0, 2))
+    return np.ascontiguousarray(filled.reshape(rows, (count + missing) // width, width).transpose(1, 0, 2))
 
 
 def unblocked(found: Array, count: int) -> Array:
