@@ -694,8 +694,8 @@ def _known(id: str) -> str:
     if id in TASKS:
         return id
     raise UserError(
-        f"there is no environment {id!r}, nor a file of that name; "
-        f"{hint(id, TASKS, '`lag-envs list` names all')}"
+        f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
+        "(a file of your own ends with .py)"
     )
 
 

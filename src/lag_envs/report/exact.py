@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 #: Bits of the arithmetic, coefficients of a series, and digits to which two computations have to agree.
 BITS, ORDER, DIGITS = 170, 30, 20
 #: A step is cut into so many pieces at most.
-MOST_PIECES = 2**12
+MOST_PIECES = 2**7
 
 _FUNCTIONS = {
     f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lag_envs import own_files
+from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
 from lag_envs.report import general
 from lag_envs.report.content import Claim, Content, Picture, Table
@@ -54,21 +56,37 @@ class Subject(NamedTuple):
     boxes: Sequence[tuple[float, float]]  #: of the state's entries, centre and half width
     controls: Sequence[tuple[float, float]]
 
+    task: type[Any] | None = None
+
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
-        """Return states that random controls lead to within a second from the starts, and random controls."""
+        """Return states of episodes under random actions, or random ones without a task; random controls."""
         rng = np.random.default_rng(seed)
-        states, controls = [], []
-        for _ in range(count):
-            start = [c + half * rng.uniform(-1, 1) for c, half in self.boxes]
-            steps = int(rng.integers(0, max(1, round(1.0 / self.dt)) + 1))
-            held = np.array([[rng.uniform(*box) for box in self.controls] for _ in range(steps + 1)])
+        low, high = (np.array([box[i] for box in self.controls]) for i in (0, 1))
+        controls = rng.uniform(low, high, (count, len(self.controls)))
+        if self.task is not None:
+            return _met(self.task, rng.integers(0, max(1, round(1.0 / self.dt)) + 1, count), seed), controls
+        centre, half = (np.array([box[i] for box in self.boxes]) for i in (0, 1))
+        return centre + half * rng.uniform(-1.0, 1.0, (count, len(centre))), controls
+
+
+def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
+    """Return the states that episodes under random actions have after so many steps, or before their ends."""
+    env = LagrangianEnv(task)  # type: ignore[arg-type]
+    env.action_space.seed(seed)
+    states = []
+    for i, length in enumerate(lengths):
+        env.reset(seed=seed if i == 0 else None)
+        state = env.state
+        for _ in range(length):
             try:
-                path = self.scene.simulate(start, held[:-1] if self.controls else steps, self.dt)
-            except StepRefused as error:
-                path = error.trajectory  # type: ignore[assignment]
-            states.append(path[-1])
-            controls.append(held[-1])
-        return np.array(states), np.array(controls).reshape(count, len(self.controls))
+                ended = any(env.step(env.action_space.sample())[2:4])
+            except StepRefused:
+                break
+            if ended:
+                break
+            state = env.state
+        states.append(state)
+    return np.array(states)
 
 
 def subjects(name: str) -> list[Subject]:
@@ -109,6 +127,7 @@ def _of_task(label: str, task: Any) -> Subject:
         task.dt,
         [(constants[f"centre{i}"], constants[f"half{i}"]) for i in range(len(scene.state_names))],
         [ranges.get(name, (0.0, 0.0)) for name in scene.control_names],
+        type(task),
     )
 
 
@@ -284,14 +303,13 @@ def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
 def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     """Return what is shown."""
     names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
-    found = general.best(rows)
+    found, factors = general.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
     pictures = [
         Picture(
             f"own-{general.slug(name)}",
             f"Error against time, {name}. One control step from {MEMBERS} states at most, {FEW} in a quick "
-            "report: "
-            "worst error, and time of a state's step; reference: Taylor series of SymPy's equations in "
-            "balls.",
+            "report: worst error, and CPU time of a state's step; reference: Taylor series of SymPy's "
+            "equations in balls.",
             partial(general.draw, name, some),
         )
         for name in names
@@ -301,18 +319,14 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     return Content(
         "Your own scenes",
         [
-            "Steps of one control interval, from states to which random controls lead within a second from "
-            "the "
-            "tasks' starts; of a scene without a task from states within a unit, or half a turn. Errors "
-            "are against "
-            "Taylor series of Lagrange's equations, which SymPy derives from the energies, in "
-            "python-flint's ball "
-            "arithmetic; relative to max(1, |entry|).",
+            "Steps of one control interval, from states to which random actions lead within a second of "
+            "the tasks' episodes; of a scene without a task from random states, a unit or half a turn at "
+            "most. Errors are against Taylor series of Lagrange's equations, which SymPy derives from the "
+            "energies, in python-flint's ball arithmetic; relative to max(1, |entry|). Times are medians "
+            "of the processor's time, samples taken in turn.",
             "The certificate bounds what the series of the step leave out; rounding comes on top. "
-            "Stability is asked "
-            f"for with each parameter multiplied by {', '.join(f'{f:g}' for f in FACTORS)}, where its "
-            "range allows "
-            "it: a step that cannot be certified is refused, and energy has to change by the work done.",
+            f"Stability is asked for with each parameter multiplied by {factors}, where its range allows it: "
+            "a step that cannot be certified is refused, and energy has to change by the work done.",
             *([f"Not taken part: {', '.join(missing)}."] if missing else []),
         ],
         [
@@ -346,8 +360,7 @@ def _steps(rows: Sequence[Row]) -> Table:
     return Table(
         "own-steps",
         "Steps as they are shipped: the share certified in one attempt, attempts a step, the largest bound "
-        "in units of "
-        "the state, and the worst error where the exact end was computed",
+        "in units of the state, and the worst error where the exact end was computed",
         (
             "scene",
             "step [s]",
@@ -405,7 +418,7 @@ def _claims(rows: Sequence[Row]) -> list[Claim]:
             f"{beyond:.1e} at most, {len(exact)} steps" if exact else "",
         ),
         Claim(
-            "No step is refused from the states that random controls lead to.",
+            "No step is refused from the states that random actions lead to.",
             refused == 0 if shares else None,
             f"{refused} of {sum(r['states'] for r in shares):,}" if shares else "",
         ),
