@@ -286,13 +286,13 @@ def test_play_steps_and_starts_anew(name, monkeypatch, capsys):
 @pytest.mark.parametrize("kind", ["Deliver", "Switched", "Drift"])
 def test_steps_keep_their_bounds(kind, monkeypatch):
     """Errors against SymPy's equations, whatever the task's actions are."""
-    monkeypatch.setattr("lag_envs.report.own.FEW", 4)
+    monkeypatch.setattr("lag_envs.report.own.FEW", 2)
     from lag_envs.report import own
 
     (subject,) = own.subjects(f"{SEVERAL}:{kind}")
     rows = list(own.steps(f"{SEVERAL}:{kind}", "", True, subject.name))
     exact = [row for row in rows if row["kind"] == "step"]
-    assert len(exact) >= own.FEW - 1
+    assert len(exact) >= 1
     assert max(row["beyond"] for row in exact) < own.ROUNDING
     assert rows[0]["kind"] == "certificate" and rows[0]["refused"] == 0
 

@@ -298,12 +298,19 @@ def first(name: str, rounds: int) -> Iterator[Row]:
 def _heyoka(system: System, mode: str) -> float:
     import heyoka
 
-    heyoka.llvm_state.clear_memcache()
     problems = SceneProblems(system.scene, *system.draw(1), system)
-    begin = process_time()
     width = 1 if mode == "single" else 2 * heyoka.recommended_simd_size()
-    Heyoka("Taylor", 1e-15)._integrator(problems.equation, width)
-    return process_time() - begin
+    state: Any = heyoka.llvm_state
+    # What it has compiled before, on this day or another, does not count; version 7 keeps it on disk too.
+    state.clear_memcache()
+    switch = getattr(state, "set_diskcache_enabled", lambda on: None)
+    switch(False)
+    try:
+        begin = process_time()
+        Heyoka("Taylor", 1e-15)._integrator(problems.equation, width)
+        return process_time() - begin
+    finally:
+        switch(True)
 
 
 def energy(quick: bool) -> Iterator[Row]:
@@ -375,7 +382,15 @@ def column(row: Row) -> str:
     return LABELS[row["family"]]
 
 
-COLUMNS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
+#: Those that are compared with, and in which columns they are.
+OTHERS = (
+    ("other libraries", ("heyoka", "MuJoCo", "Pinocchio")),
+    (
+        "steps of one length without a bound, compiled as ours is",
+        ("RK4, compiled", "DOP853, compiled", "Radau IIA, compiled"),
+    ),
+)
+COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 
 
 def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
@@ -405,7 +420,8 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     """Return what is shown: times at equal errors, equality of models, certificates, first steps, energy."""
     found = best(rows)
     missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
-    claims = [_equal(rows), _accurate(rows), *(_fastest(found, mode) for mode in MODES), _conserved(rows)]
+    fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
+    claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
     pictures = [
         Picture(
             f"general-{slug(name)}",
@@ -553,21 +569,21 @@ def _accurate(rows: Sequence[Row]) -> Claim:
     )
 
 
-def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> Claim:
+def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str, who: str, names: Sequence[str]) -> Claim:
     lost, cases = [], 0
     for (system, of, target), here in found.items():
-        if of != mode or "lag_envs" not in here or not _others(here):
+        others = [(ns, name) for ns, name in _others(here) if name in names]
+        if of != mode or "lag_envs" not in here or not others:
             continue
         cases += 1
-        ns, name = _others(here)[0]
+        ns, name = others[0]
         if ns < here["lag_envs"].ns:
             lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
+    told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
     return Claim(
-        f"Ours reaches each error in less time than any other, {MODES[mode]}.",
+        f"Ours reaches each error in less time than {who}, {MODES[mode]}.",
         not lost if cases else None,
-        (f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else ""))
-        if cases
-        else "",
+        told if cases else "",
     )
 
 
