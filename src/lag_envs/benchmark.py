@@ -71,6 +71,9 @@ STAGES = (
     "import lag_envs, gym.make", "reset", "step", "gym.make again",
 )  # fmt: skip
 
+#: Whose rows scenes of energies are, and how many bars the longest chain has.
+ENERGIES, LONGEST = "lag_envs, energies", 6
+
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
 Clock = Callable[[], float]
@@ -105,6 +108,7 @@ class Settings:
 
     ids: tuple[str, ...] = tuple(TASKS)
     files: tuple[str, ...] = ()  #: users' own, which register some of the ids
+    energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
     sizes: tuple[int, ...] = SIZES
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
@@ -147,6 +151,29 @@ def contestants(ids: Sequence[str], sizes: Sequence[int]) -> list[Contestant]:
     for library, id, prepare in PEERS:
         rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
     return rows
+
+
+def of_energies(sizes: Sequence[int]) -> list[Contestant]:
+    """Return the exact CartPole and the double pendulum at all sizes, and chains of bars at the largest."""
+    some: list[tuple[str, str, dict[str, Any], int]]
+    some = [("CartPole, exact", "ExactCartPole", {}, n) for n in sizes]
+    some += [("Chain(2)", "ChainSwing", {"bars": 2}, n) for n in sizes]
+    some += [(f"Chain({i})", "ChainSwing", {"bars": i}, max(sizes)) for i in (1, *range(3, LONGEST + 1))]
+    return [
+        Contestant(ENERGIES, id, "vector", n, partial(energies, task, given, n))
+        for id, task, given, n in some
+    ]
+
+
+def energies(task: str, given: dict[str, Any], n: int) -> Run:
+    """Prepare a vector environment of a task of `benchmark_tasks`."""
+    from lag_envs.envs.vector import LagrangianVectorEnv
+
+    envs = LagrangianVectorEnv(f"lag_envs.benchmark_tasks:{task}", n, **given)
+    actions = actions_of(envs.single_action_space, n)
+    envs.reset(seed=0)
+    spread_out(envs, actions)
+    return batch(envs.step, actions)
 
 
 def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
@@ -309,6 +336,8 @@ def bench(settings: Settings) -> dict[str, Any]:
     for name in settings.files:
         registered(name)
     rows = contestants(settings.ids, settings.sizes) if settings.speed else []
+    if settings.speed and settings.energies:
+        rows += of_energies(settings.sizes)
     stages: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
@@ -336,6 +365,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         },
     }
     report["targets"] = verdicts(results, cold)
+    report["chains"] = chains(results)
     print("\n".join(table(report)))
     if settings.output:
         Path(settings.output).write_text(to_json(report), encoding="utf-8")
@@ -522,6 +552,32 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     return results
 
 
+def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
+
+    Examples
+    --------
+    >>> about = {"library": ENERGIES, "num_envs": 8}
+    >>> rows = [
+    ...     {**about, "id": f"Chain({n})", "steps_per_second": [0.0, 1e9 / n**2, 0.0]} for n in (1, 2, 4)
+    ... ]
+    >>> chains(rows)
+    {'bars': [1, 2, 4], 'ns': [1.0, 4.0, 16.0], 'exponent': 2.0}
+    """
+    found = [
+        r
+        for r in rows
+        if r["library"] == ENERGIES and r["id"].startswith("Chain") and "steps_per_second" in r
+    ]
+    largest = max((r["num_envs"] for r in found), default=0)
+    times = {int(r["id"][6:-1]): 1e9 / r["steps_per_second"][1] for r in found if r["num_envs"] == largest}
+    if len(times) < 2:
+        return None
+    bars = sorted(times)
+    slope = np.polyfit(np.log(bars), np.log([times[n] for n in bars]), 1)[0]
+    return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
+
+
 def machine() -> dict[str, Any]:
     """Describe the machine."""
     model = platform.processor()
@@ -580,6 +636,9 @@ def table(report: dict[str, Any]) -> list[str]:
             "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
             "",
         ]
+    if found := report.get("chains"):
+        times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
+        lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
@@ -630,6 +689,18 @@ def markdown(report: dict[str, Any]) -> str:
         f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
         "\n".join("| " + " | ".join(line) + " |" for line in lines),
     ]
+    exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
+    if exact:
+        size = max(r["num_envs"] for r in exact)
+        told = [
+            f"`{r['id']}` {1e9 / r['steps_per_second'][1]:,.0f} ns, {r['ratio'][1]:.2f}×"
+            for r in exact
+            if r["num_envs"] == size and r["id"] in ("CartPole, exact", "Chain(2)")
+        ]
+        parts.append(
+            f"Scenes that are only energies, {size:,} at once, beside the same `CartPole-v1`: "
+            f"{'; '.join(told)}."
+        )
     if cold := report["cold_start"]:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")

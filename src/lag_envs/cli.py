@@ -246,6 +246,7 @@ def run_bench(args: argparse.Namespace) -> int:
     plain = {
         "ids": ids,
         "files": files,
+        "energies": not (args.quick or args.ids),
         "speed": not args.cold,
         "clock": args.clock,
         "date": args.date,
