@@ -235,7 +235,9 @@ def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
 
 def test_cold_start_times_empty_and_filled_caches(monkeypatch):
     caches = []
-    monkeypatch.setattr(benchmark, "cold_start", lambda id, cache: caches.append(cache) or [len(caches)])
+    monkeypatch.setattr(
+        benchmark, "cold_start", lambda id, cache, files: caches.append(cache) or [len(caches)]
+    )
     times = {}
     assert benchmark.cold_starts(ID, 3, times)
     assert times == {"empty": [[1], [2]], "filled": [[3], [4], [5]]}
@@ -249,6 +251,41 @@ def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
     assert len(stages) == len(benchmark.STAGES)
     assert 0.0 < sum(stages) < time.perf_counter() - start
     assert all(stage > 0.0 for stage in stages)
+
+
+def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(benchmark, "LONGEST", 2)
+    report = benchmark.bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))
+    for id in ("CartPole, exact", "Chain(1)", "Chain(2)"):
+        found = row(report, id, num_envs=3)
+        assert found["problem"] is None and found["ratio"]
+    assert report["chains"]["bars"] == [1, 2]
+    assert "grows like the power" in capsys.readouterr().out
+
+
+def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
+    """Over a short step Euler's error is small: the same start goes the same way, to the same ending."""
+    import gymnasium as gym
+    import numpy as np
+
+    from lag_envs.envs.single import LagrangianEnv
+
+    ours = LagrangianEnv("lag_envs.benchmark_tasks:ExactCartPole", dt=1e-4)
+    theirs = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
+    theirs.tau = 1e-4
+    start = np.array([0.01, -0.02, 0.03, 0.04])
+    ours.reset(options={"state": start})
+    theirs.reset(seed=0)
+    theirs.state = start
+    for i in range(20_000):
+        action = (i // 700) % 2
+        a, b = ours.step(action), theirs.step(action)
+        assert a[2] == b[2] or abs(abs(a[0][2]) - np.radians(12.0)) < 2e-3
+        if a[2] or b[2]:
+            break
+    assert i > 1000
+    np.testing.assert_allclose(a[0], b[0], atol=5e-3)
+    assert ours.action_space == theirs.action_space
 
 
 # --- statistics on known numbers ---

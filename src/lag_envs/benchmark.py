@@ -34,6 +34,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 import lag_envs
+from lag_envs.own_files import registered
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -55,7 +56,7 @@ times.append(perf_counter())
 import numba
 times.append(perf_counter())
 import lag_envs
-env = gymnasium.make({id!r})
+{load}env = gymnasium.make({id!r})
 times.append(perf_counter())
 env.reset(seed=1)
 times.append(perf_counter())
@@ -69,6 +70,9 @@ STAGES = (
     "Python's own start and end", "import numpy", "import gymnasium", "import numba",
     "import lag_envs, gym.make", "reset", "step", "gym.make again",
 )  # fmt: skip
+
+#: Whose rows scenes of energies are, and how many bars the longest chain has.
+ENERGIES, LONGEST = "lag_envs, energies", 6
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -103,6 +107,8 @@ class Settings:
     """What is measured, and for how long."""
 
     ids: tuple[str, ...] = tuple(TASKS)
+    files: tuple[str, ...] = ()  #: users' own, which register some of the ids
+    energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
     sizes: tuple[int, ...] = SIZES
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
@@ -147,10 +153,44 @@ def contestants(ids: Sequence[str], sizes: Sequence[int]) -> list[Contestant]:
     return rows
 
 
+def of_energies(sizes: Sequence[int]) -> list[Contestant]:
+    """Return the exact CartPole and the double pendulum at all sizes, and chains of bars at the largest."""
+    some: list[tuple[str, str, dict[str, Any], int]]
+    some = [("CartPole, exact", "ExactCartPole", {}, n) for n in sizes]
+    some += [("Chain(2)", "ChainSwing", {"bars": 2}, n) for n in sizes]
+    some += [(f"Chain({i})", "ChainSwing", {"bars": i}, max(sizes)) for i in (1, *range(3, LONGEST + 1))]
+    return [
+        Contestant(ENERGIES, id, "vector", n, partial(energies, task, given, n))
+        for id, task, given, n in some
+    ]
+
+
+def energies(task: str, given: dict[str, Any], n: int) -> Run:
+    """Prepare a vector environment of a task of `benchmark_tasks`."""
+    from lag_envs.envs.vector import LagrangianVectorEnv
+
+    envs = LagrangianVectorEnv(f"lag_envs.benchmark_tasks:{task}", n, **given)
+    actions = actions_of(envs.single_action_space, n)
+    envs.reset(seed=0)
+    spread_out(envs, actions)
+    return batch(envs.step, actions)
+
+
 def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
     """Return batches of shape (n, 1), uniform in [-scale, scale]: enough that they do not repeat too soon."""
     count = max(8, min(1024, 2**17 // n))
     return list(np.random.default_rng(0).uniform(-scale, scale, (count, n, 1)).astype(np.float32))
+
+
+def actions_of(space: gym.Space, n: int) -> list[NDArray]:
+    """Return batches of n random actions of a space: uniform numbers, or choices."""
+    some = random_actions(n)
+    if isinstance(space, gym.spaces.Discrete):
+        return [((a[:, 0] + 1.0) * 0.5 * int(space.n)).astype(np.int64).clip(0, space.n - 1) for a in some]
+    if isinstance(space, gym.spaces.Box) and space.shape == (1,):
+        return [float(space.high[0]) * a for a in some]
+    space.seed(0)
+    return [np.array([space.sample() for _ in range(n)]).reshape(n, *(space.shape or ())) for _ in some[:64]]
 
 
 def made(id: str) -> Run:
@@ -165,12 +205,8 @@ def unwrapped(id: str) -> Run:
 
 def single(env: gym.Env) -> Run:
     """Prepare one environment of Gymnasium's interface."""
-    actions: list[Any]
-    if isinstance(env.action_space, gym.spaces.Discrete):
-        actions = [int(a[0, 0] > 0.0) for a in random_actions(1)]
-    else:
-        actions = [a[0] for a in random_actions(1, float(env.action_space.high[0]))]  # type: ignore[attr-defined]
-    endless = cycle(actions)
+    # A choice as Python's int, as users give it.
+    endless = cycle([a[0].item() if a.ndim == 1 else a[0] for a in actions_of(env.action_space, 1)])
     env.reset(seed=0)
 
     def run(steps: int) -> int:
@@ -198,7 +234,7 @@ def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
 def ours(id: str, n: int) -> Run:
     """Prepare a native vector environment."""
     envs = gym.make_vec(id, num_envs=n)
-    actions = random_actions(n)
+    actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     spread_out(envs, actions)
     return batch(envs.step, actions)
@@ -297,12 +333,16 @@ PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
 
 def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
+    for name in settings.files:
+        registered(name)
     rows = contestants(settings.ids, settings.sizes) if settings.speed else []
+    if settings.speed and settings.energies:
+        rows += of_energies(settings.sizes)
     stages: dict[str, list[list[float]]] = {}
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
     if complete and settings.cold_starts:
-        complete = cold_starts(settings.ids[0], settings.cold_starts, stages)
+        complete = cold_starts(settings.ids[0], settings.cold_starts, stages, settings.files)
     cold = {name: [sum(one) for one in many] for name, many in stages.items()}
     results = [summary(row, rows) for row in rows]
     report: dict[str, Any] = {
@@ -325,6 +365,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         },
     }
     report["targets"] = verdicts(results, cold)
+    report["chains"] = chains(results)
     print("\n".join(table(report)))
     if settings.output:
         Path(settings.output).write_text(to_json(report), encoding="utf-8")
@@ -390,25 +431,26 @@ def rate(run: Run, steps: int, clock: Clock) -> float:
     return taken / (clock() - start)
 
 
-def cold_starts(id: str, count: int, times: dict[str, list[list[float]]]) -> bool:
+def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files: Sequence[str] = ()) -> bool:
     """Time the stages of whole processes into `times`; return False where the user broke it off."""
     empty = (count + 1) // 2
     with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
         try:
             for i in range(empty):
                 advance("cold start, cache empty")
-                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}"))
+                times.setdefault("empty", []).append(cold_start(id, f"{folder}/{i}", files))
             for _ in range(count):
                 advance("cold start, cache filled")
-                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0"))
+                times.setdefault("filled", []).append(cold_start(id, f"{folder}/0", files))
         except KeyboardInterrupt:
             return False
     return True
 
 
-def cold_start(id: str, cache: str) -> list[float]:
+def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     """Return the seconds of each of `STAGES` of a process that takes one step."""
-    command = [sys.executable, "-P", "-c", COLD_START.format(id=id)]
+    load = "".join(f"from lag_envs.own_files import registered; registered({name!r})\n" for name in files)
+    command = [sys.executable, "-P", "-c", COLD_START.format(id=id, load=load)]
     start = time.perf_counter()
     done = subprocess.run(
         command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True, text=True
@@ -510,6 +552,32 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     return results
 
 
+def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
+
+    Examples
+    --------
+    >>> about = {"library": ENERGIES, "num_envs": 8}
+    >>> rows = [
+    ...     {**about, "id": f"Chain({n})", "steps_per_second": [0.0, 1e9 / n**2, 0.0]} for n in (1, 2, 4)
+    ... ]
+    >>> chains(rows)
+    {'bars': [1, 2, 4], 'ns': [1.0, 4.0, 16.0], 'exponent': 2.0}
+    """
+    found = [
+        r
+        for r in rows
+        if r["library"] == ENERGIES and r["id"].startswith("Chain") and "steps_per_second" in r
+    ]
+    largest = max((r["num_envs"] for r in found), default=0)
+    times = {int(r["id"][6:-1]): 1e9 / r["steps_per_second"][1] for r in found if r["num_envs"] == largest}
+    if len(times) < 2:
+        return None
+    bars = sorted(times)
+    slope = np.polyfit(np.log(bars), np.log([times[n] for n in bars]), 1)[0]
+    return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
+
+
 def machine() -> dict[str, Any]:
     """Describe the machine."""
     model = platform.processor()
@@ -568,6 +636,9 @@ def table(report: dict[str, Any]) -> list[str]:
             "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
             "",
         ]
+    if found := report.get("chains"):
+        times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
+        lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
@@ -618,6 +689,18 @@ def markdown(report: dict[str, Any]) -> str:
         f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
         "\n".join("| " + " | ".join(line) + " |" for line in lines),
     ]
+    exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
+    if exact:
+        size = max(r["num_envs"] for r in exact)
+        told = [
+            f"`{r['id']}` {1e9 / r['steps_per_second'][1]:,.0f} ns, {r['ratio'][1]:.2f}×"
+            for r in exact
+            if r["num_envs"] == size and r["id"] in ("CartPole, exact", "Chain(2)")
+        ]
+        parts.append(
+            f"Scenes that are only energies, {size:,} at once, beside the same `CartPole-v1`: "
+            f"{'; '.join(told)}."
+        )
     if cold := report["cold_start"]:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")

@@ -21,9 +21,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs import TASKS, __version__
 from lag_envs.errors import UserError, hint
+from lag_envs.own_files import is_file
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
+
+
+#: What `report`, `info`, `bench` and `play` take besides ids.
+OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
 
 
 class Command(NamedTuple):
@@ -72,14 +77,25 @@ def _controls(task: Task) -> list[str]:
 
 def declare_info(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``info``."""
-    parser.add_argument("id", metavar="ID", help="an environment, such as PivotedBar-v0")
+    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN}")
 
 
 def run_info(args: argparse.Namespace) -> int:
     """Print what there is to know about an environment."""
     from lag_envs.envs.single import observation_space
+    from lag_envs.tasks.contract import Task as GeneralTask
 
-    task = _task(_known(args.id))
+    if is_file(args.id):
+        from lag_envs import own_files
+
+        task = own_files.made(own_files.one(args.id), args.id)
+    else:
+        task = _task(_known(args.id))
+    if isinstance(task, GeneralTask):
+        from lag_envs.facts import facts
+
+        print("\n".join(facts(task, task.id or type(task).__name__)))
+        return 0
     scene = task.scene
     text = [args.id, "", *_description(task)]
     text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
@@ -171,7 +187,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "ids",
         metavar="ID",
         nargs="*",
-        help="environments to measure (default: all; PivotedBar-v0 with --quick)",
+        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN}s",
     )
     parser.add_argument(
         "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
@@ -214,9 +230,8 @@ def run_bench(args: argparse.Namespace) -> int:
     """Compare speeds."""
     from lag_envs.benchmark import Settings, in_own_process
 
-    ids = tuple(map(_known, dict.fromkeys(args.ids))) or (
-        ("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS)
-    )
+    ids, files = _measured(args.ids)
+    ids = ids or (("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS))
     if args.output:
         _check_writable(Path(args.output))
     if args.checkout is not None:
@@ -238,6 +253,8 @@ def run_bench(args: argparse.Namespace) -> int:
     }
     plain = {
         "ids": ids,
+        "files": files,
+        "energies": not (args.quick or args.ids),
         "speed": not args.cold,
         "clock": args.clock,
         "date": args.date,
@@ -245,6 +262,17 @@ def run_bench(args: argparse.Namespace) -> int:
         "checkout": args.checkout,
     }
     return in_own_process(Settings(**(quick | given | plain)))
+
+
+def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the ids that are meant, and those of the names that are files."""
+    from lag_envs import own_files
+
+    files = tuple(dict.fromkeys(name for name in names if is_file(name)))
+    ids: list[str] = []
+    for name in names:
+        ids += own_files.registered(name) if name in files else [_known(name)]
+    return tuple(dict.fromkeys(ids)), files
 
 
 def _check_writable(path: Path) -> None:
@@ -283,15 +311,16 @@ def _seconds(text: str) -> float:
 def declare_report(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``report``."""
     parser.add_argument(
-        "folder", metavar="FOLDER", nargs="?", default="report", help="where to write (default: report)"
-    )
+        "places", metavar="[FILE] [FOLDER]", nargs="*",
+        help=f"{OWN}, if it is to be measured; and where to write (default: report, or report-NAME)",
+    )  # fmt: skip
     parser.add_argument(
         "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
     )
     parser.add_argument(
         "--sections",
         metavar="NAME,...",
-        help="only these: environments, work_precision, bound, stability, conservation, leave_out",
+        help="only these: environments, work_precision, general, bound, stability, conservation, leave_out",
     )
     parser.add_argument(
         "--processes", metavar="N", type=_count, default=os.cpu_count() or 1,
@@ -307,28 +336,89 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
 
 def run_report(args: argparse.Namespace) -> int:
     """Measure errors and write the page."""
-    for package in ("jinja2", "matplotlib", "mpmath", "scipy", "sympy"):
+    for package in ("flint", "jinja2", "matplotlib", "mpmath", "scipy", "sympy"):
         if find_spec(package) is None:
             raise UserError(f'{package} is missing: pip install "lag-envs[report]"')
     from lag_envs.report.report import SECTIONS, NotAReport, Settings, make_report
 
+    file, folder = _places(args.places)
+    if file:
+        from lag_envs.report import own
+
+        for option in ("sections", "docs"):
+            if getattr(args, option):
+                raise UserError(f"--{option} is for the report about this package: leave out it, or {file}")
+        own.subjects(file)  # what is wrong with the file is said before anything is measured
+        made = Settings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
+        try:
+            return 0 if make_report(made) else 130
+        except (NotAReport, OSError) as error:
+            raise UserError(str(error)) from error
     names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
     for name in names:
         if name not in SECTIONS:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs and (args.quick or names != SECTIONS):
         raise UserError("--docs takes a whole report: leave out --quick and --sections")
-    settings = Settings(args.folder, args.quick, names, args.processes, args.date)
+    settings = Settings(folder, args.quick, names, args.processes, args.date)
     try:
         if not make_report(settings):
             return 130
         if args.docs:
             from lag_envs.report import docs
 
-            return docs.main([args.folder, args.docs])
+            return docs.main([folder, args.docs])
         return 0
     except (NotAReport, OSError) as error:
         raise UserError(str(error)) from error
+
+
+def _places(places: Sequence[str]) -> tuple[str, str]:
+    """Return the file that is measured, or nothing, and the report's folder."""
+    files = [place for place in places if is_file(place) and not Path(place).is_dir() and ".py" in place]
+    folders = [place for place in places if place not in files]
+    if len(files) > 1 or len(folders) > 1:
+        raise UserError(f"one FILE and one FOLDER at most, got {' '.join(places)}")
+    if files:
+        from lag_envs.own_files import split
+
+        return files[0], folders[0] if folders else f"report-{Path(split(files[0])[0]).stem}"
+    return "", folders[0] if folders else "report"
+
+
+# --- play ---
+
+
+def declare_play(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``play``."""
+    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN}")
+    parser.add_argument(
+        "--seed", metavar="N", type=int, help="seed of the starts (default: another each time)"
+    )
+    parser.add_argument("--steps", metavar="N", type=_count, help="end after so many steps")
+
+
+def run_play(args: argparse.Namespace) -> int:
+    """Let the user drive."""
+    from gymnasium.error import Error
+
+    if find_spec("pygame") is None:
+        raise UserError('pygame is missing: pip install "lag-envs[render]"')
+    from lag_envs import own_files
+    from lag_envs.play import play
+
+    if args.seed is not None and args.seed < 0:
+        raise UserError(f"--seed must be at least 0, got {args.seed}")
+    if is_file(args.id):
+        task, path = own_files.one(args.id), own_files.split(args.id)[0]
+        (id,) = own_files.registered(f"{path}:{task.__name__}")
+    else:
+        id = _known(args.id)
+    try:
+        play(id, steps=args.steps, seed=args.seed)
+    except Error as error:
+        raise UserError(str(error)) from error
+    return 0
 
 
 # --- hyperparams ---
@@ -425,7 +515,9 @@ COMMANDS: tuple[Command, ...] = (
 
 examples:
   lag-envs info PivotedBar-v0
-  lag-envs info InclineTilt-v0""",
+  lag-envs info InclineTilt-v0
+  lag-envs info ball_on_beam.py              a task of your own; this runs the file
+  lag-envs info mine.py:Balance              one of several""",
         declare_info,
         run_info,
     ),
@@ -441,6 +533,7 @@ examples:
   lag-envs bench --output speed.json                 everything, a few minutes
   lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 InclineTilt-v0 --sizes 64,16384
+  lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
         declare_bench,
@@ -458,9 +551,23 @@ examples:
   lag-envs report --quick                            a first look, under a minute
   lag-envs report                                    everything, about half an hour on two cores
   lag-envs report --docs .                           the same, and what this checkout says of it
-  lag-envs report --sections bound,stability maps    two parts, into the folder maps""",
+  lag-envs report --sections bound,stability maps    two parts, into the folder maps
+  lag-envs report ball_on_beam.py                    scenes of your own, into report-ball_on_beam;
+                                                     this runs the file""",
         declare_report,
         run_report,
+    ),
+    Command(
+        "play",
+        "drive an environment by keys",
+        """Drive an environment by keys, in a window, at the pace of its control interval: the arrow keys are
+for the first two controls, a, d, s and w for two more.
+
+examples:
+  lag-envs play PivotedBar-v0
+  lag-envs play ball_on_beam.py              a task of your own; this runs the file""",
+        declare_play,
+        run_play,
     ),
     Command(
         "hyperparams",
@@ -595,7 +702,10 @@ def _known(id: str) -> str:
     """Return the id, or raise a UserError that names similar ones."""
     if id in TASKS:
         return id
-    raise UserError(f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')}")
+    raise UserError(
+        f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
+        "(a file of your own ends with .py)"
+    )
 
 
 def _task(id: str) -> Task:

@@ -22,7 +22,7 @@ from lag_envs.report.report import FILE, content_of, write_json
 
 FIGURES = "images/accuracy"
 #: Sections whose summaries README shows.
-SHOWN = ("environments", "work_precision", "stability")
+SHOWN = ("environments", "work_precision", "general", "stability")
 LARGEST_SVG = 200_000  #: bytes
 
 

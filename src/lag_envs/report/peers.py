@@ -21,7 +21,7 @@ from lag_envs.report.timing import Sample
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
-from lag_envs.stepping.tracing import Trace
+from lag_envs.stepping.elementary import ElementaryTrace
 
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 SUBSTEPS = (1, 4, 16, 64)
@@ -117,9 +117,9 @@ class SciPy(Peer):
         return solve
 
 
-def _recorded(equation: Equation) -> tuple[list[str], list]:
+def recorded(equation: Equation) -> tuple[list[str], list]:
     """Return the lines of the rate of y0, y1, ... with p0, p1, ... at the time t, and its values."""
-    trace = Trace()
+    trace = ElementaryTrace()
     names = [f"y{i}" for i in range(equation.size)], [f"p{i}" for i in range(equation.parameters)]
     (t,), y, p = trace.inputs("t"), trace.inputs(*names[0]), trace.inputs(*names[1])
     found = equation.rate(t, y, p, Arithmetic(trace))
@@ -129,7 +129,7 @@ def _recorded(equation: Equation) -> tuple[list[str], list]:
 @cache
 def _rate(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of one state; the parameters are a tuple."""
-    lines, values = _recorded(equation)
+    lines, values = recorded(equation)
     source = [
         "def rate(t, y, p):",
         *(f"y{i} = y[{i}]" for i in range(equation.size)),
@@ -145,7 +145,7 @@ def _rate(equation: Equation) -> Callable:
 @cache
 def _rate_of_many(equation: Equation) -> Callable:
     """Compile ``rate(t, y, p)`` of many states, one after the other in y; p has a row for each parameter."""
-    lines, values = _recorded(equation)
+    lines, values = recorded(equation)
     size = equation.size
     source = [
         "def rate(t, y, p):",
@@ -168,10 +168,11 @@ class Heyoka(Peer):
 
     Its compiled step is called from a compiled loop where a control is held for one step, so that no call
     from Python counts; over longer times it is `propagate_until`, in one call. A batch goes in blocks of
-    twice the width that heyoka recommends, the fastest of those tried.
+    twice the width that heyoka recommends, or of that width ("narrow"), the fastest of those tried.
     """
 
     family = "heyoka"
+    NARROW = "Taylor, narrow"
     settings: ClassVar = {"Taylor": (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)}
 
     @property
@@ -183,7 +184,7 @@ class Heyoka(Peer):
         """Compile the integrator, and find its step."""
         import heyoka
 
-        width = 2 * heyoka.recommended_simd_size() if together else 1
+        width = heyoka.recommended_simd_size() * (1 if self.method == self.NARROW else 2) if together else 1
         integrator = self._integrator(problems.equation, width)
         size, count, span = problems.equation.size, len(problems), dt * steps
         start, p = blocks(problems.y[:size], width), blocks(problems.p, width)

@@ -16,7 +16,7 @@ from lag_envs.report.content import Content
 from lag_envs.report.runner import Result, module, run_jobs, versions
 
 #: Modules of this package, in the order of the page.
-SECTIONS = ("environments", "work_precision", "bound", "stability", "conservation", "leave_out")
+SECTIONS = ("environments", "work_precision", "general", "bound", "stability", "conservation", "leave_out")
 FILE = "report.json"
 
 
@@ -29,6 +29,7 @@ class Settings:
     sections: tuple[str, ...] = SECTIONS
     processes: int = 2
     date: str = ""
+    file: str = ""  #: a user's own, which is measured in place of the package
 
 
 class NotAReport(ValueError):
@@ -46,7 +47,8 @@ def make_report(settings: Settings) -> bool:
         For a folder that cannot be written to.
     """
     folder = prepare(Path(settings.folder))
-    jobs = [job for name in settings.sections for job in module(name).jobs(settings.quick)]
+    given = (settings.quick, settings.file) if settings.file else (settings.quick,)
+    jobs = [job for name in settings.sections for job in module(name).jobs(*given)]
     begin = time.monotonic()
     results, complete = run_jobs(jobs, folder, settings.processes, lambda text: print(text, file=sys.stderr))
     found = collect(settings, results, complete, time.monotonic() - begin)

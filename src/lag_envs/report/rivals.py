@@ -23,7 +23,7 @@ from lag_envs.report.steppers import METHODS, Arithmetic
 from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
-from lag_envs.stepping.tracing import Trace
+from lag_envs.stepping.elementary import ElementaryTrace
 
 
 class Rival(ABC):
@@ -207,7 +207,7 @@ def _names(equation: Equation) -> tuple[list[str], list[str]]:
 def _step(equation: Equation, method: str, carried: bool) -> list[str]:
     """Return the lines that take the unknowns y0, y1, ... one step of length h further, from the time t."""
     y, p = _names(equation)
-    trace = Trace()
+    trace = ElementaryTrace()
     given = trace.inputs(*y, *p, "t", "h")
     formula = equation.stepper(method, carried)
     moved = formula(given[: len(y)], given[len(y) : -2], *given[-2:], Arithmetic(trace))
@@ -266,7 +266,7 @@ def blocks(columns: Array, width: int) -> Array:
     rows, count = columns.shape
     missing = -count % width
     filled = np.concatenate([columns, np.repeat(columns[:, :1], missing, axis=1)], axis=1)
-    return np.ascontiguousarray(filled.reshape(rows, -1, width).transpose(1, 0, 2))
+    return np.ascontiguousarray(filled.reshape(rows, (count + missing) // width, width).transpose(1, 0, 2))
 
 
 def unblocked(found: Array, count: int) -> Array:

@@ -29,7 +29,7 @@ Row = dict[str, Any]
 #: Whose versions matter.
 LIBRARIES = (
     "gymnasium", "numpy", "numba", "llvmlite", "scipy", "mpmath", "sympy", "matplotlib",
-    "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco",
+    "python-flint", "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco", "pin",
 )  # fmt: skip
 
 

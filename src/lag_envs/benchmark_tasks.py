@@ -1,0 +1,61 @@
+"""Tasks on scenes of energies that ``lag-envs bench`` sets beside Gymnasium's CartPole, one of them its own."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+from lag_envs.scenes import CartPole, Chain
+from lag_envs.tasks import Task
+
+
+class ExactCartPole(Task):
+    """Gymnasium's `CartPole-v1`: its model, choices, start, reward and endings, without Euler's error."""
+
+    scene: Any = CartPole
+    interval, steps = 0.02, 500
+    action: ClassVar = {"force": [-10.0, 10.0]}
+    start: ClassVar = dict.fromkeys(("x", "x_dot", "theta", "theta_dot"), 0.05)
+
+    def observe(self, after: Any, target: Any, xp: Any) -> dict[str, Any]:
+        """Return the state."""
+        return {name: after[name] for name in self.scene.state_names}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 1."""
+        return 1.0
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        return (xp.abs(after.x) > 2.4) | (xp.abs(after.theta) > math.radians(12.0))
+
+
+class ChainSwing(Task):
+    """Bars that hang from a support which is pushed to and fro; they start anywhere, turning fast."""
+
+    scene: Any = Chain
+    interval, steps = 0.02, 500
+    action: ClassVar = {"s_ddot": 5.0}
+
+    @property
+    def start(self) -> dict[str, float]:
+        """Return a box around hanging still."""
+        names = self.scene.coordinates
+        return dict.fromkeys(names, math.pi) | {f"{name}_dot": 3.0 for name in names}
+
+    def observe(self, after: Any, target: Any, xp: Any) -> dict[str, Any]:
+        """Return cosine, sine and rate of each angle, and the support's place and rate."""
+        found = {"s": after.s, "s_dot": after.s_dot}
+        for name in self.scene.coordinates:
+            found |= {f"cos({name})": xp.cos(after[name]), f"sin({name})": xp.sin(after[name])}
+            found[f"{name}_dot"] = after[f"{name}_dot"]
+        return found
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return how high the chain's end is, and what a place off the middle costs."""
+        height = sum(-xp.cos(after[name]) for name in self.scene.coordinates)
+        return height - 0.1 * after.s**2
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the support has left its track."""
+        return xp.abs(after.s) > 2.4

@@ -1,0 +1,139 @@
+"""What there is to know about a task of the general contract, as text; the command ``lag-envs info``."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lag_envs.benchmark import columns
+from lag_envs.envs.single import observation_space
+from lag_envs.scenes.base import StepRefused
+from lag_envs.tasks.contract import Task
+
+
+def facts(task: Task, name: str) -> list[str]:
+    """Return the lines: description, state, controls, observation, start, parameters, accuracy."""
+    scene = task.scene
+    states = zip(scene.state_names, scene.state_units, strict=True)
+    text = [name, "", _description(task), "", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
+    text += [f"State: {', '.join(f'{name} [{unit}]' for name, unit in states)}"]
+    text += [f"Step: {task.dt:g} s; episode: {task.limit:g} steps, {task.duration:g} s"]
+    text += ["", "Controls, and the actions that set them", *_indented(_controls(task))]
+    if task.formulas.target_boxes:
+        rows: list[tuple[str, ...]] = [
+            (t.name, f"{t.centre:g} ± {t.half:g} {t.unit}", "or target=...")
+            for t in task.formulas.target_boxes
+        ]
+        text += ["", "Targets (uniform)", *_indented(rows)]
+    space = observation_space([task])  # type: ignore[list-item]
+    bounds = zip(task.observation, space.low.tolist(), space.high.tolist(), strict=True)
+    text += [
+        "",
+        "Observation and its bounds",
+        *_indented([(n, _bound(low, high)) for n, low, high in bounds]),
+    ]
+    text += ["", "Start (uniform, unless reset(options={'state': ...}))", *_indented(_starts(task))]
+    text += ["", "Parameters, keywords of gym.make", *_indented(_parameters(task))]
+    text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
+    return text
+
+
+def _indented(rows: list[tuple[str, ...]]) -> list[str]:
+    return [f"  {line}" for line in columns(rows)] if rows else ["  none"]
+
+
+def _description(task: Task) -> str:
+    """Return what the class's docstring says, up to its tables."""
+    text = inspect.getdoc(type(task)) or ""
+    summary, _, rest = text.partition("\n\n## Description\n\n")
+    return (
+        f"{summary}\n\n{rest.partition(chr(10) * 2 + '## ')[0]}" if rest else summary.partition("\n\n## ")[0]
+    )
+
+
+def _controls(task: Task) -> list[tuple[str, ...]]:
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    rows: list[tuple[str, ...]] = []
+    for acting in task.formulas.acting:
+        unit = units.pop(acting.control)
+        if acting.values:
+            given = f"{', '.join(f'{v:g}' for v in acting.values)} {unit}"
+            rows.append((acting.control, given, f"actions 0 to {len(acting.values) - 1}"))
+        else:
+            rows.append((acting.control, f"{acting.low:g} to {acting.high:g} {unit}", "actions -1 to 1"))
+    return rows + [(name, f"0 {unit}", "no action sets it") for name, unit in units.items()]
+
+
+def _bound(low: float, high: float) -> str:
+    largest = float(np.finfo(np.float32).max)
+    if low <= -largest and high >= largest:
+        return "unbounded"
+    return f"±{high:g}" if low == -high else f"{low:g} to {high:g}"
+
+
+def _starts(task: Task) -> list[tuple[str, ...]]:
+    constants = task.formulas.constants()
+    names = zip(task.scene.state_names, task.scene.state_units, strict=True)
+    return [
+        (name, f"{constants[f'centre{i}']:.4g} ± {constants[f'half{i}']:g} {unit}")
+        for i, (name, unit) in enumerate(names)
+    ]
+
+
+def _parameters(task: Task) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
+    for field in dataclasses.fields(task.scene):
+        value, about = getattr(task.scene, field.name), field.metadata
+        shown = f"{value:.6g} {about.get('unit', '')}".rstrip() if isinstance(value, float) else repr(value)
+        words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
+        rules = [f"{word} {about[key]:g}" for key, word in words.items() if about.get(key) is not None]
+        rows.append((field.name, shown, ", ".join(rules)))
+    rows.append(("dt", f"{task.dt:g} s", "1e-6 to 1"))
+    rows.append(("duration", f"{task.duration:g} s", "at least dt; math.inf for no end"))
+    return rows + [("target", "None", "random if None")] * bool(task.formulas.target_boxes)
+
+
+def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
+    """Yield the corners of the starts' box, or some of many, each with the controls at both ends."""
+    constants = task.formulas.constants()
+    boxes = [(constants[f"centre{i}"], constants[f"half{i}"]) for i in range(len(task.scene.state_names))]
+    ends = {a.control: (a.low, a.high) for a in task.formulas.acting}
+    for side in (0, 1):
+        held = [ends.get(name, (0.0, 0.0))[side] for name in task.scene.control_names]
+        signs = itertools.product(*((-1.0, 1.0) if half else (0.0,) for _, half in boxes))
+        for sign in itertools.islice(signs, 64):
+            yield [c + s * half for s, (c, half) in zip(sign, boxes, strict=True)], held
+
+
+def _accuracy(task: Task) -> list[str]:
+    """Say what is proved of steps from the edges of the starts under the largest controls."""
+    scene: Any = task.scene
+    found, refused = [], 0
+    for state, held in _edges(task):
+        try:
+            found.append(scene.step_bound(state, held, task.dt))
+        except StepRefused:
+            refused += 1
+    lines = []
+    if found:
+        attempts = max(bound.substeps for bound in found)
+        largest = max(max(bound.bounds.values(), default=0.0) for bound in found)
+        whole = sum(bound.substeps == 1 for bound in found)
+        lines += [
+            f"Taylor series of order {found[0].order}, {found[0].kind}",
+            f"from the edges of the starts under the largest controls: {whole} of {len(found)} steps "
+            "certified as a "
+            f"whole, {attempts} attempt{'s' if attempts > 1 else ''} at most",
+            f"proved truncation error there: {largest:.1e} at most, in units of the state"
+            if math.isfinite(largest)
+            else "",
+        ]
+    if refused:
+        lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
+    return lines

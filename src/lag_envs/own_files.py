@@ -1,0 +1,195 @@
+"""Scenes and tasks of a user's own file, for the commands: ``FILE`` or ``FILE:Class`` in place of an id.
+
+Loading a file runs its code. The leaderboard has no path here.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+import traceback
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from lag_envs.errors import UserError, hint
+from lag_envs.tasks.registration import register
+
+GUIDE = "docs/tutorial.md and examples/ball_on_beam.py show how"
+
+
+def is_file(name: str) -> bool:
+    """Tell whether a name on the command line means a file, and not an id.
+
+    Examples
+    --------
+    >>> [is_file(name) for name in ("PivotedBar-v0", "mine.py", "mine.py:Balance", "./mine")]
+    [False, True, True, True]
+    """
+    path = split(name)[0]
+    return path.endswith(".py") or bool(re.search(r"[/\\]", path)) or Path(path).is_file()
+
+
+def split(name: str) -> tuple[str, str]:
+    r"""Return path and class; on Windows a path may have a colon of its own.
+
+    Examples
+    --------
+    >>> split("mine.py:Balance"), split("mine.py"), split(r"C:\mine.py")
+    (('mine.py', 'Balance'), ('mine.py', ''), ('C:\\mine.py', ''))
+    """
+    path, colon, kind = name.rpartition(":")
+    return (path, kind) if colon and (not kind or re.fullmatch(r"\w+", kind)) else (name, "")
+
+
+@cache
+def load(path: str) -> ModuleType:
+    """Run a file and return its module.
+
+    Raises
+    ------
+    UserError
+        Where there is no such file, it is no Python, or it fails; with the line.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise UserError(f"{path} is a folder; name a Python file in it")
+    if not file.is_file():
+        raise UserError(f"there is no file {path}")
+    if file.suffix != ".py":
+        raise UserError(f"{path} is no Python file; its name must end with .py")
+    file = file.resolve()
+    name = _name(file)
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # As for `python FILE`: what lies beside it can be imported.
+    if str(file.parent) not in sys.path:
+        sys.path.insert(0, str(file.parent))
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        del sys.modules[name]
+        raise UserError(_told(path, file, error)) from error
+    except SystemExit as error:
+        del sys.modules[name]
+        raise UserError(
+            f'{path} ends the program; put what is to run only as a script behind if __name__ == "__main__":'
+        ) from error
+    return module
+
+
+def _name(file: Path) -> str:
+    """Return the name of a file's module: its own, unless another module has it."""
+    name = file.stem
+    if not name.isidentifier():
+        return "own_" + re.sub(r"\W", "_", name)
+    try:
+        known = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        known = None
+    taken = name in sys.modules or (known is not None and known.origin != str(file))
+    return f"own_{name}" if taken else name
+
+
+def _told(path: str, file: Path, error: Exception) -> str:
+    """Say in a line what went wrong and where in the file."""
+    if isinstance(error, SyntaxError) and error.filename == str(file):
+        return f"{path}, line {error.lineno}: {type(error).__name__}: {error.msg}"
+    lines = [
+        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(file)
+    ]
+    where = f"{path}, line {lines[-1]}" if lines else path
+    return f"{where}: {type(error).__name__}: {error}"
+
+
+def tasks(path: str) -> dict[str, type[Any]]:
+    """Return the tasks that a file defines, by name: classes with a scene."""
+    from lag_envs.scenes.contract import Scene
+    from lag_envs.tasks.contract import Task
+
+    found = {}
+    for name, kind in _classes(load(path)).items():
+        scene = getattr(kind, "scene", None)
+        if issubclass(kind, Task) and isinstance(scene, type) and issubclass(scene, Scene):
+            found[name] = kind
+    return found
+
+
+def scenes(path: str) -> dict[str, type[Any]]:
+    """Return the scenes that a file defines, by name."""
+    from lag_envs.scenes.contract import Scene
+
+    return {name: kind for name, kind in _classes(load(path)).items() if issubclass(kind, Scene)}
+
+
+def _classes(module: ModuleType) -> dict[str, type]:
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type) and value.__module__ == module.__name__
+    }
+
+
+def chosen(name: str) -> dict[str, type[Any]]:
+    """Return the tasks that ``FILE`` or ``FILE:Class`` means, by name.
+
+    Raises
+    ------
+    UserError
+        Where there are none.
+    """
+    path, kind = split(name)
+    found = tasks(path)
+    if kind:
+        if kind not in found:
+            raise UserError(
+                f"{path} has no task {kind!r}; " + (hint(kind, found) if found else f"it has none: {GUIDE}")
+            )
+        return {kind: found[kind]}
+    if not found:
+        have = ", ".join(scenes(path))
+        more = f" (only {have}, which `lag-envs report {path}` takes)" if have else ""
+        raise UserError(f"{path} defines no task{more}; derive one from lag_envs.tasks.Task, {GUIDE}")
+    return found
+
+
+def one(name: str) -> type[Any]:
+    """Return the one task that ``FILE`` or ``FILE:Class`` means, or raise a UserError that lists them."""
+    found = chosen(name)
+    if len(found) > 1:
+        path = split(name)[0]
+        raise UserError(
+            f"{path} has several tasks: name one, {' or '.join(f'{path}:{kind}' for kind in found)}"
+        )
+    return next(iter(found.values()))
+
+
+def made(kind: type[Any], path: str) -> Any:
+    """Return a task or scene with its defaults, or raise a UserError with what its formulas lack."""
+    try:
+        return kind()
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{split(path)[0]}: {error}") from error
+
+
+def registered(name: str) -> list[str]:
+    """Return the ids of the tasks that ``FILE`` or ``FILE:Class`` means; what has none yet gets one."""
+    import gymnasium as gym
+
+    ids = []
+    for kind in chosen(name).values():
+        made(kind, name)
+        id = kind.id or f"{kind.__name__}-v0"
+        if id not in gym.registry or gym.registry[id].kwargs.get("task") not in (kind, _place(kind)):
+            gym.registry.pop(id, None)
+            register(kind, id=id)
+        ids.append(id)
+    return ids
+
+
+def _place(kind: type[Any]) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"

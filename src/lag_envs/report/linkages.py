@@ -1,0 +1,402 @@
+"""The bodies of the general engine's scenes as other engines are given them: links, one hanging on the other.
+
+`MuJoCo` and `Pinocchio` take the same table of links. A support that moves is a field in its own frame, and
+hinges count angles from link to link, so each system says how its coordinates become joints'.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.report import reference
+from lag_envs.report.equations import Problems
+from lag_envs.report.motions import SceneProblems
+from lag_envs.report.peers import Peer
+from lag_envs.report.timing import Sample
+from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
+from lag_envs.scenes.contract import Scene
+
+Array = NDArray[np.float64]
+#: What an inertia about a rod's own axis is given as, where there is none: MuJoCo asks for some [kg m²].
+THIN = 1e-15
+
+
+class Link(NamedTuple):
+    """A body and the joint that it hangs by; z is up."""
+
+    kind: str  #: "slide" or "hinge"
+    axis: tuple[float, float, float]
+    place: tuple[float, float, float]  #: of the joint, from the one before [m]
+    mass: float
+    centre: tuple[float, float, float]  #: of mass, from the joint [m]
+    inertia: tuple[float, float, float]  #: about the centre, along the axes [kg m²]
+
+
+@dataclass(frozen=True)
+class System:
+    """A scene, the states and controls that its problems are drawn from, and its links."""
+
+    name: str
+    scene: Scene
+    places: Sequence[float]  #: half widths, by free coordinate
+    speeds: Sequence[float]
+    push: float
+    links: Sequence[Link]
+    relative: bool = False  #: whether joints' angles are differences of the scene's
+    field: bool = False  #: whether the control moves the support, else it is the joint's force
+    joint: int = 0  #: which joint's
+
+    def turned(self, values: Array) -> Array:
+        """Return joints' numbers of the coordinates', one row each."""
+        if not self.relative:
+            return values
+        return np.concatenate([values[:1], np.diff(values, axis=0)])
+
+    def back(self, values: Array) -> Array:
+        """Return coordinates' numbers of the joints'."""
+        return np.cumsum(values, axis=0) if self.relative else values
+
+    def forces(self, controls: Array) -> Array:
+        """Return the forces on the joints, one row for each control."""
+        forces = np.zeros((len(controls), len(self.links)))
+        if not self.field:
+            forces[:, self.joint] = controls
+        return forces
+
+    def fields(self, controls: Array) -> Array:
+        """Return the fields [m/s²], one row for each control."""
+        gravity: float = self.scene.gravity  # type: ignore[attr-defined]
+        along = controls if self.field else 0.0 * controls  # the support moves against x
+        return np.stack([along, 0.0 * controls, np.full(len(controls), -gravity)], axis=1)
+
+    def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
+        """Return harsh random states and controls, one row each; prescribed coordinates start at 0.
+
+        Every joint turns at up to its full speed, all at once.
+        """
+        rng = np.random.default_rng(seed)
+        states = np.zeros((count, len(self.scene.state_names)))
+        controls = np.zeros((count, 1))
+        free = self.scene._layout.free
+        for j in range(count):
+            for i, entry in enumerate(self.scene._layout.state):
+                if entry.coordinate in free:
+                    widths = self.places if entry.kind == "place" else self.speeds
+                    states[j, i] = rng.uniform(-1, 1) * widths[free.index(entry.coordinate)]
+            controls[j] = rng.uniform(-self.push, self.push)
+        return states, controls
+
+
+def _scene(kind: type[Scene], **parameters: Any) -> Any:
+    return kind(**parameters)
+
+
+def _bars(
+    lengths: Sequence[float], masses: Sequence[float], centres: Sequence[float], own: Sequence[float]
+) -> list:
+    """Return bars that hang one on the other and turn counter-clockwise in the plane.
+
+    x points to the left here, so that their axis is one of the coordinates', which Pinocchio is faster with.
+    """
+    places = [0.0, *lengths[:-1]]
+    return [
+        Link("hinge", (0.0, 1.0, 0.0), (0.0, 0.0, -place), m, (0.0, 0.0, -c), (i, i, i))
+        for place, m, c, i in zip(places, masses, centres, own, strict=True)
+    ]  # fmt: skip
+
+
+def _cart_pole() -> System:
+    s = _scene(CartPole)
+    own = s.pole_mass * s.half_length**2 / 3
+    cart = Link("slide", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), s.cart_mass, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    pole = Link(
+        "hinge", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), s.pole_mass, (0.0, 0.0, s.half_length), (own, own, own)
+    )
+    return System("cart-pole", s, (2.0, np.pi), (3.0, 12.0), 10.0, [cart, pole])
+
+
+def _acrobot() -> System:
+    s = _scene(Acrobot)
+    links = _bars(
+        (s.length_1, s.length_2), (s.mass_1, s.mass_2), (s.com_distance_1, s.com_distance_2),
+        (s.inertia_1, s.inertia_2),
+    )  # fmt: skip
+    return System("acrobot", s, (np.pi, np.pi), (6.0, 8.0), 2.0, links, joint=1)
+
+
+def _rotary() -> System:
+    s, zero = _scene(RotaryPendulum), (0.0, 0.0, 0.0)
+    arm = Link("hinge", (0.0, 0.0, 1.0), zero, 1.0, zero, (1.0, 1.0, s.arm_inertia))
+    rod = Link(
+        "hinge", (1.0, 0.0, 0.0), (s.arm_length, 0.0, 0.0), s.mass, (0.0, 0.0, -s.com_distance),
+        (s.inertia, s.inertia, THIN),
+    )  # fmt: skip
+    return System("rotary pendulum", s, (np.pi, np.pi), (10.0, 10.0), 0.1, [arm, rod])
+
+
+def _chain(bars: int, name: str, speed: float) -> System:
+    s = _scene(Chain, bars=bars)
+    links = _bars(*([x] * bars for x in (s.length, s.mass, s.com_distance, s.inertia)))
+    return System(name, s, (np.pi,) * bars, (speed,) * bars, 15.0, links, relative=True, field=True)
+
+
+SYSTEMS = {
+    system.name: system
+    for system in (
+        _cart_pole(),
+        _acrobot(),
+        _rotary(),
+        _chain(2, "double pendulum, driven", 10.0),
+        _chain(3, "triple pendulum, driven", 8.0),
+    )
+}
+
+
+class Engine(Peer):
+    """A rival with a model of its own, made of a system's links."""
+
+    @property
+    def batched(self) -> bool:
+        """It takes one state after the other."""
+        return False
+
+
+def _given(problems: Problems) -> tuple[System, Array, Array, Array]:
+    """Return the system, joints' places and velocities, and controls."""
+    assert isinstance(problems, SceneProblems) and problems.system is not None
+    system, n = problems.system, problems.equation.size // 2
+    return system, system.turned(problems.y[:n]), system.turned(problems.y[n:]), problems.controls[:, 0]
+
+
+# --- MuJoCo ---
+
+
+def xml(
+    system: System, integrator: str = "RK4", step: float = 0.02, gravity: Sequence[float] = (0, 0, 0)
+) -> str:
+    """Return MuJoCo's model of a system, contacts and constraints switched off."""
+
+    def text(values: Sequence[float]) -> str:
+        return " ".join(repr(float(x)) for x in values)
+
+    body = ""
+    for i, link in reversed(list(enumerate(system.links))):
+        body = (
+            f'<body pos="{text(link.place)}"><joint name="j{i}" type="{link.kind}" axis="{text(link.axis)}"/>'
+            f'<inertial pos="{text(link.centre)}" mass="{link.mass!r}" diaginertia="{text(link.inertia)}"/>'
+            f"{body}</body>"
+        )
+    motors = "".join(f'<motor joint="j{i}"/>' for i in range(len(system.links)))
+    return (
+        f'<mujoco><option gravity="{text(gravity)}" integrator="{integrator}" timestep="{step!r}">'
+        '<flag contact="disable" constraint="disable"/></option>'
+        f"<worldbody>{body}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+class MuJoCoLinks(Engine):
+    """MuJoCo's dynamics in its compiled rollouts, all states in one call."""
+
+    family = "mujoco"
+    settings: ClassVar = {
+        "Euler": (1, 8, 64, 512),
+        "implicitfast": (1, 8, 64, 512),
+        "RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256),
+    }
+    stepped = ("Euler", "implicitfast", "RK4")
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Make a model for each field; one is enough where the control is a force."""
+        import mujoco
+        from mujoco.rollout import rollout
+
+        system, q, v, controls = _given(problems)
+        n = self.substeps(steps)
+        fields = system.fields(controls)
+        if not system.field:
+            fields = fields[:1]
+        models = [
+            mujoco.MjModel.from_xml_string(xml(system, self.method, dt * steps / n, field))
+            for field in fields
+        ]
+        data = mujoco.MjData(models[0])
+        count = len(controls)
+        start = np.concatenate([np.zeros((count, 1)), q.T, v.T], axis=1)
+        held = np.repeat(system.forces(controls)[:, None], n, axis=1)
+        path = np.empty((count, n, start.shape[1]))
+        given = models if len(models) == count else models * count
+
+        def run() -> None:
+            rollout(given, data, start, held, state=path, skip_checks=False)
+
+        def ends() -> Array:
+            half = q.shape[0]
+            q_end, v_end = path[:, -1, 1 : 1 + half].T, path[:, -1, 1 + half :].T
+            return problems.states(np.concatenate([system.back(q_end), system.back(v_end)]), dt * steps)
+
+        return Sample(run, count * steps, ends=ends)
+
+
+def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
+    """Return MuJoCo's mass matrix and accelerations at places and velocities of its joints."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(xml(system, gravity=system.fields(np.array([control]))[0]))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, system.forces(np.array([control]))[0]
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    for column, unit in zip(mass, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
+    return mass, data.qacc.copy()
+
+
+# --- Pinocchio ---
+
+
+class PinocchioLinks(Engine):
+    """Pinocchio's articulated-body algorithm in a compiled loop of RK4 steps.
+
+    Its wheel brings its headers along: `pinocchio.cpp` is compiled where there is a compiler, once a report.
+    """
+
+    family = "pinocchio"
+    settings: ClassVar = {"ABA, RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256)}
+    stepped = ("ABA, RK4",)
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Make the model."""
+        system, q, v, controls = _given(problems)
+        library, model = pinocchio(), pinocchio_model(system)
+        n, count, half = self.substeps(steps), len(controls), q.shape[0]
+        start = np.ascontiguousarray(np.concatenate([q, v]).T)
+        found = np.empty_like(start)
+        forces, fields = system.forces(controls), np.ascontiguousarray(system.fields(controls))
+        h = ctypes.c_double(dt * steps / n)
+        arrays = [_pointer(x) for x in (start, forces, fields, found)]
+
+        def run() -> None:
+            library.run(model, count, n, h, *arrays)
+
+        def ends() -> Array:
+            joints = found[:, :half].T, found[:, half:].T
+            return problems.states(np.concatenate([system.back(x) for x in joints]), dt * steps)
+
+        return Sample(run, count * steps, ends=ends)
+
+
+def _pointer(array: Array) -> Any:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+@cache
+def pinocchio() -> Any:
+    """Return the compiled loop.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        Where Pinocchio is missing, or its headers, or a compiler.
+    """
+    include = _headers()
+    compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        raise ModuleNotFoundError("a C++ compiler is missing", name="a C++ compiler")
+    source = Path(__file__).with_name("pinocchio.cpp")
+    assert reference.store is not None
+    made = reference.store / "pinocchio.so"
+    if not made.exists():
+        part = made.with_suffix(".part")
+        options = ["-O3", "-march=native", "-std=c++17", "-DNDEBUG", "-w", "-shared", "-fPIC"]
+        options += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
+        folders = [f"-I{include}", f"-I{include / 'eigen3'}"]
+        subprocess.run(
+            [compiler, *options, *folders, "-o", str(part), str(source)], check=True, capture_output=True
+        )
+        part.replace(made)
+    library = ctypes.CDLL(str(made))
+    library.make.restype = ctypes.c_void_p
+    pointer = ctypes.c_void_p
+    library.motion.argtypes = [pointer] * 7
+    library.run.argtypes = [pointer, ctypes.c_int, ctypes.c_int, ctypes.c_double, *[pointer] * 4]
+    return library
+
+
+def _headers() -> Path:
+    """Return the folder of Pinocchio's and Eigen's headers, as their wheels have them."""
+    for package, header in (
+        ("libpinocchio", "pinocchio/algorithm/aba.hpp"),
+        ("cmeel-eigen", "eigen3/Eigen/Core"),
+    ):
+        try:
+            found = Path(str(distribution(package).locate_file("cmeel.prefix/include")))
+        except PackageNotFoundError as error:
+            raise ModuleNotFoundError(f"{package} is missing", name=package) from error
+        if not (found / header).exists():
+            raise ModuleNotFoundError(f"{package} has no headers", name=f"{header} of {package}")
+    return found
+
+
+@cache
+def _model(links: tuple[Link, ...]) -> Any:
+    numbers = [
+        [float(link.kind == "hinge"), *link.axis, *link.place, link.mass, *link.centre,
+         *(0.0 if x == THIN else x for x in link.inertia)]
+        for link in links
+    ]  # fmt: skip
+    table = np.array(numbers)
+    return pinocchio().make(len(links), _pointer(table))
+
+
+def pinocchio_model(system: System) -> Any:
+    """Return Pinocchio's model of a system."""
+    return _model(tuple(system.links))
+
+
+def pinocchio_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
+    """Return Pinocchio's mass matrix and accelerations at places and velocities of its joints."""
+    n, controls = len(q), np.array([control])
+    acceleration, mass = np.empty(n), np.empty((n, n))
+    given = [np.ascontiguousarray(x) for x in (q, v, system.forces(controls)[0], system.fields(controls)[0])]
+    pinocchio().motion(pinocchio_model(system), *map(_pointer, [*given, acceleration, mass]))
+    return mass, acceleration
+
+
+#: Engines with models of their own: their dynamics at a point, by family.
+MOTIONS: dict[str, Callable[[System, Array, Array, float], tuple[Array, Array]]] = {
+    "mujoco": mujoco_motion, "pinocchio": pinocchio_motion,
+}  # fmt: skip
+ENGINES: dict[str, type[Engine]] = {engine.family: engine for engine in (MuJoCoLinks, PinocchioLinks)}
+
+
+def differences(system: System, family: str, count: int = 50) -> tuple[float, float]:
+    """Return how far an engine's mass matrices and accelerations are from SymPy's at random states.
+
+    Both are relative to the largest there is.
+    """
+    from lag_envs.report.exact import motion_of
+
+    states, controls = system.draw(count, seed=1)
+    problems = SceneProblems(system.scene, states, controls, system)
+    n = problems.equation.size // 2
+    q, v = system.turned(problems.y[:n]), system.turned(problems.y[n:])
+    turn = system.turned(np.eye(n))
+    motion, found = motion_of(system.scene), []
+    for j in range(count):
+        mass, acceleration = motion.at(states[j].tolist(), controls[j].tolist())
+        other, joints = MOTIONS[family](system, q[:, j], v[:, j], float(controls[j, 0]))
+        found.append((turn.T @ other @ turn, mass, system.back(joints), acceleration))
+    m, mass, a, acceleration = (np.array(part) for part in zip(*found, strict=True))
+    far = [float(np.abs(x - y).max() / np.abs(y).max()) for x, y in ((m, mass), (a, acceleration))]
+    return far[0], far[1]

@@ -1,0 +1,278 @@
+"""Control steps of a scene of energies as problems that every rival can be given; ours is one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.mechanics.algebra import Atom, Expr, evaluate, substitute
+from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.recording import control, parameter
+from lag_envs.report.equations import Equation, Problems
+from lag_envs.report.exact import FLOATS, motion_of, solve
+from lag_envs.report.rivals import Rival
+from lag_envs.report.timing import BLOCK, Sample
+from lag_envs.scenes.contract import Scene
+from lag_envs.stepping.compiling import compile_function
+
+if TYPE_CHECKING:
+    from lag_envs.report.linkages import System
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneEquation(Equation):
+    """The equation of motion of a scene with its numbers put in; what they make vanish is left out.
+
+    Unknowns are the places of the free coordinates, then their velocities.
+    """
+
+    scene: Scene
+
+    @cached_property
+    def _motion(self) -> tuple[list[Expr], list[Expr]]:
+        numbers = {parameter(name): Expr.of(getattr(self.scene, name)) for name in self.scene._numbers()}
+        found = self.scene.mechanics
+        return [substitute(e, numbers) for e in found.entries()], [
+            substitute(f, numbers) for f in found.force
+        ]
+
+    @property
+    def size(self) -> int:  # type: ignore[override]
+        """Two for each free coordinate."""
+        return 2 * len(self.scene._layout.free)
+
+    @property
+    def lifted(self) -> int:  # type: ignore[override]
+        """The same: cosines and sines are not carried."""
+        return self.size
+
+    @cached_property
+    def needed(self) -> tuple[str, ...]:
+        """What the parameters are: controls, and where moving coordinates start, ``s`` and ``s_dot``."""
+        layout = self.scene._layout
+        symbols = {symbol for part in self._motion for expr in part for symbol in expr.symbols()}
+        found = [name for name in layout.controls if control(name) in symbols]
+        for p in layout.at("acceleration", "rate"):
+            turns = place(p.name) in symbols, velocity(p.name) in symbols
+            if any(turns) and p.control not in found:
+                found.append(p.control or "")
+            found += [p.name] * turns[0]
+            found += [f"{p.name}_dot"] * (p.level == "acceleration" and any(turns))
+        return tuple(found)
+
+    @property
+    def parameters(self) -> int:  # type: ignore[override]
+        """How many there are."""
+        return len(self.needed)
+
+    def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
+        """Return velocities and accelerations."""
+        layout, n = self.scene._layout, self.size // 2
+        given = dict(zip(self.needed, p, strict=True))
+        values: dict[Atom, Any] = {control(name): u for name, u in given.items() if name in layout.controls}
+        values |= {place(name): y[i] for i, name in enumerate(layout.free)}
+        values |= {velocity(name): y[n + i] for i, name in enumerate(layout.free)}
+        for moved in layout.at("acceleration", "rate"):
+            held = given.get(moved.control or "", 0.0)
+            if moved.level == "acceleration":
+                rate, push = given.get(f"{moved.name}_dot", 0.0), held
+            else:
+                rate, push = held, 0.0
+            values[place(moved.name)] = given.get(moved.name, 0.0) + t * (rate + t * (0.5 * push))
+            values[velocity(moved.name)] = rate + t * push
+        mass, force = self._motion
+        found = evaluate([*mass, *force], values, xp)
+        rows = [found[i * n : (i + 1) * n] for i in range(n)]
+        return *y[n : 2 * n], *solve(rows, found[n * n :])
+
+
+class SceneProblems(Problems):
+    """Control steps of one scene from some states under some controls.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    starts : ndarray, shape (n, n_state)
+        States.
+    controls : ndarray, shape (n, n_controls)
+        Controls.
+    system : System, optional
+        The scene's bodies as other engines are given them.
+    """
+
+    def __init__(self, scene: Scene, starts: Array, controls: Array, system: System | None = None) -> None:
+        self.scene, self.starts, self.controls, self.system = scene, starts, controls, system
+        self.cases = []
+        self.equation: SceneEquation = SceneEquation(scene)
+        layout = scene._layout
+        zero = np.zeros(len(starts))
+        given = dict(zip(scene.state_names, starts.T, strict=True))
+        held = dict(zip(layout.controls, controls.T, strict=True))
+        self._q, self._v = motion_of(scene)._start(given, held, lambda x: zero + x)
+        self._shift(-1.0)
+        free, moving = layout.free, [m.name for m in layout.at("acceleration", "rate")]
+        self.y = np.array([*(self._q[name] for name in free), *(self._v[name] for name in free)])
+        known = held | {name: self._q[name] for name in moving}
+        known |= {f"{name}_dot": self._v[name] for name in moving}
+        needed = self.equation.needed
+        self.p = np.array([known[name] for name in needed]).reshape(len(needed), len(starts))
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def _shift(self, sign: float) -> None:
+        """Go from w to velocities, where a rate is held, or back."""
+        scene = self.scene
+        if scene._layout.at("rate"):
+            shift = motion_of(scene).shift(self._q, self._v, list(self.controls.T), FLOATS)
+            self._v |= {
+                name: self._v[name] + sign * x for name, x in zip(scene._layout.free, shift, strict=True)
+            }
+
+    def states(self, y: Array, span: float) -> Array:
+        """Return the scene's states, one per line, of unknowns after the controls were held for some time."""
+        layout = self.scene._layout
+        n = len(layout.free)
+        q, v = dict(self._q), dict(self._v)
+        try:
+            self._q |= dict(zip(layout.free, y[:n], strict=True))
+            self._v |= dict(zip(layout.free, y[n : 2 * n], strict=True))
+            held = dict(zip(layout.controls, self.controls.T, strict=True))
+            for p in layout.at("acceleration", "rate"):
+                push = held[p.control or ""] if p.level == "acceleration" else 0.0
+                self._q[p.name] = q[p.name] + span * (v[p.name] + span * (0.5 * push))
+                self._v[p.name] = v[p.name] + span * push
+            self._shift(1.0)
+            return np.stack(
+                [(self._q if e.kind == "place" else self._v)[e.coordinate] for e in layout.state], axis=1
+            )
+        finally:
+            self._q, self._v = q, v
+
+
+class Certified(Rival):
+    """The general engine at a tolerance and an order, each step certified, in the loops that it ships.
+
+    The setting is the tolerance; the method names the order. Alone it is the loop of `Scene.simulate`, in a
+    batch the block function of the vector environments, both over one control step from each state.
+    """
+
+    family = "ours"
+
+    @staticmethod
+    def method_of(order: int) -> str:
+        """Return the name of an order."""
+        return f"lag_envs, order {order}"
+
+    @property
+    def order(self) -> int:
+        """Order of the series."""
+        return int(self.method.rpartition(" ")[2])
+
+    def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
+        """Compile."""
+        assert isinstance(problems, SceneProblems) and steps == 1
+        scene = problems.scene
+        code, constants = scene._code(), scene._constants()
+        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+        starts, controls, count = problems.starts, problems.controls, len(problems)
+        width, order = starts.shape[1], float(self.order)
+        if not together:
+            alone = _alone(scene._stepper, code, self.setting)
+            ends = np.empty_like(starts)
+
+            def run() -> None:
+                if alone(starts, controls, ends, dt, order, *numbers):
+                    raise ArithmeticError("a step was refused")
+
+            return Sample(run, count, ends=ends.copy)
+        batch = _batch(scene._stepper, code, self.setting)
+        blocks = -(-count // BLOCK)
+        rows = width + controls.shape[1] + len(code.rows) + 1
+        memory = np.zeros((blocks, rows, BLOCK))
+        begin = np.zeros((blocks, width + controls.shape[1], BLOCK))
+        flat = np.concatenate([starts, controls], axis=1).T
+        for i in range(blocks):
+            part = flat[:, i * BLOCK : (i + 1) * BLOCK]
+            begin[i, :, : part.shape[1]] = part
+            begin[i, :, part.shape[1] :] = part[:, :1]
+
+        def prepare() -> None:
+            memory[:, : begin.shape[1]] = begin
+
+        def together_run() -> None:
+            if batch(memory.reshape(-1), count, dt, order, *numbers):
+                raise ArithmeticError("a step was refused")
+
+        return Sample(
+            together_run,
+            count,
+            prepare,
+            lambda: memory[:, :width].transpose(0, 2, 1).reshape(-1, width)[:count].copy(),
+        )
+
+
+@cache
+def _alone(stepper: Any, code: Any, tolerance: float) -> Callable:
+    """Compile ``alone(starts, controls, ends, dt, order, constants...)``: a control step from each state."""
+    lines = [
+        f"def alone(starts, controls, ends, dt, order{''.join(f', {name}' for name in code.constants)}):",
+        f"rows = np.zeros({code.scratch})",
+        "refused = 0",
+        "for j in range(starts.shape[0]):",
+        *(f"    {y} = starts[j, {i}]" for i, y in enumerate(code.start)),
+        *(f"    {u} = controls[j, {i}]" for i, u in enumerate(code.controls)),
+        f"    {', '.join(code.start)}, status = advance({code.arguments})",
+        "    refused += status < 0",
+        *(f"    ends[j, {i}] = {y}" for i, y in enumerate(code.start)),
+        "return refused",
+    ]
+    return compile_function("alone", "\n    ".join(lines) + "\n", code.compile(tolerance))
+
+
+@cache
+def _batch(stepper: Any, code: Any, tolerance: float) -> Callable:
+    """Compile ``batch(memory, count, dt, order, constants...)``: a control step of all lanes, block by block.
+
+    A block has rows for state and controls, then those of `StepCode.rows`, and one more.
+    """
+    names = [*code.start, *code.controls]
+    rows = {name: i for i, name in enumerate([*names, *code.rows])}
+    # An input of the series may have the name of a control or of a row of its own.
+    flow = {name: len(names) + i for i, name in enumerate(code.rows)}
+
+    def at(row: int) -> str:
+        return f"memory[base + np.uint64({BLOCK * row}) + i]"
+
+    lanes = f"for i in range(np.uint64({BLOCK})):"
+    load = [f"        {name} = {at(rows[name])}" for name in names]
+    lines = [
+        f"def batch(memory, count, dt, order{''.join(f', {name}' for name in code.constants)}):",
+        "wide_vectors()",
+        "refused = 0",
+        f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+        f"    base = block * np.uint64({BLOCK * (len(names) + len(code.rows) + 1)})",
+        f"    size = min(np.int64({BLOCK}), np.int64(count) - np.int64(block) * {BLOCK})",
+        f"    {lanes}",
+        *load,
+        *(f"        {line}" for line in code.prepare),
+        "        status = 0.0",
+        *(f"        {at(flow[name])} = {name}" for name in code.given),
+        f"    first = np.int64(base) + {BLOCK * len(names)}",
+        "    refused += advance_block(memory, first, size, dt, np.int64(order))",
+        f"    {lanes}",
+        *load,
+        *(f"        {name} = {at(flow[name])}" for name in code.results),
+        *(f"        {line}" for line in code.finish),
+        *(f"        {at(rows[y])} = {z}" for y, z in zip(code.start, code.end, strict=True)),
+        "return refused",
+    ]
+    return compile_function("batch", "\n    ".join(lines) + "\n", code.compile_block(tolerance))

@@ -1,0 +1,430 @@
+"""The report about a user's own file: errors against time, the certificate, stability, scene by scene.
+
+Subjects are the scenes of the file's tasks, with the tasks' parameters, starts and controls, and scenes that
+no task uses and that their defaults make. Loading the file runs its code, in each process that measures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs import own_files
+from lag_envs.envs.single import LagrangianEnv
+from lag_envs.errors import UserError
+from lag_envs.report import general
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.exact import Unresolved, ends
+from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.peers import Heyoka
+from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.rivals import Compiled, Rival
+from lag_envs.report.runner import Job, Result, Row
+from lag_envs.scenes.base import StepRefused
+from lag_envs.scenes.contract import Scene
+
+SECTION = "own"
+#: States whose exact ends are computed, and those whose certificate is asked for; the same for a quick look.
+MEMBERS, MANY = 50, 1000
+FEW, SOME = 6, 100
+TOLERANCES: Sequence[float] = (1e-3, 1e-6, 1e-9, 1e-12, 1e-14)
+ORDERS: Sequence[int] = (8, 12, 16, 20, 24)
+#: Parameters are multiplied by these, each alone; states by the last.
+FACTORS, WILD = (1e-4, 1e-2, 1e2, 1e4), 10.0
+#: What rounding may add to a bound, relative to max(1, |entry|).
+ROUNDING = 1e-12
+#: How far energy may be out of balance, relative to what there is of it and of work.
+BALANCE = 1e-9
+#: Into how many pieces a step is cut for it.
+PIECES = (1, 8, 64, 512)
+
+
+class Subject(NamedTuple):
+    """A scene, where its motions start, and what acts on it."""
+
+    name: str
+    scene: Scene
+    dt: float
+    boxes: Sequence[tuple[float, float]]  #: of the state's entries, centre and half width
+    controls: Sequence[tuple[float, float]]
+
+    task: type[Any] | None = None
+
+    def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
+        """Return states of episodes under random actions, or random ones without a task; random controls."""
+        rng = np.random.default_rng(seed)
+        low, high = (np.array([box[i] for box in self.controls]) for i in (0, 1))
+        controls = rng.uniform(low, high, (count, len(self.controls)))
+        if self.task is not None:
+            return _met(self.task, rng.integers(0, max(1, round(1.0 / self.dt)) + 1, count), seed), controls
+        centre, half = (np.array([box[i] for box in self.boxes]) for i in (0, 1))
+        return centre + half * rng.uniform(-1.0, 1.0, (count, len(centre))), controls
+
+
+def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
+    """Return the states that episodes under random actions have after so many steps, or before their ends."""
+    env = LagrangianEnv(task)  # type: ignore[arg-type]
+    env.action_space.seed(seed)
+    states = []
+    for i, length in enumerate(lengths):
+        env.reset(seed=seed if i == 0 else None)
+        state = env.state
+        for _ in range(length):
+            try:
+                ended = any(env.step(env.action_space.sample())[2:4])
+            except StepRefused:
+                break
+            if ended:
+                break
+            state = env.state
+        states.append(state)
+    return np.array(states)
+
+
+def subjects(name: str) -> list[Subject]:
+    """Return what ``FILE`` or ``FILE:Class`` means: the scenes of tasks, then those that no task uses.
+
+    Raises
+    ------
+    UserError
+        Where there are none.
+    """
+    path, kind = own_files.split(name)
+    found, problems = [], []
+    tasks, scenes = own_files.tasks(path), own_files.scenes(path)
+    if kind and kind not in (*tasks, *scenes):
+        own_files.chosen(name)  # raises
+    used = {task.scene for task in tasks.values()}
+    for label, task in tasks.items():
+        if kind in ("", label):
+            found.append(_of_task(label, own_files.made(task, path)))
+    for label, scene in scenes.items():
+        if kind == label or (not kind and scene not in used):
+            try:
+                found.append(_of_scene(label, scene()))
+            except (TypeError, ValueError) as error:
+                problems.append(f"{label}: {error}")
+    if not found:
+        why = "; ".join(problems) or "it defines no scene and no task"
+        raise UserError(f"{path}: nothing to measure: {why}; {own_files.GUIDE}")
+    return found
+
+
+def _of_task(label: str, task: Any) -> Subject:
+    constants, scene = task.formulas.constants(), task.scene
+    ranges = {a.control: (a.low, a.high) for a in task.formulas.acting}
+    return Subject(
+        f"{type(scene).__name__} of {label}",
+        scene,
+        task.dt,
+        [(constants[f"centre{i}"], constants[f"half{i}"]) for i in range(len(scene.state_names))],
+        [ranges.get(name, (0.0, 0.0)) for name in scene.control_names],
+        type(task),
+    )
+
+
+def _of_scene(label: str, scene: Scene) -> Subject:
+    """Take a unit each way, half a turn of an angle, and twice that as speed, for want of a task."""
+    boxes = [(0.0, math.pi if "rad" in unit else 1.0) for unit in scene.state_units]
+    widths = [
+        2.0 * half if unit.endswith("/s") else half
+        for (_, half), unit in zip(boxes, scene.state_units, strict=True)
+    ]
+    return Subject(
+        label, scene, general.DT, [(0.0, w) for w in widths], [(-1.0, 1.0)] * len(scene.control_names)
+    )
+
+
+def subject(file: str, name: str) -> Subject:
+    """Return the subject of a name, in a process that measures."""
+    return next(s for s in subjects(file) if s.name == name)
+
+
+# --- jobs ---
+
+
+def jobs(quick: bool, file: str = "") -> list[Job]:
+    """Return the jobs: errors and certificate, stability, then what is timed."""
+    if not file:
+        return []
+    path = Path(own_files.split(file)[0])
+    # Rows are not taken over from another version of the file.
+    about = {
+        "file": str(path.resolve()) + file[len(str(path)) :],
+        "digest": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        "quick": quick,
+    }
+    names = [s.name for s in subjects(file)]
+    return [
+        Job(
+            SECTION,
+            f"{what}: {name}",
+            f"{SECTION}:{what}",
+            about | {"name": name},
+            900.0,
+            alone=what == "points",
+        )
+        for what in ("steps", "stability", "points")
+        for name in names
+    ]
+
+
+def steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
+    """Yield errors of steps as shipped beside their bounds, and what share is certified as a whole."""
+    s = subject(file, name)
+    order = s.scene._order(s.dt)
+    starts, controls = s.draw(SOME if quick else MANY, seed=1)
+    attempts, bounds = general.certified(s.scene, starts, controls, s.dt, order)
+    kept = bounds[np.array(attempts) > 0]
+    yield {
+        "kind": "certificate", "subject": name, "dt": s.dt, "order": order, "states": len(starts),
+        **general.shares(attempts), "bound": float(kept.max()) if len(kept) else None,
+    }  # fmt: skip
+    starts, controls, truth = exact(s, quick)
+    attempts, bounds = general.certified(s.scene, starts, controls, s.dt, order)
+    for j, taken in enumerate(attempts):
+        if taken <= 0:
+            continue
+        end = s.scene.simulate(starts[j], controls[j][None] if len(controls[j]) else 1, s.dt)[-1]
+        high, low = truth[0][j], truth[1][j]
+        far = np.abs((end - high) - low)
+        row = {"kind": "step", "subject": name, "attempts": taken, "bound": float(bounds[j])}
+        scale = np.maximum(1.0, np.abs(high))
+        yield row | {"error": float((far / scale).max()), "beyond": float(((far - bounds[j]) / scale).max())}
+
+
+def exact(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Return states, controls and the exact ends of their steps; singular ones are left out."""
+    starts, controls = s.draw(FEW if quick else MEMBERS)
+    kept, high, low = [], [], []
+    for j in range(len(starts)):
+        try:
+            a, b = ends(s.scene, starts[j : j + 1], controls[j : j + 1], s.dt)
+        except Unresolved:
+            continue
+        kept.append(j)
+        high.append(a[0])
+        low.append(b[0])
+    return starts[kept], controls[kept], (np.array(high), np.array(low))
+
+
+def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
+    """Yield errors and times of ours and the usual steppers."""
+    s = subject(file, name)
+    starts, controls, truth = exact(s, quick)
+    if not len(starts):
+        return
+    copies = max(1, 1024 // len(starts))
+    problems = SceneProblems(s.scene, np.tile(starts, (copies, 1)), np.tile(controls, (copies, 1)))
+    some: slice = slice(-1, None, -3) if quick else slice(None)
+    ours: list[Rival] = [
+        Certified(Certified.method_of(order), tolerance)
+        for tolerance in TOLERANCES[some]
+        for order in ORDERS[some]
+    ]
+    ours += [Compiled(method, n) for method in ("RK4", "DOP853") for n in general.SUBSTEPS[method][some]]
+    ours += [CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]]
+    others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
+    clock = Certified(Certified.method_of(16), 1e-12)
+    for mode in general.MODES:
+        for rivals in (ours, others):
+            yield from general.measured(
+                problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
+            )
+
+
+def cases(s: Subject) -> Iterator[tuple[str, Scene, float]]:
+    """Yield scenes with one extreme parameter each, where its range allows it, and a factor of the state."""
+    yield "as it is", s.scene, 1.0
+    yield f"states × {WILD:g}", s.scene, WILD
+    for field in dataclasses.fields(s.scene):  # type: ignore[arg-type]
+        value = getattr(s.scene, field.name)
+        if "unit" not in field.metadata or not value or not math.isfinite(value):
+            continue
+        for factor in FACTORS:
+            try:
+                scene = dataclasses.replace(s.scene, **{field.name: factor * value})  # type: ignore[type-var]
+            except (TypeError, ValueError):
+                continue  # not in the parameter's range
+            yield f"{field.name} × {factor:g}", scene, 1.0
+
+
+def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
+    """Yield refusals and the balance of energy of steps with extreme parameters and states."""
+    s = subject(file, name)
+    count = 2 if quick else 20
+    starts, controls = s.draw(count, seed=2)
+    for label, scene, factor in cases(s):
+        refused, worst = 0, 0.0
+        for state, held in zip(starts, controls, strict=True):
+            try:
+                found = balance(scene, factor * state, held, s.dt)
+            except StepRefused:
+                refused += 1
+                continue
+            worst = max(worst, found if math.isfinite(found) else math.inf)
+        about = {"kind": "stability", "subject": name, "case": label, "states": count, "refused": refused}
+        yield about | {"balance": worst if math.isfinite(worst) else None}
+
+
+def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
+    """Return how far a step's change of energy is from the work done, relative to energy and work.
+
+    Work is a quadrature along the motion. Where that is too coarse, the step is cut into pieces.
+    """
+    control: Any = held if len(held) else 0.0
+    found = math.inf
+    for pieces in PIECES:
+        state, total, size = start, 0.0, 0.0
+        for _ in range(pieces):
+            part = scene.energy_balance(state, control, dt / pieces)
+            energy = scene.energy(state, control)
+            size = max(size, abs(float(energy["kinetic"])) + abs(float(energy["potential"])))
+            size += abs(part["work"]) + abs(part["loss"])
+            total += part["residual"]
+            state = scene.simulate(state, held[None] if len(held) else 1, dt / pieces)[-1]
+        found = abs(total) / size if size else 0.0
+        if found <= BALANCE:
+            break
+    return found
+
+
+# --- what it comes to ---
+
+
+def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+    """Return what is shown."""
+    names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
+    found, factors = general.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
+    pictures = [
+        Picture(
+            f"own-{general.slug(name)}",
+            f"Error against time, {name}. One control step from {MEMBERS} states at most, {FEW} in a quick "
+            "report: worst error, and CPU time of a state's step; reference: Taylor series of SymPy's "
+            "equations in balls.",
+            partial(general.draw, name, some),
+        )
+        for name in names
+        if (some := [r for r in rows if r["kind"] == "point" and r["system"] == name and "ns" in r])
+    ]
+    missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
+    return Content(
+        "Your own scenes",
+        [
+            "Steps of one control interval, from states to which random actions lead within a second of "
+            "the tasks' episodes; of a scene without a task from random states, a unit or half a turn at "
+            "most. Errors are against Taylor series of Lagrange's equations, which SymPy derives from the "
+            "energies, in python-flint's ball arithmetic; relative to max(1, |entry|). Times are medians "
+            "of the processor's time, samples taken in turn.",
+            "The certificate bounds what the series of the step leave out; rounding comes on top. "
+            f"Stability is asked for with each parameter multiplied by {factors}, where its range allows it: "
+            "a step that cannot be certified is refused, and energy has to change by the work done.",
+            *([f"Not taken part: {', '.join(missing)}."] if missing else []),
+        ],
+        [
+            t
+            for t in (_steps(rows), *(_times(found, mode) for mode in general.MODES), _stability(rows))
+            if t.rows
+        ],
+        pictures,
+        _claims(rows) if rows else [],
+        details=[_all(rows)],
+    )
+
+
+def _of(rows: Sequence[Row], kind: str) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for r in rows:
+        if r["kind"] == kind:
+            found.setdefault(r["subject"], []).append(r)
+    return found
+
+
+def _steps(rows: Sequence[Row]) -> Table:
+    exact, found = _of(rows, "step"), []
+    for name, (c,) in _of(rows, "certificate").items():
+        share = f"{100.0 * c['share']:.1f} % of {c['states']:,}"
+        errors = [r["error"] for r in exact.get(name, [])]
+        found.append((
+            name, c["dt"], c["order"], share, c["attempts"], c["refused"],
+            c["bound"], max(errors, default=None), len(errors),
+        ))  # fmt: skip
+    return Table(
+        "own-steps",
+        "Steps as they are shipped: the share certified in one attempt, attempts a step, the largest bound "
+        "in units of the state, and the worst error where the exact end was computed",
+        (
+            "scene",
+            "step [s]",
+            "order",
+            "certified as a whole",
+            "attempts",
+            "refused",
+            "largest bound",
+            "worst error",
+            "of",
+        ),
+        found,
+    )
+
+
+def _times(found: Mapping[tuple, Mapping[str, general.Best]], mode: str) -> Table:
+    return dataclasses.replace(general._times(found, mode), name=f"own-times-{mode}")
+
+
+def _stability(rows: Sequence[Row]) -> Table:
+    return Table(
+        "own-stability",
+        "Extreme parameters and states: steps refused, and energy out of balance at most, relative to "
+        "energy and work",
+        ("scene", "case", "steps", "refused", "balance"),
+        [
+            (
+                r["subject"],
+                r["case"],
+                r["states"],
+                r["refused"],
+                "no number" if r["balance"] is None else r["balance"],
+            )
+            for r in rows
+            if r["kind"] == "stability"
+        ],
+    )
+
+
+def _all(rows: Sequence[Row]) -> Table:
+    return dataclasses.replace(general._all(rows), name="own-points")
+
+
+def _claims(rows: Sequence[Row]) -> list[Claim]:
+    exact = [r for r in rows if r["kind"] == "step"]
+    beyond = max((r["beyond"] for r in exact), default=0.0)
+    shares = [r for r in rows if r["kind"] == "certificate"]
+    balances = [r for r in rows if r["kind"] == "stability" and r["refused"] < r["states"]]
+    worst = max((math.inf if r["balance"] is None else r["balance"] for r in balances), default=0.0)
+    refused = sum(r["refused"] for r in shares)
+    return [
+        Claim(
+            f"No error exceeds its bound by more than rounding ({ROUNDING:g}).",
+            beyond <= ROUNDING if exact else None,
+            f"{beyond:.1e} at most, {len(exact)} steps" if exact else "",
+        ),
+        Claim(
+            "No step is refused from the states that random actions lead to.",
+            refused == 0 if shares else None,
+            f"{refused} of {sum(r['states'] for r in shares):,}" if shares else "",
+        ),
+        Claim(
+            f"Energy changes by the work done, to {BALANCE:g}, at extreme parameters too.",
+            worst <= BALANCE if balances else None,
+            f"{worst:.1e} at most in {len(balances)} cases" if balances else "",
+        ),
+    ]

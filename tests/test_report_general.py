@@ -1,0 +1,226 @@
+"""The report on scenes of energies: exact ends, the same models for all, whose setting is the quickest."""
+
+import importlib.util
+from functools import cache
+
+import numpy as np
+import pytest
+from series_systems import SYSTEMS as TYPED
+from series_systems import acceleration
+from test_series import FLOATS
+
+from lag_envs.report import general
+from lag_envs.report.exact import Motion, Unresolved, ends, motion_of
+from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
+from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
+from lag_envs.report.peers import Heyoka
+from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.rivals import Compiled
+from lag_envs.scenes import Scene, parameter
+
+COUNT = 3
+
+
+class Trolley(Scene):
+    """A pendulum on a trolley whose rate, or place, is held, with what a rival cannot leave out."""
+
+    length: float = parameter(0.7, "m", above=0.0)
+    steep: float = parameter(0.4, "1/m")
+    drag: float = parameter(0.1, "N m s", least=0.0)
+    control: str = "rate"
+
+    coordinates = {"theta": "rad"}
+    prescribed = {"s": "m"}
+    modes = {"rate": {"s_dot": "m/s"}, "place": {"s": "m"}, "acceleration": {"s_ddot": "m/s²"}}
+
+    def kinetic(self, q, v, xp):
+        along = v.s + self.length * v.theta * xp.cos(q.theta)
+        return 0.5 * (along**2 + (self.length * v.theta * xp.sin(q.theta)) ** 2) + 0.1 * v.theta**2
+
+    def potential(self, q, xp):
+        return -9.81 * self.length * xp.cos(q.theta) * xp.exp(self.steep * q.s)
+
+    def dissipation(self, q, v, u, xp):
+        return 0.5 * self.drag * v.theta**2
+
+
+@cache
+def problem(name):
+    """Return a system's problems and their exact ends."""
+    system = SYSTEMS[name]
+    starts, controls = system.draw(COUNT)
+    return SceneProblems(system.scene, starts, controls, system), ends(
+        system.scene, starts, controls, general.DT
+    )
+
+
+def worst(rival, name, together=False):
+    problems, truth = problem(name)
+    return general.errors(rival.build(problems, general.DT, 1, together).end(), truth)[0]
+
+
+# --- the reference ---
+
+
+@pytest.mark.parametrize("system", TYPED, ids=lambda system: system.name)
+def test_sympy_gives_the_equations_that_were_typed_in(system):
+    generator = np.random.default_rng(5)
+    motion = Motion(system.scene)
+    first = 2 * system.driven
+    for _ in range(10):
+        state, control = system.draw(generator)
+        q, v = state[first::2], state[first + 1 :: 2]
+        typed = acceleration(system, q, v, control, state[0], control[0] if system.driven else None, FLOATS)
+        found = motion.at(state, control)[1]
+        np.testing.assert_allclose(found, typed, rtol=1e-11, atol=1e-11 * np.abs(typed).max())
+
+
+@pytest.mark.parametrize("control", ["rate", "place", "acceleration"])
+def test_what_moves_a_support(control):
+    """The exact end, and the steppers' equation, whether acceleration, rate or place is held."""
+    scene = Trolley(control=control)
+    states = np.random.default_rng(1).uniform(-2, 2, (4, len(scene.state_names)))
+    controls = np.random.default_rng(2).uniform(-2, 2, (4, 1))
+    truth = ends(scene, states, controls, 0.05)
+    problems = SceneProblems(scene, states, controls)
+    for rival in (
+        Certified(Certified.method_of(18), 1e-14),
+        Compiled("DOP853", 8),
+        CompiledRadau("Radau IIA", 200),
+    ):
+        assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
+
+
+def test_a_motion_into_a_singular_point_is_unresolved():
+    class Fall(Scene):
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return -xp.log(q.x)
+
+    with pytest.raises(Unresolved):
+        motion_of(Fall()).end([1e-3, -10.0], [], 0.01)
+
+
+# --- the rivals ---
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_equations_of_the_rivals_are_those_of_sympy(name):
+    system = SYSTEMS[name]
+    starts, controls = system.draw(20, seed=7)
+    problems, motion = SceneProblems(system.scene, starts, controls), motion_of(system.scene)
+    rates = SceneEquation(system.scene).rate(0.0, problems.y, problems.p, np)
+    n = problems.equation.size // 2
+    for j in range(20):
+        exact = motion.at(starts[j].tolist(), controls[j].tolist())[1]
+        np.testing.assert_allclose(
+            [r[j] for r in rates[n:]], exact, rtol=1e-10, atol=1e-11 * np.abs(exact).max()
+        )
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_mujoco_has_the_same_models(name):
+    pytest.importorskip("mujoco")
+    assert max(differences(SYSTEMS[name], "mujoco")) < general.EQUAL
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
+    if importlib.util.find_spec("pinocchio") is None:
+        pytest.skip("Pinocchio is not installed")
+    from lag_envs.report import reference
+
+    monkeypatch.setattr(reference, "store", reference.store or tmp_path_factory.getbasetemp())
+    assert max(differences(SYSTEMS[name], "pinocchio")) < general.EQUAL
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("name", ["cart-pole", "double pendulum, driven"])
+def test_ours_is_what_simulate_does(name, together):
+    """What is timed has the bits of `simulate`."""
+    problems, _ = problem(name)
+    order = int(problems.scene._order(general.DT))
+    found = Certified(Certified.method_of(order), 1e-14).build(problems, general.DT, 1, together).end()
+    paths = [
+        problems.scene.simulate(y, u[None], general.DT)[-1]
+        for y, u in zip(problems.starts, problems.controls, strict=True)
+    ]
+    assert np.array_equal(found, paths)
+
+
+@pytest.mark.parametrize("name", ["cart-pole", "rotary pendulum"])
+def test_every_rival_converges(name):
+    """No form is fast because it is broken."""
+    assert worst(Certified(Certified.method_of(12), 1e-6), name) < 1e-5
+    for rival in (Compiled("RK4", 256), Compiled("DOP853", 8), CompiledRadau("Radau IIA", 64)):
+        assert worst(rival, name) < 1e-9, rival.method
+    for family, setting, goal in (("mujoco", 128, 1e-9),):
+        if importlib.util.find_spec(family):
+            assert worst(ENGINES[family]("RK4", setting), name) < goal
+    if importlib.util.find_spec("heyoka"):
+        for together in (False, True):
+            assert worst(Heyoka("Taylor", 1e-12), name, together) < 1e-11
+
+
+# --- what it comes to ---
+
+
+def point(family, method, setting, error, ns, mode="single", batched=True, clock=100.0):
+    return {
+        "kind": "point", "system": "cart-pole", "mode": mode, "family": family, "method": method,
+        "setting": setting, "error": error, "ns": ns, "clock": clock, "batched": batched,
+    }  # fmt: skip
+
+
+ROWS = [
+    point("ours", "lag_envs, order 8", 1e-4, 1e-5, 50.0),
+    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 80.0),
+    point("ours", "lag_envs, order 16", 1e-12, 1e-13, 20.0, "batch"),
+    point("heyoka", "Taylor", 1e-9, 1e-10, 160.0, clock=200.0),
+    point("mujoco", "RK4", 8, 1e-4, 900.0, batched=False),
+]
+
+
+def test_times_are_compared_at_equal_error_in_one_clock():
+    found = general.best(ROWS)
+    assert found["cart-pole", "single", 1e-3]["lag_envs"].ns == 50.0
+    assert found["cart-pole", "single", 1e-6]["lag_envs"].ns == 80.0
+    assert found["cart-pole", "single", 1e-6]["heyoka"].ns == 80.0  # its job ran at half the speed
+    assert "MuJoCo" not in found["cart-pole", "single", 1e-6]
+    assert found["cart-pole", "batch", 1e-3]["MuJoCo"].ns == 900.0  # it has no batch
+
+
+def test_a_defeat_is_told_like_a_win():
+    rows = [*ROWS, point("compiled", "RK4", 1, 1e-4, 10.0)]
+    content = general.content(rows, [])
+    alone = next(c for c in content.claims if "as ours is, alone" in c.text)
+    assert alone.holds is False and "RK4, compiled by 5.00 (cart-pole, 0.001)" in alone.evidence
+    assert any(
+        "RK4, compiled takes 0.2 to 0.2 times our time, and is faster in 1 of 1" in t for t in content.text
+    )
+    assert [row[0] for row in content.summary.rows] == ["cart-pole", "cart-pole"]
+
+
+def test_what_is_missing_is_said_and_no_error(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "heyoka", None)
+    problems, truth = problem("cart-pole")
+    clock = Certified(Certified.method_of(16), 1e-12)
+    rows = list(
+        general.measured(
+            problems, truth, [Heyoka("Taylor", 1e-9)], clock, "single", 1, {"system": "cart-pole"}
+        )
+    )
+    assert [row["problem"] for row in rows] == ["heyoka is not installed"]
+    assert "Not taken part: heyoka is not installed." in general.content(rows, []).text
+
+
+def test_certificates_of_a_scene():
+    system = SYSTEMS["cart-pole"]
+    attempts, bounds = general.certified(system.scene, *system.draw(20), 0.02, 16)
+    assert attempts == [1] * 20 and bounds.max() < 1e-12
+    assert general.shares([1, 2, -5]) == {"share": 1 / 3, "attempts": 1.5, "refused": 1}
