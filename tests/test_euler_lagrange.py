@@ -20,6 +20,7 @@ from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
+from lag_envs.stepping.general import code_of
 
 PACKAGE = [
     (PivotedBar, {}),
@@ -269,9 +270,7 @@ def test_exact_flow_and_general_series_agree(case):
     if scene._form is None:
         return
     generator = np.random.default_rng(7)
-    code, stepper = scene._stepper.code(), scene._stepper
-    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
-    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    code, numbers = code_of(scene)
     for dt in (0.005, 0.02, 0.05):
         state = generator.uniform(-2.0, 2.0, len(scene.state_names))
         given = generator.uniform(0.0, 2.0, (40, len(scene.control_names)))

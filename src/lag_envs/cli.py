@@ -7,8 +7,6 @@ To add a subcommand, write a function that declares its arguments and one that r
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import inspect
 import math
 import os
 import sys
@@ -57,19 +55,17 @@ def _line(id: str) -> tuple[str, ...]:
     return (
         id,
         ", ".join(task.observation),
-        ", ".join(_controls(task)),
+        ", ".join(_range(task, acting) for acting in task.formulas.acting),
         f"{task.dt:g} s",
         f"{task.limit:g}",
         f"{task.duration:g} s",
     )
 
 
-def _controls(task: Task) -> list[str]:
-    """Return names, ranges and units of the controls where episodes start."""
-    scene = task.scene
-    low, high = task.control_range
-    rows = zip(scene.control_names, low, high, scene.control_units, strict=True)
-    return [f"{name} {a:g} to {b:g} {unit}".rstrip() for name, a, b, unit in rows]
+def _range(task: Task, acting: Any) -> str:
+    """Return a control's name, range and unit."""
+    unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
+    return f"{acting.control} {acting.low:g} to {acting.high:g} {unit}".rstrip()
 
 
 # --- info ---
@@ -82,100 +78,18 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
 
 def run_info(args: argparse.Namespace) -> int:
     """Print what there is to know about an environment."""
-    from lag_envs.envs.single import observation_space
-    from lag_envs.tasks.contract import Task as GeneralTask
+    from lag_envs.facts import facts
 
     if is_file(args.id):
         from lag_envs import own_files
 
         task = own_files.made(own_files.one(args.id), args.id)
+        name = task.id or type(task).__name__
     else:
-        task = _task(_known(args.id))
-    if isinstance(task, GeneralTask):
-        from lag_envs.facts import facts
-
-        print("\n".join(facts(task, task.id or type(task).__name__)))
-        return 0
-    scene = task.scene
-    text = [args.id, "", *_description(task)]
-    text += ["", f"Scene: {type(scene).__module__}.{type(scene).__name__}"]
-    states = (f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True))
-    text += [f"State: {', '.join(states)}"]
-    text += [
-        f"Control: {control}, for actions from -1 to 1 where episodes start" for control in _controls(task)
-    ]
-    text += [f"Step: {task.dt:g} s; episode: {task.limit:g} steps, {task.duration:g} s"]
-    if task.target_range is not None:
-        text += [f"Target: uniform in ±{task.target_range:g}, or target=..."]
-
-    bounds = observation_space([task]).high
-    text += ["", "Observation and its bounds (proved for every start that is accepted)"]
-    text += _columns(
-        [("  " + name, f"±{bound:g}") for name, bound in zip(task.observation, bounds, strict=True)]
-    )
-    text += ["", "Start (uniform, unless reset(options={'state': ...}))"]
-    starts = zip(scene.state_names, task.centre, task.half_widths, scene.state_units, strict=True)
-    text += _columns(
-        [("  " + name, f"{centre:.4g} ± {half:g} {unit}") for name, centre, half, unit in starts]
-    )
-    text += ["", "Parameters, keywords of gym.make"]
-    text += _columns(
-        [*(_parameter(field, task) for field in dataclasses.fields(scene)), *_own_parameters(task)]
-    )
-    text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
-    place = f"{type(task).__module__}.{type(task).__name__}"
-    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  python -m pydoc {place}"]
-    print("\n".join(text))
+        name = _known(args.id)
+        task = _task(name)
+    print("\n".join(facts(task, name)))
     return 0
-
-
-def _description(task: Task) -> list[str]:
-    """Return the summary of the task's class and the section that describes it; the others are left out."""
-    summary, _, rest = (inspect.getdoc(type(task)) or "").partition("\n\n## Description\n\n")
-    return [summary, "", rest.partition("\n\n## ")[0]]
-
-
-def _parameter(field: dataclasses.Field, task: Task) -> tuple[str, str, str]:
-    value = getattr(task.scene, field.name)
-    low, high = task.usable_ranges().get(field.name, (-math.inf, math.inf))
-    rule = f"{low:g} to {high:g}" if math.isfinite(low) else ""
-    shown = f"{value:.6g} {field.metadata.get('unit', '')}" if isinstance(value, float) else repr(value)
-    return f"  {field.name}", shown.rstrip(), rule
-
-
-def _own_parameters(task: Task) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [
-        ("  dt", f"{task.dt:g} s", "1e-6 to 1"),
-        ("  duration", f"{task.duration:g} s", "at least dt; math.inf for no end"),
-    ]
-    return rows + [("  target", "None", "random if None")] * (task.target_range is not None)
-
-
-def _accuracy(task: Task) -> list[str]:
-    """Say what is proved of a step with the largest control, and how far one substep goes."""
-    scene = task.scene
-    edge = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
-    bounds = [scene.step_bound(edge, u, task.dt) for u in task.control_range]
-    first = max(bounds, key=lambda b: (b.substeps, max(b.bounds.values())))
-    speed = task.certified_speed()
-    if not first.order:
-        return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
-    units = dict(zip(scene.state_names, scene.state_units, strict=True))
-    errors = [f"{bound:.1e} {units[name]} of {name}" for name, bound in first.bounds.items() if bound]
-    text = [
-        f"Taylor series of order {first.order}",
-        f"from the edge of the starts under the largest control: {first.substeps} substep(s)",
-        f"truncation error there, {first.kind}: {', '.join(errors)}",
-    ]
-    if speed is None:
-        return text
-    reach = "no step is certified for a single substep: the number follows from the bound before each step"
-    if speed >= 0.0:
-        shown = math.floor(10.0 * speed) / 10.0
-        reach = (
-            f"one substep is certified up to |theta_dot| = {shown:g} rad/s; above, the bound tells how many"
-        )
-    return [*text, reach]
 
 
 # --- bench ---

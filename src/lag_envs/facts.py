@@ -14,7 +14,7 @@ import numpy as np
 from lag_envs.benchmark import columns
 from lag_envs.envs.single import observation_space
 from lag_envs.scenes.base import StepRefused
-from lag_envs.tasks.contract import Task
+from lag_envs.tasks.base import Task
 
 
 def facts(task: Task, name: str) -> list[str]:
@@ -31,7 +31,7 @@ def facts(task: Task, name: str) -> list[str]:
             for t in task.formulas.target_boxes
         ]
         text += ["", "Targets (uniform)", *_indented(rows)]
-    space = observation_space([task])  # type: ignore[list-item]
+    space = observation_space([task])
     bounds = zip(task.observation, space.low.tolist(), space.high.tolist(), strict=True)
     text += [
         "",
@@ -41,6 +41,8 @@ def facts(task: Task, name: str) -> list[str]:
     text += ["", "Start (uniform, unless reset(options={'state': ...}))", *_indented(_starts(task))]
     text += ["", "Parameters, keywords of gym.make", *_indented(_parameters(task))]
     text += ["", "Numerical accuracy", *("  " + line for line in _accuracy(task))]
+    place = f"{type(task).__module__}.{type(task).__name__}"
+    text += ["", "Rewards, end of the episode, equations, optimal value:", f"  python -m pydoc {place}"]
     return text
 
 
@@ -78,21 +80,21 @@ def _bound(low: float, high: float) -> str:
 
 
 def _starts(task: Task) -> list[tuple[str, ...]]:
-    constants = task.formulas.constants()
-    names = zip(task.scene.state_names, task.scene.state_units, strict=True)
-    return [
-        (name, f"{constants[f'centre{i}']:.4g} ± {constants[f'half{i}']:g} {unit}")
-        for i, (name, unit) in enumerate(names)
-    ]
+    names = zip(task.scene.state_names, task.centre, task.half_widths, task.scene.state_units, strict=True)
+    return [(name, f"{centre:.4g} ± {half:g} {unit}") for name, centre, half, unit in names]
 
 
 def _parameters(task: Task) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
+    usable = task.usable_ranges()
     for field in dataclasses.fields(task.scene):
         value, about = getattr(task.scene, field.name), field.metadata
         shown = f"{value:.6g} {about.get('unit', '')}".rstrip() if isinstance(value, float) else repr(value)
         words = {"above": "above", "least": "at least", "below": "below", "most": "at most"}
         rules = [f"{word} {about[key]:g}" for key, word in words.items() if about.get(key) is not None]
+        low, high = usable.get(field.name, (-math.inf, math.inf))
+        if math.isfinite(low):
+            rules = [f"{low:g} to {high:g}"]
         rows.append((field.name, shown, ", ".join(rules)))
     rows.append(("dt", f"{task.dt:g} s", "1e-6 to 1"))
     rows.append(("duration", f"{task.duration:g} s", "at least dt; math.inf for no end"))
@@ -101,8 +103,7 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
     """Yield the corners of the starts' box, or some of many, each with the controls at both ends."""
-    constants = task.formulas.constants()
-    boxes = [(constants[f"centre{i}"], constants[f"half{i}"]) for i in range(len(task.scene.state_names))]
+    boxes = list(zip(task.centre, task.half_widths, strict=True))
     ends = {a.control: (a.low, a.high) for a in task.formulas.acting}
     for side in (0, 1):
         held = [ends.get(name, (0.0, 0.0))[side] for name in task.scene.control_names]
@@ -121,6 +122,8 @@ def _accuracy(task: Task) -> list[str]:
         except StepRefused:
             refused += 1
     lines = []
+    if found and not any(bound.order for bound in found):
+        return ["stepped in closed form, or by a series summed to rounding: nothing to certify, one substep"]
     if found:
         attempts = max(bound.substeps for bound in found)
         largest = max(max(bound.bounds.values(), default=0.0) for bound in found)
@@ -134,6 +137,12 @@ def _accuracy(task: Task) -> list[str]:
             if math.isfinite(largest)
             else "",
         ]
+    speed = task.certified_speed()
+    if speed is not None and speed >= 0.0:
+        shown, rate = math.floor(10.0 * speed) / 10.0, f"{scene._layout.free[0]}_dot"
+        lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
+    elif speed is not None:
+        lines += ["no step is certified for one substep: the number follows from the bound before each step"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

@@ -108,8 +108,8 @@ def _told(path: str, file: Path, error: Exception) -> str:
 
 def tasks(path: str) -> dict[str, type[Any]]:
     """Return the tasks that a file defines, by name: classes with a scene."""
-    from lag_envs.scenes.contract import Scene
-    from lag_envs.tasks.contract import Task
+    from lag_envs.scenes.base import Scene
+    from lag_envs.tasks.base import Task
 
     found = {}
     for name, kind in _classes(load(path)).items():
@@ -121,7 +121,7 @@ def tasks(path: str) -> dict[str, type[Any]]:
 
 def scenes(path: str) -> dict[str, type[Any]]:
     """Return the scenes that a file defines, by name."""
-    from lag_envs.scenes.contract import Scene
+    from lag_envs.scenes.base import Scene
 
     return {name: kind for name, kind in _classes(load(path)).items() if issubclass(kind, Scene)}
 

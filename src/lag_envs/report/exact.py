@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lag_envs.mechanics.recording import Values, twin
 from lag_envs.report import reference
-from lag_envs.scenes.contract import Scene
+from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 #: Bits of the arithmetic, coefficients of a series, and digits to which two computations have to agree.

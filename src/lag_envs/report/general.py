@@ -29,7 +29,7 @@ from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row, describe
 from lag_envs.report.timing import Sample, interleaved
-from lag_envs.stepping.general import usual_order
+from lag_envs.stepping.general import code_of, usual_order
 from lag_envs.stepping.series import TOLERANCE
 
 if TYPE_CHECKING:
@@ -249,8 +249,7 @@ def certificate(name: str, count: int) -> Iterator[Row]:
 
 def certified(scene: Any, states: Array, controls: Array, dt: float, order: int) -> tuple[list[int], Array]:
     """Return the attempts of each step, not positive where it was refused, and its largest bound."""
-    code, constants = scene._code(), scene._constants()
-    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    code, numbers = code_of(scene)
     attempts, bounds = [], []
     for state, held in zip(states.tolist(), controls.tolist(), strict=True):
         status, found = code.bounded(state, held, dt, order, numbers)
@@ -347,8 +346,7 @@ def _path(scene: Any, start: Array, steps: int, tolerance: float | None) -> Arra
     """Return a trajectory without control, certified to a tolerance."""
     if tolerance is None:
         return scene.simulate(start, np.zeros(steps), DT)
-    code, constants = scene._code(), scene._constants()
-    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    code, numbers = code_of(scene)
     path = np.empty((steps + 1, len(start)))
     path[0] = start
     if code.compile_simulate(tolerance)(path, np.zeros((steps, 1)), DT, float(scene._order(DT)), *numbers):

@@ -25,7 +25,7 @@ from lag_envs.report.motions import SceneProblems
 from lag_envs.report.peers import Peer
 from lag_envs.report.timing import Sample
 from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
-from lag_envs.scenes.contract import Scene
+from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 #: What an inertia about a rod's own axis is given as, where there is none: MuJoCo asks for some [kg m²].

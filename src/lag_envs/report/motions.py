@@ -17,8 +17,9 @@ from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.exact import FLOATS, motion_of, solve
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample
-from lag_envs.scenes.contract import Scene
+from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.general import code_of
 
 if TYPE_CHECKING:
     from lag_envs.report.linkages import System
@@ -181,8 +182,7 @@ class Certified(Rival):
         """Compile."""
         assert isinstance(problems, SceneProblems) and steps == 1
         scene = problems.scene
-        code, constants = scene._code(), scene._constants()
-        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+        code, numbers = code_of(scene)
         starts, controls, count = problems.starts, problems.controls, len(problems)
         width, order = starts.shape[1], float(self.order)
         if not together:

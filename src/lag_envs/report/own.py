@@ -28,8 +28,7 @@ from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row
-from lag_envs.scenes.base import StepRefused
-from lag_envs.scenes.contract import Scene
+from lag_envs.scenes.base import Scene, StepRefused
 
 SECTION = "own"
 #: States whose exact ends are computed, and those whose certificate is asked for; the same for a quick look.

@@ -454,6 +454,14 @@ def stepper_of(mechanics: Mechanics) -> SeriesStepper:
     return _steppers[mechanics.key]
 
 
+def code_of(scene: Any) -> tuple[StepCode, list[float]]:
+    """Return the code by which the general series steps a scene, and the constants that it takes."""
+    stepper = stepper_of(scene.mechanics)
+    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
+    code = stepper.code(frozenset(name for name, value in constants.items() if value == 0.0))
+    return code, [constants[name.removeprefix("k_")] for name in code.constants]
+
+
 def usual_order(dt: float) -> int:
     """Return the order of the series for a control step [s], unless a scene is given another."""
     return 16 if dt <= 0.03 else 20 if dt <= 0.1 else 22
