@@ -6,7 +6,7 @@ Importing the package registers its environments; ``gym.make("PivotedBar-v0")`` 
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.registration import register
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["TASKS", "__version__", "register"]
 
 for _id, (_task, _fixed) in TASKS.items():

@@ -915,6 +915,12 @@ def _controls(scene: Scene, modes: Any, controls: Any) -> tuple[Any, tuple[str, 
 def _check_class(cls: type[Scene]) -> None:
     """Raise a FormulaError for what can be seen of a class without running its formulas."""
     of = cls.__name__
+    for c in cls.__mro__[: cls.__mro__.index(Scene)]:
+        if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
+            raise FormulaError(
+                f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
+                "dissipation and applied, from which these follow (CHANGELOG.md shows a scene before and after)"
+            )
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:
         raise FormulaError(f"{of}.{faults[0]}")
@@ -929,11 +935,6 @@ def _check_names(scene: Scene) -> None:
     cls, of = type(scene), type(scene).__name__
     public = {name for name in dir(Scene) if not name.startswith("_")}
     for c in cls.__mro__[: cls.__mro__.index(Scene)]:
-        if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
-            raise FormulaError(
-                f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
-                "dissipation and applied, from which these follow"
-            )
         for name in (*_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
                 raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")

@@ -106,6 +106,11 @@ class Task:
     def __init__(
         self, *, dt: float | None = None, duration: float | None = None, target: Any = None, **parameters: Any
     ) -> None:
+        if hasattr(type(self), "scene_type"):
+            raise FormulaError(
+                f"{type(self).__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
+                "write scene, action, start, observe and reward by name (CHANGELOG.md shows one before and after)"
+            )
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(
