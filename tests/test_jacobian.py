@@ -3,7 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
-from contract_scenes import ChargedParticle, RotatingHoop
+from contract_scenes import ChargedParticle, RotatingHoop, Trolley
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
@@ -22,6 +22,7 @@ CASES = {
     "charge": (ChargedParticle(), [0.2, 1.0, 2.0, -3.0], [], 0.1),
     "hoop": (RotatingHoop(), [0.4, 1.0], [0.01], 0.05),
     "turning plane": (Incline(control="tilt_rate", damping=0.03), [0.1, 0.2, 0.05], [0.3], 0.05),
+    "two rates": (Trolley(), [0.2, 0.1, 1.0, 2.0, -0.5, -3.0], [0.7, 0.2, 0.3], 0.02),
 }
 
 
