@@ -3,7 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
-from contract_scenes import ChargedParticle, RotatingHoop
+from contract_scenes import ChargedParticle, RotatingHoop, Trolley
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
@@ -31,6 +31,7 @@ CASES = {
     "hoop": (RotatingHoop(), [0.4, 1.0], [0.01], 0.05),
     "turning shell": (CylinderInCylinder(damping=0.24), [0.3, 1.0, 4.0], [9.0], 0.05),
     "turning plane": (Incline(control="tilt_rate", damping=0.03), [0.1, 0.2, 0.05], [0.3], 0.05),
+    "two rates": (Trolley(), [0.2, 0.1, 1.0, 2.0, -0.5, -3.0], [0.7, 0.2, 0.3], 0.02),
 }
 
 

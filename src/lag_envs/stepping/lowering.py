@@ -427,9 +427,9 @@ class Lowering:
             weight: Weight = 1.0
             constant: Weight = next(value)
             node = now[node]
-            if node >= 0 and nodes[node].op == "sum" and len(nodes[node].args) == 1:
-                weight, constant = nodes[node].weights
-                (node,) = nodes[node].args
+            if node >= 0 and nodes[node].op == "sum" and len(nodes[node].args) < 2:
+                *several, constant = nodes[node].weights
+                weight, node = (several[0], nodes[node].args[0]) if several else (1.0, -1)
             if node >= 0 or constant != 0.0:
                 mass[place] = (node, weight, constant)
         return _needed(
