@@ -1,4 +1,4 @@
-"""Tasks on scenes of energies that ``lag-envs bench`` sets beside Gymnasium's CartPole, one of them its own."""
+"""Tasks on scenes of energies that ``lag-envs bench`` sets beside Gymnasium's CartPole: one is the same."""
 
 from __future__ import annotations
 
