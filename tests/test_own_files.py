@@ -1,5 +1,6 @@
 """A file of one's own in `report`, `info`, `bench` and `play`: what is found, what is said of mistakes."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -318,6 +319,19 @@ def test_stiff_parameters_are_counted(write):
     found = {row["case"]: row for row in own.stability(path, "", True, "Swing")}
     assert found["as it is"]["refused"] == 0 and found["as it is"]["balance"] < 1e-12
     assert {"states × 10", "length × 0.0001", "length × 10000"} <= set(found)
+    assert max(row["balance"] for row in found.values()) < own.BALANCE
+
+
+def test_a_balance_of_quick_motion_needs_finer_quadrature(write):
+    """With a load of a tenth of a gram the winch pulls it to and fro hundreds of times as fast."""
+    from lag_envs.report import own
+
+    (subject,) = own.subjects(f"{SEVERAL}:Deliver")
+    light = dataclasses.replace(subject.scene, load_mass=1e-4)
+    start, held = np.array([0.0, 0.0, 1.06, 0.7, 0.22, -0.6]), np.array([-9.5, 6.0])
+    assert own.balance(light, start, held, subject.dt) < 1e-11
+    coarse = light.energy_balance(start, held, subject.dt)
+    assert abs(coarse["residual"]) > 1e-3 * abs(coarse["work"])
 
 
 @pytest.mark.slow

@@ -110,7 +110,7 @@ def test_cosine_and_sine_stay_a_pair(name):
 
 
 #: Constants that act at random or at a limit only are moved by more, so that few steps show it.
-MOVED = {"chance": 1.0, "limit": 0.5, "x": 0.01}
+MOVED = {"chance0": 1.0, "limit": 0.5, "x": 0.01, "self_radius": 0.5, "self_shell_radius": 0.5}
 
 
 @pytest.mark.parametrize("id", TASKS)

@@ -40,7 +40,7 @@ DT = 0.02
 #: Systems, states, copies of them in a timed call, tolerances and orders of ours; the same for a quick look.
 MEMBERS, COPIES = 200, 8
 TOLERANCES: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12, 1e-14)
-ORDERS: Sequence[int] = tuple(range(6, 25, 2))
+ORDERS: Sequence[int] = tuple(range(4, 25, 2))
 #: Settings of the others.
 HEYOKA: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12, 1e-13, 1e-15)
 SUBSTEPS = {

@@ -42,8 +42,8 @@ FACTORS, WILD = (1e-4, 1e-2, 1e2, 1e4), 10.0
 ROUNDING = 1e-12
 #: How far energy may be out of balance, relative to what there is of it and of work.
 BALANCE = 1e-9
-#: Into how many pieces a step is cut for it.
-PIECES = (1, 8, 64, 512)
+#: How often the time of a step is halved for it.
+DEEPEST = 12
 
 
 class Subject(NamedTuple):
@@ -277,23 +277,21 @@ def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
 def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
     """Return how far a step's change of energy is from the work done, relative to energy and work.
 
-    Work is a quadrature along the motion. Where that is too coarse, the step is cut into pieces.
+    Work is a quadrature along the motion. Where that is too coarse, the time is halved.
     """
     control: Any = held if len(held) else 0.0
-    found = math.inf
-    for pieces in PIECES:
-        state, total, size = start, 0.0, 0.0
-        for _ in range(pieces):
-            part = scene.energy_balance(state, control, dt / pieces)
-            energy = scene.energy(state, control)
-            size = max(size, abs(float(energy["kinetic"])) + abs(float(energy["potential"])))
-            size += abs(part["work"]) + abs(part["loss"])
-            total += part["residual"]
-            state = scene.simulate(state, held[None] if len(held) else 1, dt / pieces)[-1]
-        found = abs(total) / size if size else 0.0
-        if found <= BALANCE:
-            break
-    return found
+    total = size = 0.0
+    todo = [(start, dt, 0)]
+    while todo:
+        state, span, depth = todo.pop()
+        part, energy = scene.energy_balance(state, control, span), scene.energy(state, control)
+        here = sum(abs(float(energy[k])) for k in ("kinetic", "potential")) + abs(part["work"]) + part["loss"]
+        if depth < DEEPEST and not abs(part["residual"]) <= 1e-3 * BALANCE * here:
+            middle = scene.simulate(state, held[None] if len(held) else 1, 0.5 * span)[-1]
+            todo += [(middle, 0.5 * span, depth + 1), (state, 0.5 * span, depth + 1)]
+            continue
+        total, size = total + part["residual"], max(size, here)
+    return abs(total) / size if size else 0.0
 
 
 # --- what it comes to ---

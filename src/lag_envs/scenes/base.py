@@ -919,7 +919,7 @@ def _check_class(cls: type[Scene]) -> None:
         if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
             raise FormulaError(
                 f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
-                "dissipation and applied, from which these follow (CHANGELOG.md shows a scene before and after)"
+                "dissipation and applied, from which these follow (see CHANGELOG.md)"
             )
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:

@@ -109,7 +109,7 @@ class Task:
         if hasattr(type(self), "scene_type"):
             raise FormulaError(
                 f"{type(self).__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
-                "write scene, action, start, observe and reward by name (CHANGELOG.md shows one before and after)"
+                "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
             )
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
