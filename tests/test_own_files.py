@@ -226,7 +226,7 @@ def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(benchmark, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")
-    settings = benchmark.Settings(ids, (SEVERAL,), (3,), 1, 1e-4, cold_starts=0)
+    settings = benchmark.Settings(ids, (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
     rows = [row for row in benchmark.bench(settings)["rows"] if row["library"] == "lag_envs"]
     assert len(rows) == 9 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
 
