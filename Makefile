@@ -7,8 +7,10 @@ PYTHON ?=
 ARGS ?=
 BIN := .venv/bin
 
-# The oldest supported Gymnasium, and the tests that are run on it too.
+# The oldest supported Gymnasium, Numba and NumPy, and the tests that are run on them too.
 OLDEST_GYMNASIUM := 1.2.2
+OLDEST_NUMBA := numba==0.61.0 llvmlite==0.44.0 numpy==2.0.2
+NUMBA_TESTS ?= tests/test_golden.py tests/test_series.py tests/test_own_tasks.py
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
@@ -42,8 +44,11 @@ test-slow: setup  ## install what the slow tests need (Ray, the RL Zoo) and run 
 test-libraries: setup  ## run libraries by their own scripts, each in its environment; ARGS='--docs' writes the page
 	$(BIN)/python tools/libraries $(ARGS)
 
-test-oldest: setup  ## run the tests on the oldest supported Gymnasium
-	@rm -rf .venv/oldest
+test-oldest: setup  ## run tests on the oldest supported Numba and NumPy, and all on the oldest Gymnasium
+	@rm -rf .venv/oldest .venv/oldest-numba
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		--no-deps --target .venv/oldest-numba $(OLDEST_NUMBA)
+	PYTHONPATH=$(CURDIR)/.venv/oldest-numba $(BIN)/python -m pytest -n 2 --dist worksteal $(NUMBA_TESTS)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--no-deps --target .venv/oldest gymnasium==$(OLDEST_GYMNASIUM)
 	@PYTHONPATH=.venv/oldest $(BIN)/python -c \

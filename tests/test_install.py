@@ -37,6 +37,30 @@ INSTALLED = f"""
 import importlib.util, json
 print(json.dumps([name for name in {OPTIONAL} if importlib.util.find_spec(name)]))
 """
+#: The example by its module's name: native vectors equal workers that are started anew.
+OWN = """
+import json
+import gymnasium as gym
+import numpy as np
+
+if __name__ == "__main__":
+    id = "ball_on_beam:BallOnBeam-v0"
+    native = gym.make_vec(id, num_envs=2)
+    workers = gym.make_vec(
+        id, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}
+    )
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 2, 1)).astype(np.float32)
+    seen = []
+    for envs in (native, workers):
+        observations = [envs.reset(seed=3)[0]]
+        for action in actions:
+            observations.append(envs.step(action)[0])
+        seen.append(np.array(observations))
+    workers.close()
+    single = gym.make(id)
+    start, _ = single.reset(seed=3)
+    print(json.dumps([bool(np.array_equal(*seen)), bool(np.array_equal(start, seen[0][0, 0]))]))
+"""
 
 
 def run(*command, cwd):
@@ -69,6 +93,11 @@ def test_core_alone_can_be_installed_and_stepped(tmp_path):
     # -I keeps the surrounding environment's PYTHONPATH out.
     assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
     assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
+    # A file of one's own is all that an environment takes, also in worker processes that are spawned.
+    example = (ROOT / "examples" / "ball_on_beam.py").read_text(encoding="utf-8")
+    (tmp_path / "ball_on_beam.py").write_text(example, encoding="utf-8")
+    (tmp_path / "use_it.py").write_text(OWN, encoding="utf-8")
+    assert json.loads(run(python, "use_it.py", cwd=tmp_path)) == [True, True]
     # What is for other libraries is in the wheel, and says what it needs.
     assert "lag_envs.sb3.ScaledReward" in run(
         python.with_name("lag-envs"), "hyperparams", "ppo", cwd=tmp_path

@@ -80,6 +80,8 @@ class Architecture(ABC):
 
     #: Names and shapes of the arrays in each policy's file; nothing where there are no files.
     arrays: dict[str, Shape]
+    #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
+    plans = False
 
     @abstractmethod
     def __init__(self, env_id: str, table: Fields) -> None: ...
@@ -397,7 +399,8 @@ class Controller(Architecture):
         from lag_envs.controllers import CONTROLLERS
 
         makers = CONTROLLERS[env_id]
-        self.maker = makers[table.choice("name", makers)]
+        name = table.choice("name", makers)
+        self.maker, self.plans = makers[name], name == "iLQR"
         self.task = protocol.make_task(env_id)
         numbers = table.table("numbers", {})
         self.numbers = {

@@ -29,6 +29,9 @@ LEARNED_POLICIES, MOST_POLICIES = 5, 20
 #: How far returns may lie apart on two builds, relative to the way from random to best known. Libraries round
 #: the last digit of tanh differently, and that may grow in the course of an episode.
 TOLERANCE = 1e-3
+#: The same for one who plans: where a rounding decides between two steps of its search, all that follows is
+#: another plan, nearly as good, and so each of its episodes may be another one.
+PLANNED = 1e-2
 #: Share of episodes that may lie further apart than that: where a rounding decides, all else may follow.
 APART = 0.01
 

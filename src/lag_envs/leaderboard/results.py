@@ -194,7 +194,9 @@ class Comparison(NamedTuple):
     far: list[str]
 
 
-def compare(result: Mapping[str, Any], other: Mapping[str, Any], way: float) -> Comparison:
+def compare(
+    result: Mapping[str, Any], other: Mapping[str, Any], way: float, tolerance: float = protocol.TOLERANCE
+) -> Comparison:
     """Compare two verifications of the same submission with the same nonce and number of episodes.
 
     Parameters
@@ -203,6 +205,8 @@ def compare(result: Mapping[str, Any], other: Mapping[str, Any], way: float) -> 
         What `verify` returned.
     way : float
         From the mean return of random actions to that of the best policy known.
+    tolerance : float
+        How far episodes may lie apart, relative to the way.
 
     Raises
     ------
@@ -220,11 +224,11 @@ def compare(result: Mapping[str, Any], other: Mapping[str, Any], way: float) -> 
     if difference > protocol.TOLERANCE:
         far.append(f"mean returns by {difference:.1e} of the scale")
     for a, b in pairs:
-        for name, share in apart(a, b, way).items():
+        for name, share in apart(a, b, way, tolerance).items():
             if share > protocol.APART:
                 far.append(f"the {name} of {share:.1%} of the episodes of seed {a['seed']}")
     # One episode of a hundred may be another one altogether.
-    few = protocol.TOLERANCE * max(1.0, result["episodes"] / protocol.DISTURBED_EPISODES)
+    few = tolerance * max(1.0, result["episodes"] / protocol.DISTURBED_EPISODES)
     conditions = {**result["robustness"], "acting often": result["often"]}
     others = {**other["robustness"], "acting often": other["often"]}
     if set(conditions) != set(others):
@@ -244,7 +248,9 @@ def compare(result: Mapping[str, Any], other: Mapping[str, Any], way: float) -> 
     return Comparison(same, of_one, float(difference), far)
 
 
-def apart(policy: Mapping[str, Any], other: Mapping[str, Any], way: float) -> dict[str, float]:
+def apart(
+    policy: Mapping[str, Any], other: Mapping[str, Any], way: float, tolerance: float = protocol.TOLERANCE
+) -> dict[str, float]:
     """Return the share of episodes that differ in their returns, success, times and efforts."""
 
     def share(name: str, most: float) -> float:
@@ -254,11 +260,11 @@ def apart(policy: Mapping[str, Any], other: Mapping[str, Any], way: float) -> di
         return float(np.mean(~_close(a, b, most)))
 
     return {
-        "returns": share("returns", protocol.TOLERANCE * way),
+        "returns": share("returns", tolerance * way),
         "reference's returns": share("reference", protocol.TOLERANCE * way),
         "successes": share("success", 0.0),
         "times": share("settle", 0.1),
-        "efforts": share("effort", protocol.TOLERANCE),
+        "efforts": share("effort", tolerance),
     }
 
 

@@ -376,7 +376,8 @@ def run_verify(args: argparse.Namespace) -> int:
         results.append({"folder": str(folder)} | result)
         print("\n".join(table(results[-1])), flush=True)
         if before is not None and "refused" not in result:
-            far |= _report(result, before.get(result["digest"]), args.against)
+            plans = load(folder).architecture.plans
+            far |= _report(result, before.get(result["digest"]), args.against, plans)
     if args.json:
         Path(args.json).write_text(json.dumps(results, allow_nan=False) + "\n", encoding="utf-8")
     return 1 if far or any("refused" in result for result in results) else 0
@@ -394,7 +395,7 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
         raise UserError(f"--against: {file} cannot be read: {error}") from error
 
 
-def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> bool:
+def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:
     """Tell how a result compares with an earlier one; return whether it is too far from it."""
     from lag_envs.scores import KNOWN_RETURNS
 
@@ -403,7 +404,8 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str) -> 
         return False
     known = KNOWN_RETURNS[result["env"]]
     try:
-        found = compare(result, other, known.best - known.random)
+        tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
+        found = compare(result, other, known.best - known.random, tolerance)
     except ValueError as error:
         raise UserError(f"--against: {file}: {error}") from error
     if found.same:
