@@ -230,6 +230,28 @@ def test_mistakes_in_a_task(changes, message):
         _mistaken(**changes)().formulas.box()
 
 
+def test_order_of_a_task():
+    """It is the environment's and its scene's, also as a copy; every step is certified with it."""
+    task = type("Calm", (own_tasks.Switched,), {"order": 10, "id": "OwnCalm-v0"})
+    lag_envs.register(task)
+    env = gym.make("OwnCalm-v0").unwrapped
+    del gym.registry["OwnCalm-v0"]
+    copied = copy.deepcopy(env)
+    for one in (env, copied):
+        one.reset(seed=2)
+        assert one.scene.step_bound(one.state, one.control, one.task.dt).order == 10
+    for _ in range(5):
+        before = env.state
+        for one in (env, copied):
+            one.step(env.action_space.sample() * 0 + 1)
+        np.testing.assert_array_equal(env.state, copied.state)
+        after = env.scene.simulate(before, [env.control], env.task.dt)[-1]
+        np.testing.assert_array_equal(env.state, after)
+    for order in (5, 25, 10.0, True):
+        with pytest.raises(FormulaError, match="order must be a whole number from 6 to 24"):
+            type("Wrong", (own_tasks.Deliver,), {"order": order})()
+
+
 def test_unknown_keyword():
     with pytest.raises(
         TypeError, match="unexpected keyword argument 'wind'; this environment takes gravity, load_mass"

@@ -40,6 +40,9 @@ Array = NDArray[np.float64]
 MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
 SEQUENCES = ("state", "left_out")
 
+#: Where a task notes the order of the series that it chose for its scene.
+ORDER = "_order_of_task"
+
 #: What a scene may define; all other public names of `Scene` are its calls.
 DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
 
@@ -336,7 +339,7 @@ class Scene(metaclass=SceneType):
 
     def __reduce__(self) -> tuple:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}  # type: ignore[arg-type]
-        others = {name: value for name, value in vars(self).items() if not name.startswith("_")}
+        others = {n: value for n, value in vars(self).items() if not n.startswith("_") or n == ORDER}
         return _restore, (type(self), others | fields)
 
     # --- what follows: names -------------------------------------------------------------------------------
@@ -599,7 +602,9 @@ class Scene(metaclass=SceneType):
         """Return the order of the series for a control step; 0 for a closed form."""
         from lag_envs.stepping.general import usual_order
 
-        return self._form.order(dt) if self._form else usual_order(dt)
+        if self._form:
+            return self._form.order(dt)
+        return vars(self).get(ORDER) or usual_order(dt)
 
     def _limit(self, dt: float) -> float:
         """Return what a step takes besides dt: the largest x of one series, or the order of the series."""
@@ -753,7 +758,9 @@ class Scene(metaclass=SceneType):
         states = np.broadcast_to(states, (*shape, n)).reshape(count, n)
         controls = np.broadcast_to(controls, (*shape, m)).reshape(count, m)
         parameters = {name: getattr(self, name) for name in self._numbers()}
-        found, refused = self._stepper.jacobian(states, controls, parameters, dt, usual_order(dt))
+        found, refused = self._stepper.jacobian(
+            states, controls, parameters, dt, self._order(dt) or usual_order(dt)
+        )
         if refused:
             i = refused - 1
             raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")
