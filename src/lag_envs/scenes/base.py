@@ -102,8 +102,10 @@ copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 #: Where a motion is singular, or a number too large, that state's results are not finite, and no others'.
 _QUIET = np.errstate(all="ignore")
 
-#: Scenes whose formulas passed the door: the keys of `Scene._structure` by class.
-_admitted: weakref.WeakKeyDictionary[type, set] = weakref.WeakKeyDictionary()
+#: What was derived of scenes whose formulas passed the door: by class, and by `Scene._structure`.
+_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
+    weakref.WeakKeyDictionary()
+)
 
 
 class SceneType(ABCMeta):
@@ -303,17 +305,19 @@ class Scene(metaclass=SceneType):
         self.check()
         try:
             key = self._structure
-            known = key in _admitted.setdefault(type(self), set())
+            known = _admitted.setdefault(type(self), {}).get(key)
         except TypeError as error:
             raise FormulaError(
                 f"{type(self).__name__}: {error}; structural fields must be hashable"
             ) from error
-        if not known:
+        if known is not None:
+            vars(self)["_cached_layout"], vars(self)["_cached_mechanics"] = known
+        else:
             _check_names(self)
             recording.check_again(self, self._layout, recording.record(self, self._layout))
             _check_motion(self, self.mechanics)
             _check_bodies(self)
-            _admitted[type(self)].add(key)
+            _admitted[type(self)][key] = self._layout, self.mechanics
 
     def _numbers(self) -> tuple[str, ...]:
         """Return the names of the parameters that have a value."""

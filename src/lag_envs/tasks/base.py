@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import inspect
 import math
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType, SimpleNamespace
@@ -444,6 +445,9 @@ class _Lifted:
         return self._xp.sin(x)
 
 
+#: Observations and chances of tasks whose formulas have been run: by class, and by `TaskFormulas.key`.
+_checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
+
 #: Attributes of a task whose numbers reach its code as constants, if at all.
 _NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas"}
 
@@ -480,7 +484,11 @@ class TaskFormulas:
         self.draws = task.draws
         self.starts = _starts(task)
         self.has_last = type(task).last_reward is not Task.last_reward
-        self.observation = self._names()
+        known = _checked.setdefault(type(task), {})
+        key = self.key
+        if key not in known:
+            known[key] = self._names(), self._chances
+        self.observation, self._chances = known[key]
 
     # --- constants ------------------------------------------------------------------------------------------
 
