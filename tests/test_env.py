@@ -705,6 +705,20 @@ def test_a_refused_step_changes_nothing():
     env.reset(seed=2)
 
 
+@each_id
+def test_making_again_derives_nothing(env_id, monkeypatch):
+    """Other numbers need no other equations: 64 environments are made in some 30 ms."""
+    make(env_id)
+
+    def refuse(*arguments):
+        raise AssertionError("derived anew")
+
+    monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
+    monkeypatch.setattr("lag_envs.mechanics.recording.record", refuse)
+    monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._names", refuse)
+    make(env_id, mass=1.7, gravity=3.0)
+
+
 def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
     # It is most of what making an environment takes.
     recorded = []

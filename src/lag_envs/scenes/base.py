@@ -108,6 +108,14 @@ _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]
 )
 
 
+def is_own(kind: type) -> bool:
+    """Tell whether a class is the package's: then nothing but its structure decides what formulas give.
+
+    A formula of somebody else may use what is defined outside, and see it changed.
+    """
+    return kind.__module__.startswith("lag_envs.")
+
+
 class SceneType(ABCMeta):
     """The type of scenes: a class is made a frozen dataclass, unless it is one, when it is used first."""
 
@@ -310,9 +318,9 @@ class Scene(metaclass=SceneType):
             raise FormulaError(
                 f"{type(self).__name__}: {error}; structural fields must be hashable"
             ) from error
-        if known is not None:
+        if known is not None and is_own(type(self)):
             vars(self)["_cached_layout"], vars(self)["_cached_mechanics"] = known
-        else:
+        elif known is None:
             _check_names(self)
             recording.check_again(self, self._layout, recording.record(self, self._layout))
             _check_motion(self, self.mechanics)

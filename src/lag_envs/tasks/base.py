@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import ORDER, Scene, complete
+from lag_envs.scenes.base import ORDER, Scene, complete, is_own
 from lag_envs.scenes.checks import StepRefused, check_number, real_array
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
@@ -486,7 +486,7 @@ class TaskFormulas:
         self.has_last = type(task).last_reward is not Task.last_reward
         known = _checked.setdefault(type(task), {})
         key = self.key
-        if key not in known:
+        if key not in known or not is_own(type(task)):
             known[key] = self._names(), self._chances
         self.observation, self._chances = known[key]
 
