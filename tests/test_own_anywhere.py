@@ -21,10 +21,15 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 2, 1)).astype(np.floa
 def example(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES), prepend=":")  # for processes that are started
+    forget()
+    yield
+    forget()
+
+
+def forget():
+    """Leave nothing of the example, so that whoever imports it next has it registered."""
     gym.registry.pop("BallOnBeam-v0", None)
     sys.modules.pop("ball_on_beam", None)
-    yield
-    gym.registry.pop("BallOnBeam-v0", None)
 
 
 def rolled(envs):

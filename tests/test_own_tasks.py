@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 from pathlib import Path
 
 import cloudpickle
@@ -270,3 +271,4 @@ def test_example(monkeypatch):
     ]
     assert after == pytest.approx(before, abs=1e-14)
     del gym.registry["BallOnBeam-v0"]
+    sys.modules.pop("ball_on_beam", None)
