@@ -53,6 +53,13 @@ class Pump(Task):
 """
 
 
+@pytest.fixture(autouse=True)
+def own_ids_only():
+    """Forget what other tests, or pages that are run, have registered of the example."""
+    gym.registry.pop("BallOnBeam-v0", None)
+    sys.modules.pop("ball_on_beam", None)
+
+
 @pytest.fixture
 def write(tmp_path):
     """Write a file, and forget what it defined."""
