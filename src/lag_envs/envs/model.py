@@ -122,7 +122,8 @@ class Model:
         if targets is None and count and fixed is None:
             raise ValueError("the task's target is random: targets must be given")
         if targets is None:
-            return np.ascontiguousarray(np.broadcast_to(fixed if count else np.empty(0), (n, count)))  # type: ignore[arg-type]
+            given = np.empty(0) if fixed is None else fixed
+            return np.ascontiguousarray(np.broadcast_to(given, (n, count)))
         array = np.asarray(targets, np.float64)
         if array.shape not in ([(), (n,)] if count == 1 else [(count,), (n, count)]):
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"

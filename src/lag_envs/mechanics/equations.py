@@ -76,12 +76,6 @@ class Equations:
         """Return G_ij."""
         return self.mass.get((min(i, j), max(i, j)), Expr({}))
 
-    @property
-    def potential_of_motion(self) -> Expr:
-        """V - T₀, the potential of Jacobi's integral."""
-        rest = Expr({m: c for m, c in self.energies.kinetic.terms.items() if _degree(m) == 0})
-        return self.energies.potential - rest
-
 
 def _degree(monomial: Sequence[tuple[Atom, int]]) -> int:
     return sum(n for atom, n in monomial if atom.kind == "velocity")

@@ -139,6 +139,22 @@ class Carrying:
     tanh = _carried(np.tanh, lambda x, y: 1.0 - y * y)
 
 
+def eliminated(matrix: Sequence[Sequence], right: Sequence) -> list:
+    """Solve a small linear system by elimination without pivoting, on numbers of any kind."""
+    n = range(len(right))
+    a, b = [list(row) for row in matrix], list(right)
+    for i in n:
+        for j in range(i + 1, len(n)):
+            factor = a[j][i] / a[i][i]
+            a[j] = [x - factor * y for x, y in zip(a[j], a[i], strict=True)]
+            b[j] = b[j] - factor * b[i]
+    for i in reversed(n):
+        for j in range(i + 1, len(n)):
+            b[i] = b[i] - a[i][j] * b[j]
+        b[i] = b[i] / a[i][i]
+    return b
+
+
 class Point:
     """A motion at given states under given controls.
 
@@ -210,20 +226,9 @@ class Point:
         return total
 
     def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a column, by elimination: where M is singular, that state alone gets no number."""
-        n = range(len(right))
-        a = [list(self.mass[len(n) * i : len(n) * (i + 1)]) for i in n]
-        b = list(right)
-        for i in n:
-            for j in range(i + 1, len(n)):
-                factor = a[j][i] / a[i][i]
-                a[j] = [x - factor * y for x, y in zip(a[j], a[i], strict=True)]
-                b[j] = b[j] - factor * b[i]
-        for i in reversed(n):
-            for j in range(i + 1, len(n)):
-                b[i] = b[i] - a[i][j] * b[j]
-            b[i] = b[i] / a[i][i]
-        return b
+        """Return M⁻¹ times a column; where M is singular, that state alone gets no number."""
+        n = len(right)
+        return eliminated([self.mass[n * i : n * (i + 1)] for i in range(n)], right)
 
     # --- what follows --------------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.evaluation import eliminated
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
@@ -121,7 +122,7 @@ class SeriesStepper:
             (weight,) = evaluate([entry], values, xp)
             by = next(p.control for p in levels if p.name == name)
             right[i] = right[i] + weight * held[by or ""]
-        return _solve([entries[i * n : (i + 1) * n] for i in range(n)], right)
+        return eliminated([entries[i * n : (i + 1) * n] for i in range(n)], right)
 
     def finish(
         self, xp: Any, q: Sequence, v: Sequence, y: Sequence, u: Sequence, dt: Any, k: Mapping[str, Any]
@@ -226,22 +227,6 @@ def _evaluated(record: SeriesRecord, parameters: Mapping[Atom, float]) -> dict[s
     names = list(record.constants)
     numbers = evaluate([record.constants[name] for name in names], parameters, math)
     return {name: float(value) for name, value in zip(names, numbers, strict=True)}
-
-
-def _solve(matrix: Sequence[Sequence], right: Sequence) -> list:
-    """Solve a small linear system by elimination without pivoting, on numbers of any kind."""
-    n = len(right)
-    a, b = [list(row) for row in matrix], list(right)
-    for i in range(n):
-        for j in range(i + 1, n):
-            factor = a[j][i] / a[i][i]
-            a[j] = [x - factor * y for x, y in zip(a[j], a[i], strict=True)]
-            b[j] = b[j] - factor * b[i]
-    for i in reversed(range(n)):
-        for j in range(i + 1, n):
-            b[i] = b[i] - a[i][j] * b[j]
-        b[i] = b[i] / a[i][i]
-    return b
 
 
 class StepBound(NamedTuple):
