@@ -37,8 +37,8 @@ test: setup  ## run the tests and doctests, all but the slow ones
 	@sh tools/browser
 	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
-test-slow: setup  ## install what the slow tests need (Ray, the RL Zoo) and run them; it prints how long it took
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,ray,zoo]'
+test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'
 	$(BIN)/python -m pytest -m slow --no-skips --durations 10 $(ARGS)
 
 test-libraries: setup  ## run libraries by their own scripts, each in its environment; ARGS='--docs' writes the page

@@ -1,5 +1,6 @@
 """The example of the tutorial in the hands of other libraries: videos, workers, learners, clusters."""
 
+import os
 import sys
 import threading
 from pathlib import Path
@@ -20,7 +21,8 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 2, 1)).astype(np.floa
 @pytest.fixture(autouse=True)
 def example(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    monkeypatch.setenv("PYTHONPATH", str(EXAMPLES), prepend=":")  # for processes that are started
+    for folder in (Path(__file__).parent, EXAMPLES):  # for processes that are started
+        monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
     forget()
     yield
     forget()
