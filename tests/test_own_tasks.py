@@ -249,7 +249,7 @@ def test_order_of_a_task():
         after = env.scene.simulate(before, [env.control], env.task.dt)[-1]
         np.testing.assert_array_equal(env.state, after)
     for order in (5, 25, 10.0, True):
-        with pytest.raises(FormulaError, match="order must be a whole number from 6 to 24"):
+        with pytest.raises(ValueError, match="order must be a whole number from 6 to 24"):
             type("Wrong", (own_tasks.Deliver,), {"order": order})()
 
 

@@ -23,11 +23,11 @@ from series_systems import SYSTEMS, System, acceleration
 from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import compiling, driver, general, machine
-from lag_envs.stepping.compiling import compile_python
+from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.driver import compile_advance, compile_advance_block
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.lowering import ELAPSED
-from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt
+from lag_envs.stepping.machine import Layout, compile_attempt
 from lag_envs.stepping.series import (
     LARGEST_ORDER,
     SMALLEST_ORDER,

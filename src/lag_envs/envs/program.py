@@ -9,10 +9,10 @@ kind of its end: 1 terminated, 2 truncated, 3 both). Needed within a step: lifte
 reward ``r``, kind of end ``over``, whether the step was an ``ordinary`` one (1; 0 special; 2 none but a
 restart), observation ``o``.
 
-A batch is cut into blocks of 64 environments. The rows of a block lie behind one another at distances known
-when compiling, so the compiler sees that they do not overlap and turns the loop over a block into vector
-instructions; with one array per row it gives up on proving that. Rows needed within a step exist once for all
-blocks and so stay in the processor's nearest cache.
+A batch is cut into blocks of `BLOCK` environments. The rows of a block lie behind one another at distances
+known when compiling, so the compiler sees that they do not overlap and turns the loop over a block into
+vector instructions; with one array per row it gives up on proving that. Rows needed within a step exist once
+for all blocks and so stay in the processor's nearest cache.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
 
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import section, split
 from lag_envs.stepping.tracing import Trace
 
-BLOCK = 64
 DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
 SLOW = -3  #: status of a step that the fast formula does not cover
 
@@ -281,7 +280,7 @@ class Program:
             *self.lift, *(f"{u} = 0.0" for u in self.u), "n = 0.0",
         ]  # fmt: skip
 
-    # --- a batch: blocks of rows of 64 environments --------------------------------------------------------
+    # --- a batch: blocks of rows ---------------------------------------------------------------------------
 
     @cached_property
     def step_all(self) -> Callable:

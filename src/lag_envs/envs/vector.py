@@ -29,6 +29,7 @@ from lag_envs.envs.single import (
 )
 from lag_envs.scenes import StepRefused
 from lag_envs.scenes.checks import is_masked, real_array, shown
+from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -45,8 +46,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     Parameters
     ----------
-    task : str
-        The task, as "module:Class". The ids fix it.
+    task : str or type
+        The task, a class or "module:Class". The ids fix it.
     num_envs : int
         Number of environments.
     max_episode_steps : int, optional
@@ -78,7 +79,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def __init__(
         self,
-        task: str,
+        task: str | type[Task],
         num_envs: int = 1,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -313,6 +314,18 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return single_number(
             np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
         )
+
+    @property
+    def order(self) -> int | None:
+        """Order of the series by which steps are taken; None where a closed form takes them.
+
+        Another order takes another time; each step is certified to the same tolerance with any.
+        """
+        return None if self.scene._form else int(self._par[self._program.uniform.index("x")])
+
+    @order.setter
+    def order(self, value: int) -> None:
+        self._par[self._program.uniform.index("x")] = check_order("order", value)
 
     @property
     def spec(self) -> EnvSpec | None:

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from lag_envs.report.cases import Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import Flow
 
 Array = NDArray[np.float64]
 K = TypeVar("K")
-BLOCK = 64  #: states of a batch whose numbers lie together in the processor's nearest cache
 
 
 class Kernels:

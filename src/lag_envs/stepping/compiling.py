@@ -14,6 +14,10 @@ from typing import Any
 
 from lag_envs.stepping.tracing import Trace, Value
 
+#: Lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, enough that those
+#: which need further substeps fill vectors.
+BLOCK = 192
+
 _BLOCK = "block_[0-9a-f]{16}"
 _blocks: dict[str, tuple] = {}
 

@@ -13,9 +13,9 @@ from functools import cache
 
 import numpy as np
 
-from lag_envs.stepping.compiling import compile_python
+from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import BLOCK, Layout, compile_attempt, compile_tangent
+from lag_envs.stepping.machine import Layout, compile_attempt, compile_tangent
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.

@@ -15,15 +15,13 @@ from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
 from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
-from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.dual import Dual
 from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
 from lag_envs.stepping.series import LARGEST_ORDER, Lane, Series
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
-#: Lanes whose rows lie together.
-BLOCK = 64
 #: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
 STRIDE = LARGEST_ORDER + 3
 

@@ -50,6 +50,13 @@ TRIES = 4
 GROUP = 8
 
 
+def check_order(name: str, value: Any) -> int:
+    """Return an order that a task may choose, or raise a ValueError; below 6 no step would be worth it."""
+    if type(value) is not int or not 6 <= value <= LARGEST_ORDER:
+        raise ValueError(f"{name} must be a whole number from 6 to {LARGEST_ORDER}, got {value!r:.60}")
+    return value
+
+
 def _rough_log2(x: Any, xp: Any) -> Any:
     """Return the logarithm of x to the base 2, to 0.01."""
     n = xp.exponent(x)

@@ -23,7 +23,7 @@ from lag_envs.scenes.checks import StepRefused, check_number, real_array
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
-from lag_envs.stepping.series import LARGEST_ORDER
+from lag_envs.stepping.series import check_order
 
 if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
@@ -72,7 +72,8 @@ class Task:
         Whether rewards of another `dt` are scaled by dt/interval.
     order : int, optional
         Order of the general series, 6 to 24; by default it follows from `dt`. Calm tasks are stepped in less
-        time with a lower one; each step is certified with any. `lag-envs bench FILE` shows what it costs.
+        time with a lower one, wild ones with a higher one; each step is certified with any.
+        ``lag-envs order FILE`` measures which is best.
     usable : mapping
         Ranges of parameters in which the task can be used, where they are not those that the scene declares.
         Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
@@ -131,12 +132,7 @@ class Task:
             )
         self.scene = kind(**(dict(self.defaults) | parameters))
         if self.order is not None:
-            if type(self.order) is not int or not 6 <= self.order <= LARGEST_ORDER:
-                raise FormulaError(
-                    f"{type(self).__name__}.order must be a whole number from 6 to {LARGEST_ORDER}, "
-                    f"got {self.order!r}"
-                )
-            vars(self.scene)[ORDER] = self.order
+            vars(self.scene)[ORDER] = check_order(f"{type(self).__name__}.order", self.order)
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
         if not 1e-6 <= self.dt <= 1.0:
             raise ValueError(f"dt must lie between 1e-6 and 1 s, got {self.dt:g} s")

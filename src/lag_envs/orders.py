@@ -1,0 +1,82 @@
+"""What the order of the series costs in a task's own episodes: ``lag-envs order``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from statistics import median
+from typing import Any
+
+from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.errors import UserError
+from lag_envs.stepping.series import LARGEST_ORDER
+
+#: An odd order takes the work of the next even one.
+ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
+#: A lower order is preferred to one that is faster by less than this: times differ that much by chance.
+SAME = 1.02
+
+
+def measure(
+    task: type[Any],
+    num_envs: int = 1024,
+    rounds: int = 9,
+    steps: int = 20,
+    advance: Callable[[], Any] = lambda: None,
+) -> dict[int, float]:
+    """Return the time of a step [ns] by the order of the series.
+
+    One batch goes on and on under random actions, its episodes restarted as they end; each round steps it by
+    every order in turn. Whatever the order, each step is certified to the same tolerance.
+
+    Parameters
+    ----------
+    task : type
+        A task whose scene has no closed form.
+    num_envs : int
+        Size of the batch.
+    rounds, steps : int
+        Samples, and steps of one of them.
+    advance : callable
+        Called after each sample.
+    """
+    envs = LagrangianVectorEnv(task, num_envs)
+    if envs.order is None:
+        raise UserError(
+            f"{task.__name__} is stepped in closed form, as {type(envs.scene).__name__} moves like a "
+            "pendulum or on a slope: there is no order to choose"
+        )
+    envs.reset(seed=0)
+    envs.action_space.seed(0)
+    actions = [envs.action_space.sample() for _ in range(64)]
+    # Episodes are to have come of different ages before anything is measured.
+    for action in actions * max(1, min(8, round(envs.task.limit / 64))):
+        envs.step(action)
+    samples: dict[int, list[float]] = {order: [] for order in ORDERS}
+    for _ in range(rounds):
+        for order, times in samples.items():
+            envs.order = order
+            begin = time.perf_counter()
+            for action in actions[:steps]:
+                envs.step(action)
+            times.append((time.perf_counter() - begin) / (steps * num_envs) * 1e9)
+            advance()
+    envs.close()
+    return {order: median(times) for order, times in samples.items()}
+
+
+def best(times: dict[int, float]) -> int:
+    """Return the lowest order that takes no more time than the fastest, but for chance."""
+    fastest = min(times.values())
+    return next(order for order, taken in times.items() if taken <= SAME * fastest)
+
+
+def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
+    """Return the table, and what to write into the task."""
+    found = best(times)
+    rows = [f"{order:5}  {taken:8.1f}  {taken / times[found]:5.2f}" for order, taken in times.items()]
+    if times[now + now % 2] <= SAME * times[found]:
+        advice = f"{task.__name__} is stepped by order {now}, which is as fast as any."
+    else:
+        advice = f"Write `order = {found}` into {task.__name__}, which is stepped by order {now} now."
+    return ["order  ns a step  ratio", *rows, "", advice]

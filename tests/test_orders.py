@@ -1,0 +1,71 @@
+"""The order of the series: what it may be, that it is taken, and what `lag-envs order` says of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lag_envs import orders
+from lag_envs.benchmark_tasks import ExactCartPole
+from lag_envs.cli import main
+from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.errors import UserError
+from lag_envs.tasks import TASKS, load_task
+
+EXAMPLE = str(Path(__file__).parents[1] / "examples" / "ball_on_beam.py")
+PENDULUM = load_task(TASKS["PivotedBar-v0"][0])
+
+
+def test_any_order_takes_the_same_steps():
+    """To rounding: each of them is certified."""
+    seen = {}
+    for order in (8, 10, 24):
+        envs = LagrangianVectorEnv(ExactCartPole, 5)
+        envs.order = order
+        assert envs.order == order
+        envs.reset(seed=3)
+        for i in range(15):
+            envs.step(np.full(5, i % 2))
+        seen[order] = envs.state
+    assert not np.array_equal(seen[8], seen[24])
+    for order in (8, 10):
+        np.testing.assert_allclose(seen[order], seen[24], rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("order", [5, 25, 10.0, True, None])
+def test_an_order_out_of_range_changes_nothing(order):
+    envs = LagrangianVectorEnv(ExactCartPole, 2)
+    with pytest.raises(ValueError, match="order must be a whole number from 6 to 24"):
+        envs.order = order
+    assert envs.order == ExactCartPole.order
+
+
+def test_closed_forms_have_none():
+    assert LagrangianVectorEnv(PENDULUM, 2).order is None
+    with pytest.raises(UserError, match="closed form"):
+        orders.measure(PENDULUM)
+
+
+def test_the_best_is_the_lowest_of_the_fastest():
+    assert orders.best({8: 2.0, 10: 1.01, 12: 1.0, 14: 1.005}) == 10
+    assert orders.best({8: 2.0, 10: 1.1, 12: 1.0}) == 12
+
+
+@pytest.mark.parametrize(
+    ("now", "said"), [(16, "Write `order = 10` into"), (10, "is as fast as any"), (9, "is as fast as any")]
+)
+def test_advice(now, said):
+    text = orders.lines(ExactCartPole, {8: 90.0, 10: 45.0, 12: 50.0, 14: 60.0, 16: 70.0}, now)
+    assert said in text[-1]
+
+
+def test_command(capsys):
+    assert main(["order", EXAMPLE, "--num-envs", "16", "--rounds", "1"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"\n{order:5}  " in out for order in orders.ORDERS)
+    assert "order" in out.splitlines()[-1]
+
+
+def test_command_refuses_what_has_no_series(capsys):
+    assert main(["order", "PivotedBar-v0"]) == 2
+    assert "closed form" in capsys.readouterr().err
