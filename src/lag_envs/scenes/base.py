@@ -761,18 +761,17 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        from lag_envs.stepping.general import usual_order
-
         states, controls, shape = self._check_both(state, control)
         dt = check_step(dt)
         n, m = states.shape[-1], controls.shape[-1]
         count = math.prod(shape)
         states = np.broadcast_to(states, (*shape, n)).reshape(count, n)
         controls = np.broadcast_to(controls, (*shape, m)).reshape(count, m)
-        parameters = {name: getattr(self, name) for name in self._numbers()}
-        found, refused = self._stepper.jacobian(
-            states, controls, parameters, dt, self._order(dt) or usual_order(dt)
-        )
+        if self._form:
+            found, refused = self._form.jacobian(states, controls, self._constants(), dt)
+        else:
+            parameters = {name: getattr(self, name) for name in self._numbers()}
+            found, refused = self._stepper.jacobian(states, controls, parameters, dt, self._order(dt))
         if refused:
             i = refused - 1
             raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")

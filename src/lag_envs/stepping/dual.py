@@ -189,6 +189,11 @@ class Variable:
     def __init__(self, value: Any, slopes: Any) -> None:
         self.value, self.slopes = value, slopes
 
+    @classmethod
+    def of_column(cls, columns: Sequence[str], name: str, value: Any) -> Variable:
+        """Return the number of that name among those by which derivatives are taken, or a constant."""
+        return cls(value, np.array([float(name == column) for column in columns], dtype=object))
+
     def _other(self, other: Any) -> Variable:
         return other if isinstance(other, Variable) else Variable(other, 0.0)
 
@@ -220,6 +225,22 @@ class Variable:
 
     def __rtruediv__(self, other: Any) -> Variable:
         return self._other(other) / self
+
+
+def variables_of(states: Any, controls: Any) -> tuple[list[Variable], list[Variable]]:
+    """Return the columns of states (n, n_state) and of controls (n, n_controls), each a column of its own."""
+    columns = [*states.T, *controls.T]
+    unit = np.eye(len(columns))[:, :, None]
+    given = [Variable(x, unit[i]) for i, x in enumerate(columns)]
+    return given[: states.shape[1]], given[states.shape[1] :]
+
+
+def stacked(numbers: Sequence[Variable], count: int) -> Any:
+    """Return the slopes of numbers as an array of shape (count, len(numbers), columns)."""
+    found = np.empty((count, len(numbers), len(numbers[0].slopes)))
+    for i, number in enumerate(numbers):
+        found[:, i] = number.slopes.T
+    return found
 
 
 class VariableFunctions:

@@ -27,8 +27,9 @@ class Flow(NamedTuple):
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step. ``order`` is that of the series, 0 for a closed form;
-    ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
+    makes the scalar function for any step. ``compile_tangent(present, by)`` makes the one that differentiates
+    steps, by the variables and by the coefficients that are named. ``order`` is that of the series, 0 for a
+    closed form; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
     """
 
     size: int
@@ -37,6 +38,7 @@ class Flow(NamedTuple):
     fast: Callable
     within: Callable
     compile: Callable
+    compile_tangent: Callable
     tolerance: float = pendulum.TOLERANCE
 
 
@@ -55,6 +57,7 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda present: pendulum.compile_flow(present, order, tolerance),
+        lambda present, by: pendulum.compile_tangent(present, by, order, tolerance),
         tolerance,
     )
 
@@ -71,9 +74,16 @@ SLIDE = Flow(
     lambda variables, pull, dt, xp: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
+    slope.compile_slide_tangent,
 )
 TURN = Flow(
-    4, slope.Turn, 0, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn
+    4,
+    slope.Turn,
+    0,
+    _turn,
+    lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp),
+    slope.compile_turn,
+    slope.compile_turn_tangent,
 )
 
 
