@@ -770,8 +770,11 @@ class Scene(metaclass=SceneType):
         if self._form:
             found, refused = self._form.jacobian(states, controls, self._constants(), dt)
         else:
-            parameters = {name: getattr(self, name) for name in self._numbers()}
-            found, refused = self._stepper.jacobian(states, controls, parameters, dt, self._order(dt))
+            tangent = vars(self).get("_cached_tangent")
+            if tangent is None:
+                tangent = self._stepper.tangent({name: getattr(self, name) for name in self._numbers()})
+                vars(self)["_cached_tangent"] = tangent
+            found, refused = tangent.jacobian(states, controls, dt, self._order(dt))
         if refused:
             i = refused - 1
             raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")
