@@ -3,16 +3,36 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
 from lag_envs.envs.single import absent
+from lag_envs.mechanics.quadratic import Quadratic, QuadraticFunctions
 from lag_envs.scenes.checks import real_array
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
+
+
+class Expansion(NamedTuple):
+    """Derivatives of a step by the m entries of state and action.
+
+    Attributes
+    ----------
+    slopes : ndarray, shape (n, n_state, m)
+        Of the state at the step's end.
+    gradient : ndarray, shape (n, m)
+        Of the reward.
+    curvature : ndarray, shape (n, m, m)
+        Its second derivatives, as far as they do not come from the motion's own.
+    """
+
+    slopes: Array
+    gradient: Array
+    curvature: Array
 
 
 class Model:
@@ -98,6 +118,72 @@ class Model:
                 state, action, self.task.dt, None, f"the step of row {refused - 1}"
             )
         return ends, rewards, ended
+
+    def expand(
+        self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None
+    ) -> Expansion:
+        """Expand one step about each state and action: its motion to first order, its reward to second.
+
+        The motion's derivatives are those of the scene's control step, those of guard and reward come from
+        the formulas. Kinks in these are expanded as `lag_envs.mechanics.quadratic` says. That actions beyond
+        [-1, 1] are clipped is left aside.
+
+        Parameters
+        ----------
+        states, actions, targets : array_like
+            As for a step.
+
+        Returns
+        -------
+        Expansion
+            The derivatives by the state's entries and the actions.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As a step does; ValueError also for a task whose actions are choices.
+        """
+        formulas, form, scene = self.task.formulas, self.task.scene._form, self.task.scene
+        if formulas.choices:
+            raise ValueError(
+                f"{type(self.task).__name__} has a list of actions to choose from, by which no step has "
+                "derivatives"
+            )
+        ends, _, ended = self(states, actions, targets)
+        states = real_array("states", states)
+        n, width = states.shape
+        goals = list(self._targets(targets, n).T)
+        acting = real_array("actions", actions).reshape(n, formulas.actions)
+        given = [
+            Quadratic.variable(x, i, width + formulas.actions) for i, x in enumerate([*states.T, *acting.T])
+        ]
+        xp, k = QuadraticFunctions, self._constants
+
+        def lifted(y: list) -> list:
+            angle = None if form is None else form.angle
+            return y if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
+
+        before, zero = given[:width], 0.0 * given[0]
+        y = lifted(before)
+        with np.errstate(all="ignore"):
+            u = [zero + x for x in formulas.control(xp, given[width:], y, goals, k)]
+        held = np.stack([np.broadcast_to(x.value, n) for x in u], axis=-1) if u else np.zeros((n, 0))
+        moved = np.concatenate(scene.jacobian(states, held, self.task.dt), axis=-1)
+        after = []
+        for i, end in enumerate(ends.T):
+            z = sum((x * moved[:, i, j] for j, x in enumerate([*before, *u])), zero)
+            after.append(Quadratic(end, z.slope, z.curvature))
+        z = lifted(after)
+        with np.errstate(all="ignore"):
+            reward = zero + formulas.reward(xp, y, z, u, goals, k)
+            if formulas.has_last and ended.any():
+                reward = xp.where(ended, formulas.last(xp, y, z, u, goals, k), reward)
+        m = len(given)
+        return Expansion(
+            np.stack([x.slope for x in after], axis=-2),
+            np.broadcast_to(reward.slope, (n, m)),
+            np.broadcast_to(reward.curvature, (n, m, m)),
+        )
 
     def kicked(self, states: ArrayLike, draws: ArrayLike) -> Array:
         """Return the states after the task's random kick.

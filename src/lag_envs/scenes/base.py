@@ -765,8 +765,8 @@ class Scene(metaclass=SceneType):
         dt = check_step(dt)
         n, m = states.shape[-1], controls.shape[-1]
         count = math.prod(shape)
-        states = np.broadcast_to(states, (*shape, n)).reshape(count, n)
-        controls = np.broadcast_to(controls, (*shape, m)).reshape(count, m)
+        states = np.array(np.broadcast_to(states, (*shape, n)), order="C").reshape(count, n)
+        controls = np.array(np.broadcast_to(controls, (*shape, m)), order="C").reshape(count, m)
         if self._form:
             found, refused = self._form.jacobian(states, controls, self._constants(), dt)
         else:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.stepping.lowering import SeriesRecord
 
 
@@ -221,7 +222,16 @@ def stacked(numbers: Sequence[Variable], count: int) -> Any:
 
 
 class VariableFunctions:
-    """The functions of `Variable`."""
+    """The functions of `Variable`.
+
+    Parameters
+    ----------
+    xp : namespace
+        Those of its values.
+    """
+
+    def __init__(self, xp: Any = Numeric) -> None:
+        self._xp = xp
 
     def _of(self, x: Any, value: Any, rate: Any) -> Any:
         return Variable(value, x.slopes * rate) if isinstance(x, Variable) else value
@@ -229,34 +239,34 @@ class VariableFunctions:
     def sin(self, x: Any) -> Any:
         """Return the sine."""
         a = getattr(x, "value", x)
-        return self._of(x, np.sin(a), np.cos(a))
+        return self._of(x, self._xp.sin(a), self._xp.cos(a))
 
     def cos(self, x: Any) -> Any:
         """Return the cosine."""
         a = getattr(x, "value", x)
-        return self._of(x, np.cos(a), -np.sin(a))
+        return self._of(x, self._xp.cos(a), -self._xp.sin(a))
 
     def exp(self, x: Any) -> Any:
         """Return the exponential."""
-        value = np.exp(getattr(x, "value", x))
+        value = self._xp.exp(getattr(x, "value", x))
         return self._of(x, value, value)
 
     def log(self, x: Any) -> Any:
         """Return the natural logarithm."""
         a = getattr(x, "value", x)
-        return self._of(x, np.log(a), 1.0 / a)
+        return self._of(x, self._xp.log(a), 1.0 / a)
 
     def sqrt(self, x: Any) -> Any:
         """Return the square root."""
-        value = np.sqrt(getattr(x, "value", x))
+        value = self._xp.sqrt(getattr(x, "value", x))
         return self._of(x, value, 0.5 / value)
 
     def atan(self, x: Any) -> Any:
         """Return the arc tangent."""
         a = getattr(x, "value", x)
-        return self._of(x, np.arctan(a), 1.0 / (1.0 + a * a))
+        return self._of(x, self._xp.atan(a), 1.0 / (1.0 + a * a))
 
     def tanh(self, x: Any) -> Any:
         """Return the hyperbolic tangent."""
-        value = np.tanh(getattr(x, "value", x))
+        value = self._xp.tanh(getattr(x, "value", x))
         return self._of(x, value, 1.0 - value * value)

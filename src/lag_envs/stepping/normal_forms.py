@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from types import SimpleNamespace
@@ -29,7 +29,6 @@ from lag_envs.mechanics.layout import Layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
 
@@ -182,27 +181,8 @@ class NormalForm:
     ) -> tuple[Any, int]:
         """Return the derivatives of the states at the step's end by states and controls.
 
-        Parameters and results are those of `SeriesStepper.jacobian`; `constants` are those of this form.
+        Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form.
         """
-        y, u = variables_of(states, controls)
-        xp = VariableFunctions()
-        if self.angle is not None:
-            y += [xp.cos(y[self.angle]), xp.sin(y[self.angle])]
-        k = SimpleNamespace(**constants)
-        given = [*self.unpack(y, u, k), *self.drive(y, u, k, xp)]
-        count, wide = len(states), states.shape[1] + controls.shape[1]
-        values, slopes = np.zeros((count, len(given))), np.zeros((count, len(given), wide))
-        for i, number in enumerate(given):
-            values[:, i] = getattr(number, "value", number)
-            slopes[:, i] = np.transpose(getattr(number, "slopes", 0.0))
-        refused = self._tangent(dt, constants)(values, slopes, dt, self.largest_x(dt))
-        if refused:
-            return None, refused
-        moved = [Variable(0.0, slopes[:, i].T) for i in range(2)]
-        return stacked(self.pack(moved, y, u, dt, k), count), 0
-
-    def _tangent(self, dt: float, constants: Mapping[str, float]) -> Callable:
-        """Return what differentiates steps, by those coefficients that states or controls change."""
         absent = frozenset(name for name, value in constants.items() if value == 0.0)
         stepper = self.stepper(dt, absent)
         by = tuple(
@@ -210,7 +190,13 @@ class NormalForm:
             for name, terms in self.terms.items()
             if any(term.held.number is None and term.constant not in absent for term in terms)
         )
-        return stepper.flow.compile_tangent(tuple(stepper.terms.values()), by)
+        found = np.empty((*states.shape, states.shape[1] + controls.shape[1]))
+        numbers = (constants[name.removeprefix("k_")] for name in stepper.constants)
+        jacobian = stepper.compile_jacobian(by)
+        refused = jacobian(states, controls, found, dt, self.largest_x(dt), *numbers)
+        if not refused and not np.isfinite(found).all():
+            refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
+        return found, refused
 
     # --- what depends on numbers ---------------------------------------------------------------------------
 

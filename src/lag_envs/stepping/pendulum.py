@@ -532,42 +532,38 @@ def _carry(slopes, lost, change):  # type: ignore[no-untyped-def]
             lost[row, column] = (slopes[row, column] - before[row]) - added
 
 
-def _tangent(values, slopes, dt, x):  # type: ignore[no-untyped-def]
-    """Differentiate a step from each row of `values`; return the row whose step was refused, or 0.
+def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
+    """Differentiate a step; return 0, or -1 where it is refused.
 
-    A row holds θ, θ', cosθ, sinθ and the coefficients. ``slopes[i]``, of shape (9, columns), has their
-    derivatives by anything at the start of step i; those of θ and θ' are replaced by those at its end.
+    `values` are θ, θ', cosθ, sinθ and the coefficients, `slopes` their derivatives at the step's start, by
+    anything, of shape (9, columns). Those of θ and θ' are replaced by those at its end.
     """
-    change, lost = np.zeros((2, len(ROWS))), np.zeros((2, slopes.shape[2]))
-    for i in range(values.shape[0]):
-        theta, omega, c, s, alpha, beta, gamma, delta, ramp = values[i]
-        lost[:] = 0.0
-        if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
-            local(change, omega, c, s, alpha, beta, gamma, delta, ramp, dt, 0.0)
-            carry(slopes[i], lost, change)
-        else:
-            layer, n, m, drift = plan(omega, alpha, beta, gamma, delta, ramp, dt, order, FIELD_COUNTS)
-            if n < 0.0:
-                return i + 1
-            h = layer / n
-            scaled = scale(omega, alpha, beta, gamma, delta, ramp, h, fma(-h, n, layer) / n)
-            w, w_low = scaled[0], scaled[1]
-            c_low = s_low = turned = turned_low = 0.0
-            for j in range(int(n)):
-                local(change, w / h, c, s, alpha, beta, gamma, delta, ramp, h, j * h)
-                carry(slopes[i], lost, change)
-                w, w_low, c, c_low, s, s_low, turned, turned_low = substep(
-                    w, w_low, c, c_low, s, s_low, turned, turned_low, *scaled[2:], float(j)
-                )
-            if m > 0.0:
-                if drift:
-                    alpha = beta = 0.0
-                delta += ramp * layer
-                slopes[i, 7] += slopes[i, 8] * layer
-                slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order, slopes[i])
-        for column in range(slopes.shape[2]):
-            if not (abs(slopes[i, 0, column]) < math.inf and abs(slopes[i, 1, column]) < math.inf):
-                return i + 1
+    theta, omega, c, s, alpha, beta, gamma, delta, ramp = values
+    change, lost = scratch[:2], scratch[2:]
+    lost[:] = 0.0
+    if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
+        local(change, omega, c, s, alpha, beta, gamma, delta, ramp, dt, 0.0)
+        carry(slopes, lost, change)
+        return 0
+    layer, n, m, drift = plan(omega, alpha, beta, gamma, delta, ramp, dt, order, FIELD_COUNTS)
+    if n < 0.0:
+        return -1
+    h = layer / n
+    scaled = scale(omega, alpha, beta, gamma, delta, ramp, h, fma(-h, n, layer) / n)
+    w, w_low = scaled[0], scaled[1]
+    c_low = s_low = turned = turned_low = 0.0
+    for j in range(int(n)):
+        local(change, w / h, c, s, alpha, beta, gamma, delta, ramp, h, j * h)
+        carry(slopes, lost, change)
+        w, w_low, c, c_low, s, s_low, turned, turned_low = substep(
+            w, w_low, c, c_low, s, s_low, turned, turned_low, *scaled[2:], float(j)
+        )
+    if m > 0.0:
+        if drift:
+            alpha = beta = 0.0
+        delta += ramp * layer
+        slopes[7] += slopes[8] * layer
+        slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order, slopes)
     return 0
 
 
@@ -575,7 +571,7 @@ def _tangent(values, slopes, dt, x):  # type: ignore[no-untyped-def]
 def compile_tangent(
     present: tuple[bool, ...], by: tuple[str, ...], order: int = ORDER, tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``tangent(values, slopes, dt, x)``, see `_tangent`.
+    """Compile ``tangent(values, slopes, scratch, dt, x)``, see `_tangent`; `scratch` has four rows.
 
     Parameters
     ----------
