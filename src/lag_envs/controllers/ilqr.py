@@ -231,14 +231,18 @@ class ILQR:
         m = width + 1
         slopes = np.empty((n, steps, m, width))
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
+        # The action is moved inward from its bounds, beyond which it has no effect.
+        inner = np.clip(actions, -1.0 + WIDTH, 1.0 - WIDTH)
         size = max(1, 20_000 // steps)  # what finds room in memory nearby
         for first in range(0, n, size):
             part = slice(first, first + size)
-            x, u = states[part].reshape(-1, width), actions[part].ravel()
+            x, u = states[part].reshape(-1, width), inner[part].ravel()
             found = self.model.expand(x, u, self._goals(targets[part, None], actions[part].shape))
             slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
             gradient[part] = found.gradient.reshape(gradient[part].shape)
             curvature[part] = found.curvature.reshape(curvature[part].shape)
+        # At a bound the reward is as steep as just inside, but for the curvature.
+        gradient[..., -1] += curvature[..., -1, -1] * (actions - inner)
         curvature = concave(curvature)
         if self.tail is None:
             return slopes, gradient, curvature, np.zeros((n, width)), np.zeros((n, width, width))

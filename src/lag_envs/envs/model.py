@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
 from lag_envs.envs.single import absent
-from lag_envs.mechanics.quadratic import Quadratic, QuadraticFunctions
+from lag_envs.mechanics.quadratic import Quadratic, QuadraticFunctions, differences
 from lag_envs.scenes.checks import real_array
 from lag_envs.tasks.base import Task
 
@@ -159,21 +160,26 @@ class Model:
         ]
         xp, k = QuadraticFunctions, self._constants
 
-        def lifted(y: list) -> list:
+        def lifted(xp: Any, y: list) -> list:
             angle = None if form is None else form.angle
             return y if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
 
+        def applied(xp: Any, y: list, acting: Sequence) -> list:
+            return formulas.control(xp, acting, lifted(xp, y), goals, k)
+
         before, zero = given[:width], 0.0 * given[0]
-        y = lifted(before)
         with np.errstate(all="ignore"):
-            u = [zero + x for x in formulas.control(xp, given[width:], y, goals, k)]
+            if type(self.task).guard is not Task.guard:
+                u = differences(lambda *x: applied(np, list(x[:width]), x[width:]), given)
+            else:
+                u = [zero + x for x in applied(xp, before, given[width:])]
         held = np.stack([np.broadcast_to(x.value, n) for x in u], axis=-1) if u else np.zeros((n, 0))
         moved = np.concatenate(scene.jacobian(states, held, self.task.dt), axis=-1)
         after = []
         for i, end in enumerate(ends.T):
             z = sum((x * moved[:, i, j] for j, x in enumerate([*before, *u])), zero)
             after.append(Quadratic(end, z.slope, z.curvature))
-        z = lifted(after)
+        y, z = lifted(xp, before), lifted(xp, after)
         with np.errstate(all="ignore"):
             reward = zero + formulas.reward(xp, y, z, u, goals, k)
             if formulas.has_last and ended.any():

@@ -1,6 +1,6 @@
 """Numbers that carry first and second derivatives along, for the formulas of tasks.
 
-Formulas of tasks may have kinks: `abs`, `minimum`, `maximum`. They are expanded as what moving the variables
+Formulas of tasks may have kinks, by `abs`, `minimum`, `maximum` and `where`. They are expanded as what moving the variables
 by `WIDTH` makes of them: a secant and a second difference. Away from the kink both are exact; near it a
 planner sees how the slope changes, not only on which side it is.
 """
@@ -8,7 +8,7 @@ planner sees how the slope changes, not only on which side it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,21 +93,28 @@ class Quadratic:
 
     def __abs__(self) -> Quadratic:
         x = self.value
-        w = np.maximum(WIDTH * np.sqrt(np.sum(self.slope * self.slope, axis=-1)), 1e-150)
+        w = self._reach()
         up, down = np.abs(x + w), np.abs(x - w)
         return self.through(np.abs(x), (up - down) / (2.0 * w), (up + down - 2.0 * np.abs(x)) / (w * w))
 
-    def __lt__(self, other: Any) -> Any:
-        return self.value < self._lifted(other).value
+    def __lt__(self, other: Any) -> Condition:
+        return (other - self)._positive(strictly=True)
 
-    def __gt__(self, other: Any) -> Any:
-        return self.value > self._lifted(other).value
+    def __gt__(self, other: Any) -> Condition:
+        return (self - other)._positive(strictly=True)
 
-    def __le__(self, other: Any) -> Any:
-        return self.value <= self._lifted(other).value
+    def __le__(self, other: Any) -> Condition:
+        return (other - self)._positive(strictly=False)
 
-    def __ge__(self, other: Any) -> Any:
-        return self.value >= self._lifted(other).value
+    def __ge__(self, other: Any) -> Condition:
+        return (self - other)._positive(strictly=False)
+
+    def _positive(self, *, strictly: bool) -> Condition:
+        return Condition(self.value > 0.0 if strictly else self.value >= 0.0, np.abs(self.value) < self._reach())
+
+    def _reach(self) -> Any:
+        """Return how far the value comes where the variables are moved."""
+        return np.maximum(WIDTH * np.sqrt(np.sum(self.slope * self.slope, axis=-1)), 1e-150)
 
     def through(self, value: Any, first: Any, second: Any) -> Quadratic:
         """Return a function of this number, from its value and two derivatives."""
@@ -115,6 +122,59 @@ class Quadratic:
         first, second = np.asarray(first), np.asarray(second)
         curvature = first[..., None, None] * self.curvature + second[..., None, None] * square
         return Quadratic(value, first[..., None] * self.slope, curvature)
+
+
+def differences(formula: Callable, variables: Sequence[Quadratic]) -> list[Quadratic]:
+    """Expand what a formula returns about its variables by central differences of `WIDTH`.
+
+    So much of a kink is seen as within that reach, and of slopes that change as fast only their mean.
+
+    Parameters
+    ----------
+    formula : callable
+        Takes an array per variable, with any number of axes in front, and returns a list of such arrays.
+    variables : sequence of Quadratic
+        All of the variables, in order.
+    """
+    m = len(variables)
+    i, j = np.triu_indices(m, 1)
+    moves = np.zeros((1 + 2 * m + 2 * len(i), m))
+    moves[1 : m + 1], moves[m + 1 : 2 * m + 1] = WIDTH * np.eye(m), -WIDTH * np.eye(m)
+    moves[2 * m + 1 :: 2] = moves[1 + i] + moves[1 + j]
+    moves[2 * m + 2 :: 2] = -moves[2 * m + 1 :: 2]
+    found = []
+    for values in formula(*(x.value + moves[:, column, None] for column, x in enumerate(variables))):
+        values = np.moveaxis(np.broadcast_to(values, (len(moves), *variables[0].value.shape)), 0, -1)
+        middle, plus, minus = values[..., :1], values[..., 1 : m + 1], values[..., m + 1 : 2 * m + 1]
+        own = plus + minus - 2.0 * middle
+        both = values[..., 2 * m + 1 :: 2] + values[..., 2 * m + 2 :: 2] - 2.0 * middle
+        curvature = np.empty((*own.shape, m))
+        curvature[..., range(m), range(m)] = own
+        curvature[..., i, j] = curvature[..., j, i] = 0.5 * (both - own[..., i] - own[..., j])
+        found.append(Quadratic(middle[..., 0], (plus - minus) / (2.0 * WIDTH), curvature / WIDTH**2))
+    return found
+
+
+class Condition:
+    """Whether a comparison holds, and whether moving the variables may change that."""
+
+    def __init__(self, holds: Any, near: Any = False) -> None:
+        self.holds, self.near = np.asarray(holds), np.asarray(near)
+
+    def _joined(self, other: Any, how: Callable) -> Condition:
+        b = other if isinstance(other, Condition) else Condition(other)
+        return Condition(how(self.holds, b.holds), self.near | b.near)
+
+    def __or__(self, other: Any) -> Condition:
+        return self._joined(other, np.logical_or)
+
+    def __and__(self, other: Any) -> Condition:
+        return self._joined(other, np.logical_and)
+
+    __ror__, __rand__ = __or__, __and__
+
+    def __invert__(self) -> Condition:
+        return Condition(~self.holds, self.near)
 
 
 def _function(value: Callable, first: Callable, second: Callable) -> Any:
@@ -162,13 +222,23 @@ class QuadraticFunctions:
 
     @staticmethod
     def where(condition: Any, a: Any, b: Any) -> Any:
-        """Select elementwise."""
+        """Select elementwise; near the border as (a + b ± |a - b|)/2, which sees a kink there."""
+        given = condition if isinstance(condition, Condition) else Condition(condition)
         known = a if isinstance(a, Quadratic) else b
         if not isinstance(known, Quadratic):
-            return np.where(condition, a, b)
-        a, b, condition = known._lifted(a), known._lifted(b), np.asarray(condition)
-        return Quadratic(
-            np.where(condition, a.value, b.value),
-            np.where(condition[..., None], a.slope, b.slope),
-            np.where(condition[..., None, None], a.curvature, b.curvature),
-        )
+            return np.where(given.holds, a, b)
+        a, b = known._lifted(a), known._lifted(b)
+        chosen = _select(given.holds, a, b)
+        if not given.near.any():
+            return chosen
+        off = a - b
+        sign = np.sign(off.value) * np.where(given.holds, 1.0, -1.0)
+        return _select(given.near, 0.5 * (a + b + sign * abs(off)), chosen)
+
+
+def _select(condition: Any, a: Quadratic, b: Quadratic) -> Quadratic:
+    return Quadratic(
+        np.where(condition, a.value, b.value),
+        np.where(condition[..., None], a.slope, b.slope),
+        np.where(condition[..., None, None], a.curvature, b.curvature),
+    )
