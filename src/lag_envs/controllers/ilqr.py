@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, Reader, as_actions
-from lag_envs.envs.model import Model
-from lag_envs.mechanics.quadratic import WIDTH
+from lag_envs.envs.model import REACH, Model
 from lag_envs.tasks.base import Task
 
 #: Shares of the full change of the controls that are tried side by side.
@@ -232,8 +231,8 @@ class ILQR:
         slopes = np.empty((n, steps, m, width))
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
         # The action is moved inward from its bounds, beyond which it has no effect.
-        inner = np.clip(actions, -1.0 + WIDTH, 1.0 - WIDTH)
-        size = max(1, 20_000 // steps)  # what finds room in memory nearby
+        inner = np.clip(actions, -1.0 + REACH, 1.0 - REACH)
+        size = max(1, 4_000 // steps)  # what finds room in memory nearby
         for first in range(0, n, size):
             part = slice(first, first + size)
             x, u = states[part].reshape(-1, width), inner[part].ravel()
@@ -253,7 +252,7 @@ class ILQR:
         assert self.tail is not None
         ends = self._step(states[:, -1], actions[:, -1], targets)[0]
         n, width = ends.shape
-        moves = WIDTH * np.eye(width)
+        moves = REACH * np.eye(width)
 
         def value(move: Array) -> Array:
             assert self.tail is not None
@@ -266,8 +265,8 @@ class ILQR:
             for b in range(width):
                 corner = value(moves[a] + moves[b]) - value(moves[a] - moves[b])
                 corner += value(-moves[a] - moves[b]) - value(moves[b] - moves[a])
-                curvature[:, a, b] = corner / (4.0 * WIDTH**2)
-        return (plus - minus) / (2.0 * WIDTH), concave(curvature)
+                curvature[:, a, b] = corner / (4.0 * REACH**2)
+        return (plus - minus) / (2.0 * REACH), concave(curvature)
 
     def _solve(
         self, actions: Array, damping: Array, slopes: Array, gradient: Array, curvature: Array,
