@@ -122,9 +122,7 @@ class Model:
             )
         return ends, rewards, ended
 
-    def expand(
-        self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None
-    ) -> Expansion:
+    def expand(self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None) -> Expansion:
         """Expand one step about each state and action: its motion to first order, its reward to second.
 
         The motion's derivatives are those of the scene's control step. Guard and reward have kinks, of which

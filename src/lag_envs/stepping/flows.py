@@ -240,7 +240,7 @@ class Stepper:
         columns = [*self.start[:n], *self.controls]
         wide, size, rows = len(columns), self.flow.size, self.flow.size + len(self.terms)
 
-        def given(names: Sequence[str], numbers: Sequence) -> list[Variable]:
+        def given(names: Sequence[Any], numbers: Sequence) -> list[Variable]:
             found = [Variable.of_column(columns, name, x) for name, x in zip(names, numbers, strict=True)]
             if self._angle is not None:
                 angle, (c, s) = found[self._angle].slopes, numbers[n : n + 2]
@@ -250,8 +250,8 @@ class Stepper:
         def prepare(xp: Any, *numbers: Any) -> list:
             names = [*self.start, *self.controls, *self._given]
             found = self._prepare(VariableFunctions(xp), *given(names, numbers))
-            numbers = [x if isinstance(x, Variable) else Variable.of_column(columns, "", x) for x in found]
-            return [x.value for x in numbers] + [slope for x in numbers for slope in x.slopes]
+            results = [x if isinstance(x, Variable) else Variable.of_column(columns, "", x) for x in found]
+            return [x.value for x in results] + [slope for x in results for slope in x.slopes]
 
         def finish(xp: Any, *numbers: Any) -> list:
             slopes, rest = split(numbers, 2 * wide)
@@ -265,9 +265,7 @@ class Stepper:
         moved = [f"moved{i}" for i in range(2 * wide)]
         prepared, before = section(prepare, [*self.start, *self.controls, *self._given], held)
         ends = [f"end{i}" for i in range(n * wide)]
-        finished, after = section(
-            finish, [*moved, *self.start, *self.controls, "dt", *self._given], ends
-        )
+        finished, after = section(finish, [*moved, *self.start, *self.controls, "dt", *self._given], ends)
         loop = [
             *(f"{y} = states[i, {j}]" for j, y in enumerate(self.start[:n])),
             *lift_lines(n, self._angle, "y"),

@@ -345,7 +345,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
 
 
 def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
-    """Carry derivatives over a substep along the slow manifold: the lines of `_slow_motion`, differentiated."""
+    """Carry derivatives over a substep along the slow manifold: `_slow_motion` differentiated."""
     drift = (delta + ramp * elapsed - ramp / gamma) / gamma * h
     slope = ramp / gamma * h * h
     U = V.copy()
@@ -381,7 +381,7 @@ def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp,
 
 
 def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # type: ignore[no-untyped-def]
-    """Return how a step is divided: up to when, into how many substeps, and how many follow the slow manifold.
+    """Return how a step is divided: until when, into how many substeps, how many follow the slow manifold.
 
     Last comes whether drive and drag alone move it there. That is not asked for where derivatives by the
     field are wanted (`field_counts`). The second number is negative where there would be too many.
@@ -586,8 +586,10 @@ def compile_tangent(
     columns, n = ("theta", "omega", *by), len(by) + 2
     numbers = ("omega", "c", "s", *Drive._fields, "h", "elapsed")
     trace = Trace()
-    given = [trace.zero() if name in absent else trace.inputs(name)[0] for name in numbers]
-    found = step_slopes(*given[:3], Drive(*given[3:8]), *given[8:], columns, order)
+    omega, c, s, *rest, h, elapsed = (
+        trace.zero() if name in absent else trace.inputs(name)[0] for name in numbers
+    )
+    found = step_slopes(omega, c, s, Drive(*rest), h, elapsed, columns, order)
     lines, entries = record_block(trace, {f"out{i}": x for i, x in enumerate(found)})
     body = [
         f"def local(change, {', '.join(numbers)}):",

@@ -394,7 +394,6 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
 @cache
 def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; it takes any terms."""
-
     names = ("x", "v", "c", "s", *Turn._fields, "h")
 
     def change(xp: Any, *numbers: Any) -> tuple:

@@ -18,8 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import ORDER, Scene, complete, is_own
+from lag_envs.scenes.base import ORDER, Scene
 from lag_envs.scenes.checks import StepRefused, check_number, real_array
+from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.door import is_own
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
