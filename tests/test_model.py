@@ -76,7 +76,7 @@ def test_expansion_of_a_step(env_id):
     task = load_task(place)(**fixed)
     model, rng = Model(task), np.random.default_rng(3)
     n, width = 20, len(task.scene.state_names)
-    x, a = rng.uniform(-0.3, 0.3, (n, width)), rng.uniform(-0.5, 0.5, n)
+    x, a = rng.uniform(-0.05, 0.05, (n, width)), rng.uniform(-0.5, 0.5, n)
     goals = None if task.target_range is None else rng.uniform(-0.1, 0.1, n)
     found, h = model.expand(x, a, goals), 1e-5
     for j in range(width + 1):
