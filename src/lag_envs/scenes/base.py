@@ -20,13 +20,12 @@ from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLane
 from lag_envs.mechanics.layout import Layout, make_layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
-from lag_envs.scenes import picture
-from lag_envs.scenes.checks import StepRefused, check_step, real_array, shown
+from lag_envs.scenes import picture, steps
+from lag_envs.scenes.checks import check_both
 from lag_envs.scenes.declaring import MAPPINGS, SEQUENCES, complete, controls_of, declare
 from lag_envs.scenes.door import admit
 from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Moment, Shape, Window
-from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
     import sympy
@@ -246,60 +245,9 @@ class Scene(metaclass=SceneType):
 
     # --- what follows: numbers -----------------------------------------------------------------------------
 
-    def _check_state(self, state: ArrayLike) -> Array:
-        """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
-        array = self._check_states(state)
-        if array.ndim != 1:
-            raise ValueError(
-                f"state must be ({', '.join(self.state_names)}), got shape {array.shape}: {shown(state)}"
-            )
-        return array
-
-    def _check_states(self, states: ArrayLike) -> Array:
-        """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
-        array, names = real_array("state", states), self.state_names
-        if array.shape[-1:] != (len(names),):
-            raise ValueError(f"state must be ({', '.join(names)}), got shape {array.shape}: {shown(states)}")
-        bad = ~np.isfinite(array)
-        if bad.any():
-            row = array[tuple(np.argwhere(bad)[0][:-1])]
-            raise ValueError(f"state must be finite, got {dict(zip(names, row.tolist(), strict=True))}")
-        return array
-
-    def _check_controls(self, control: ArrayLike, ndim: int) -> Array:
-        """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
-
-        A single control may stand without its axis; `ndim` is that of the states, by which this is told.
-        """
-        array, names = real_array("the control", control), self.control_names
-        bad = ~np.isfinite(array)
-        if bad.any():
-            raise ValueError(
-                f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
-            )
-        if array.ndim == 0 and (len(names) == 1 or array == 0.0):
-            return np.full(len(names), float(array))
-        if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):
-            return array[..., None]
-        if array.shape[-1:] != (len(names),):
-            wanted = f"({', '.join(names)})" if names else "left out, since the scene has none"
-            raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
-        return array
-
-    def _check_both(self, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-        """Return states and controls with their last axes, and the shape of what follows from both."""
-        states = self._check_states(state)
-        controls = self._check_controls(control, states.ndim)
-        try:
-            return states, controls, np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
-        except ValueError:
-            raise ValueError(
-                f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
-            ) from None
-
     def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
-        states, controls, shape = self._check_both(state, control)
+        states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
         return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
 
@@ -411,7 +359,7 @@ class Scene(metaclass=SceneType):
         B : ndarray, shape (..., n_state, n_controls)
             ∂(d state/dt)/∂control.
         """
-        states, controls, shape = self._check_both(state, control)
+        states, controls, shape = check_both(self, state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
         numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
@@ -492,43 +440,7 @@ class Scene(metaclass=SceneType):
             Where a step cannot be certified within the cap on substeps, or has no finite result. Its
             attribute `trajectory` holds the rows before that.
         """
-        start, dt = self._check_state(state), check_step(dt)
-        given = self._check_sequence(controls)
-        trajectory = np.empty((len(given) + 1, len(start)))
-        trajectory[0] = start
-        code, constants = self._code(dt), self._constants()
-        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-        row = code.simulation(trajectory, given, dt, self._limit(dt), *numbers)
-        if not row and not np.isfinite(trajectory[-1]).all():
-            row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
-        if row:
-            raise self._refusal(
-                trajectory[row - 1], given[row - 1], dt, trajectory[:row], f"step {row - 1} of {len(given)}"
-            )
-        return trajectory
-
-    def _check_sequence(self, controls: ArrayLike | int) -> Array:
-        """Return controls as an array of shape (T, n_controls), or raise a ValueError."""
-        n = len(self.control_names)
-        if n == 0:
-            if isinstance(controls, bool) or not isinstance(controls, int | np.integer) or controls < 0:
-                raise ValueError(
-                    "this scene has no control: give the number of steps in place of controls, "
-                    f"got {controls!r:.60}"
-                )
-            return np.empty((int(controls), 0))
-        array = real_array("controls", controls)
-        if array.ndim == 1 and n == 1:
-            array = array[:, None]
-        if array.ndim != 2 or array.shape[1] != n:
-            wanted = "(T,)" if n == 1 else f"(T, {n}), in each row {', '.join(self.control_names)}"
-            raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
-        bad = ~np.isfinite(array)
-        if bad.any():
-            raise ValueError(
-                f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}"
-            )
-        return array
+        return steps.simulate(self, state, controls, dt)
 
     def step_bound(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> StepBound:
         """Return how a control step is divided, and what its series leave out at most.
@@ -556,22 +468,7 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        from lag_envs.stepping.general import StepBound
-
-        start, dt = self._check_state(state), check_step(dt)
-        held = self._check_controls(control, 1).reshape(-1)
-        if self._form:
-            return self._form.step_bound(start, list(held), dt, self._constants())
-        code, constants = self._code(dt), self._constants()
-        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-        order = self._order(dt)
-        status, bounds = code.bounded(start.tolist(), held.tolist(), dt, order, numbers)
-        if status < 0:
-            raise self._refusal(start, held, dt, None, "the step")
-        of = {("place", name): bounds[0][i] for i, name in enumerate(self._layout.free)}
-        of |= {("velocity", name): bounds[1][i] for i, name in enumerate(self._layout.free)}
-        by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in self._layout.state}
-        return StepBound(status, order, by_state, "proved with the step")
+        return steps.step_bound(self, state, control, dt)
 
     truncation_bound = step_bound
 
@@ -601,42 +498,7 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        states, controls, shape = self._check_both(state, control)
-        dt = check_step(dt)
-        n, m = states.shape[-1], controls.shape[-1]
-        count = math.prod(shape)
-        states = np.array(np.broadcast_to(states, (*shape, n)), order="C").reshape(count, n)
-        controls = np.array(np.broadcast_to(controls, (*shape, m)), order="C").reshape(count, m)
-        if self._form:
-            found, refused = self._form.jacobian(states, controls, self._constants(), dt)
-        else:
-            tangent = vars(self).get("_cached_tangent")
-            if tangent is None:
-                tangent = self._stepper.tangent({name: getattr(self, name) for name in self._numbers()})
-                vars(self)["_cached_tangent"] = tangent
-            found, refused = tangent.jacobian(states, controls, dt, self._order(dt))
-        if refused:
-            i = refused - 1
-            raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")
-        found = found.reshape(*shape, n, n + m)
-        return found[..., :n], found[..., n:]
-
-    def _refusal(
-        self, state: Array, control: ArrayLike, dt: float, trajectory: Array | None, where: str
-    ) -> StepRefused:
-        """Return the error for a step that was refused."""
-        start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
-        held = zip(self.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
-        why = "it could not be certified within the largest number of substeps"
-        if self._form is not None:
-            why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
-        error = StepRefused(
-            f"{where} was refused: from ({start}) with "
-            f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
-            "finite result; take a smaller dt or milder parameters"
-        )
-        error.trajectory = None if trajectory is None else trajectory.copy()
-        return error
+        return steps.jacobian(self, state, control, dt)
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
@@ -727,20 +589,7 @@ class Scene(metaclass=SceneType):
             ``change`` of energy, or of Jacobi's integral where `energy` has it; ``work`` of drive and applied
             forces, ``loss`` to drag, and ``residual`` = change - work + loss.
         """
-        dt = check_step(dt)
-        controls = self._check_controls(control, 1)
-        points, weights = np.polynomial.legendre.leggauss(nodes)
-        times = 0.5 * dt * (points + 1.0)
-        held: Any = controls[None] if self.control_names else 1
-        states = np.array([self.simulate(state, held, t)[1] for t in [*times, dt]])
-        power = self.power(states[:-1], controls)
-        work, loss = (
-            float(np.sum(0.5 * dt * weights * value))
-            for value in (power["drive"] + power["applied"], power["drag"])
-        )
-        name = "total" if self.mechanics.gyroscopic is None else "jacobi"
-        change = float(self.energy(states[-1], controls)[name] - self.energy(state, controls)[name])
-        return {"change": change, "work": work, "loss": loss, "residual": change - work + loss}
+        return steps.energy_balance(self, state, control, dt, nodes)
 
 
 def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
