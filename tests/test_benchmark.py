@@ -5,12 +5,16 @@ import re
 import subprocess
 import sys
 import time
+from functools import partial
 
+import numpy as np
 import pytest
 
 import lag_envs
 from lag_envs import benchmark, cli
 from lag_envs.benchmark import Contestant, Settings
+from lag_envs.benchmark_jacobians import compile_steps
+from lag_envs.scenes import CartPole
 from lag_envs.tasks import TASKS
 
 ID = "PivotedBarFree-v0"
@@ -251,6 +255,21 @@ def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
     assert len(stages) == len(benchmark.STAGES)
     assert 0.0 < sum(stages) < time.perf_counter() - start
     assert all(stage > 0.0 for stage in stages)
+
+
+def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
+    some = partial(benchmark.jacobians, names=("Incline", "CartPole"))
+    monkeypatch.setattr(benchmark, "jacobians", some)
+    report = benchmark.bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, jacobians=True))
+    rows = {row["name"]: row for row in report["jacobians"]}
+    assert [rows[name]["columns"] for name in ("Incline", "CartPole")] == [3, 5]
+    assert all(row["ratio"] > 0.0 and row["aim"] == 1 + 2 * row["columns"] for row in rows.values())
+    assert "Jacobian of a step" in capsys.readouterr().out
+    # The loop that it is compared with takes the very steps of the scene.
+    scene, states = CartPole(), np.array([[0.1, 0.2, 0.3, 0.4], [0.5, -0.2, 3.0, 1.0]])
+    ends = [scene.simulate(x, [u], 0.02)[1].sum() for x, u in zip(states, (1.0, -2.0), strict=True)]
+    steps = compile_steps(scene, 0.02)(states, np.array([[1.0], [-2.0]]))
+    assert steps == pytest.approx(sum(ends), rel=1e-14)
 
 
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):

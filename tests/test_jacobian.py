@@ -1,10 +1,14 @@
 """Derivatives of a control step against differences in 50-digit arithmetic."""
 
+import math
+
 import mpmath
 import numpy as np
 import pytest
 from contract_scenes import ChargedParticle, RotatingHoop, Trolley
+from reference import flow, random_cases
 
+from lag_envs import scenes
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import parameter
 from lag_envs.scenes import (
@@ -13,6 +17,7 @@ from lag_envs.scenes import (
     Chain,
     CylinderInCylinder,
     RotaryPendulum,
+    Scene,
     StepRefused,
     TwoLinkArm,
 )
@@ -81,6 +86,92 @@ def test_jacobian_is_the_derivative(case):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
+def oracle(case):
+    """Return the derivatives of a step by differences of the lecture's equations in 60 digits."""
+    at = [mpmath.mpf(x) for x in [*case["state"], case["control"]]]
+    n, columns = len(case["state"]), []
+    with mpmath.workdps(60):
+        h = mpmath.mpf(10) ** -15
+        for j in range(len(at)):
+            ends = [
+                flow(case["scene"], case["params"], moved[:n], moved[n], case["dt"], 50)
+                for moved in ([*at[:j], at[j] + side, *at[j + 1 :]] for side in (h, -h))
+            ]
+            columns.append([float((a - b) / (2 * h)) for a, b in zip(*ends, strict=True)])
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize(
+    ("kind", "n"),
+    [
+        ("task", 6),
+        ("damped", 6),
+        ("stiff", 24),
+        *(pytest.param(kind, 120, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
+    ],
+)
+def test_exact_flows(kind, n):
+    """Each scene and control, with drag from gamma dt = 0 to 1e6: also where the control is the drag."""
+    for case in random_cases(kind, n, 41 + n):
+        scene = getattr(scenes, case["scene"])(**case["params"])
+        found = np.concatenate(scene.jacobian(case["state"], case["control"], case["dt"]), axis=1)
+        expected = oracle(case)
+        size = np.maximum(np.abs(expected).max(axis=0), 1e-3)  # column by column
+        assert (np.abs(found - expected) <= 1e-12 * size).all(), case
+
+
+#: Slow manifold and boundary layer, with a field that the control makes, or that is nothing beside the push.
+HEAVY = {
+    "support at rest": ("PivotedBar", {"damping": 40.0}, [0.1, 0.0, 2.0, -30.0], 0.0, 0.02),
+    "support driven": ("PivotedBar", {"damping": 4e3}, [0.1, 0.0, 2.0, 3.0], 9.0, 0.05),
+    "no field": ("PivotedBar", {"damping": 40.0, "gravity": 0.0}, [0.0, 0.0, 2.0, 1.0], 0.0, 0.02),
+    "shell turns": ("CylinderInCylinder", {"damping": 40.0, "control": "tilt"}, [0.5, 2.0, 3.0], -9.0, 0.5),
+    "shell turns without gravity": (
+        "CylinderInCylinder",
+        {"damping": 1e3, "control": "tilt", "gravity": 0.0},
+        [0.5, 2.0, 3.0],
+        -9.0,
+        0.5,
+    ),
+    "the control is the drag": ("CylinderInCylinder", {"control": "damping"}, [1.0, -20.0], 3e4, 0.05),
+    "plane turns": ("Incline", {"control": "tilt_rate", "damping": 1e5}, [0.3, 2.0, 0.2], -0.5, 0.05),
+}
+
+
+@pytest.mark.parametrize("case", HEAVY)
+def test_heavy_damping(case):
+    name, given, state, control, dt = HEAVY[case]
+    bar = {"mass": 0.2, "com_distance": 0.3, "gravity": 9.81, "track": math.inf}
+    rolling = {"mass": 1.0, "radius": 0.1, "gravity": 9.81}
+    shell = rolling | {"shell_radius": 0.5}
+    params = {"PivotedBar": bar, "Incline": rolling, "CylinderInCylinder": shell}[name] | given
+    found = np.concatenate(getattr(scenes, name)(**params).jacobian(state, control, dt), axis=1)
+    problem = {"scene": name, "params": params, "state": state, "control": control, "dt": dt}
+    expected = oracle(problem)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
+
+
+def test_what_equations_lack_has_no_column():
+    scene = CartPole()
+    a, b = scene.jacobian([0.3, -1.0, 2.0, 3.0], 4.0, 0.02)
+    np.testing.assert_array_equal(a[:, 0], [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(a[:, 1], [0.02, 1.0, 0.0, 0.0])
+    assert vars(scene)["_cached_tangent"]._columns == ("q1", "v1", "control_force")
+
+    class Free(Scene):
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x * v.x
+
+        def potential(self, q, xp):
+            return 0.0 * q.x
+
+    a, b = Free().jacobian([1.0, 2.0], dt=0.5)
+    np.testing.assert_array_equal(a, [[1.0, 0.5], [0.0, 1.0]])
+    assert b.shape == (2, 0)
+
+
 def test_rows_of_a_batch():
     scene, state, _, dt = CASES["double"]
     states = np.array([state, np.multiply(state, 0.5), np.zeros(6)])
@@ -97,5 +188,9 @@ def test_step_that_is_refused():
         def kinetic(self, q, v, xp):
             return self.mass * (v.x**2 + (q.x * v.y) ** 2) / 2
 
+    # So many substeps that it is refused, as the step itself is.
+    bar = scenes.PivotedBar(damping=0.0)
+    with pytest.raises(StepRefused, match=r"the step of row 1.* more than 1,000,000 substeps"):
+        bar.jacobian([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1e12]])
     with pytest.raises(StepRefused, match="the step of row 1"):
         Rope().jacobian([[1.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]], dt=0.02)

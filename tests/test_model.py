@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from rollouts import IDS, actions, make
 
 from lag_envs.envs.model import Model
 from lag_envs.scenes import StepRefused
+from lag_envs.tasks import TASKS, load_task
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -64,3 +67,30 @@ def test_a_fixed_target_is_taken():
     states = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
     _, rewards, _ = model(states, [0.0, 0.0])
     assert rewards[0] > 0.99 > 0.1 > rewards[1]
+
+
+@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarFree-v0", "InclineTilt-v0"])
+def test_expansion_of_a_step(env_id):
+    """Slopes, gradient and curvature beside differences of the step itself, away from kinks."""
+    place, fixed = TASKS[env_id]
+    task = load_task(place)(**fixed)
+    model, rng = Model(task), np.random.default_rng(3)
+    n, width = 20, len(task.scene.state_names)
+    x, a = rng.uniform(-0.05, 0.05, (n, width)), rng.uniform(-0.5, 0.5, n)
+    goals = None if task.target_range is None else rng.uniform(-0.1, 0.1, n)
+    found, h = model.expand(x, a, goals), 1e-5
+    for j in range(width + 1):
+        move = h * np.eye(width + 1)[j]
+        plus = model(x + move[:width], a + move[width], goals)
+        minus = model(x - move[:width], a - move[width], goals)
+        np.testing.assert_allclose(found.slopes[..., j], (plus[0] - minus[0]) / (2 * h), atol=1e-8)
+        np.testing.assert_allclose(found.gradient[:, j], (plus[1] - minus[1]) / (2 * h), rtol=5e-3, atol=3e-3)
+    np.testing.assert_array_equal(found.curvature, np.swapaxes(found.curvature, 1, 2))
+
+
+def test_expansion_needs_actions_between():
+    class Choices(load_task(TASKS["PivotedBarFree-v0"][0])):
+        action: ClassVar = {"s_ddot": [-1.0, 1.0]}
+
+    with pytest.raises(ValueError, match="Choices has a list of actions to choose from"):
+        Model(Choices(track=None)).expand([[0.0, 0.0]], [0.0])

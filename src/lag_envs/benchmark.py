@@ -34,6 +34,8 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 import lag_envs
+from lag_envs import benchmark_jacobians
+from lag_envs.benchmark_jacobians import jacobians
 from lag_envs.own_files import registered
 from lag_envs.tasks import TASKS
 
@@ -109,6 +111,7 @@ class Settings:
     ids: tuple[str, ...] = tuple(TASKS)
     files: tuple[str, ...] = ()  #: users' own, which register some of the ids
     energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
+    jacobians: bool = False  #: what derivatives of a step cost beside it
     sizes: tuple[int, ...] = SIZES
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
@@ -368,6 +371,8 @@ def bench(settings: Settings) -> dict[str, Any]:
     }
     report["targets"] = verdicts(results, cold)
     report["chains"] = chains(results)
+    if settings.jacobians and complete:
+        report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
     print("\n".join(table(report)))
     if settings.output:
         Path(settings.output).write_text(to_json(report), encoding="utf-8")
@@ -642,6 +647,8 @@ def table(report: dict[str, Any]) -> list[str]:
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
+    if costs := report.get("jacobians"):
+        lines += [*columns(benchmark_jacobians.table(costs)), ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"

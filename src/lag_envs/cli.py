@@ -169,6 +169,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "ids": ids,
         "files": files,
         "energies": not (args.quick or args.ids),
+        "jacobians": not (args.quick or args.ids or args.cold),
         "speed": not args.cold,
         "clock": args.clock,
         "date": args.date,

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.controllers.basic import Array, Reader, as_actions
-from lag_envs.envs.model import Model
+from lag_envs.envs.model import REACH, Model
 from lag_envs.tasks.base import Task
 
 #: Shares of the full change of the controls that are tried side by side.
 SHARES = 0.5 ** np.arange(0, 10, 1.5)
-#: Steps of the differences that derivatives are taken by.
-WIDTH = 5e-3
 #: Least curvature over an action that is believed [reward/action²], in a step of the task's own interval.
 FLAT = 1e-4
 
@@ -146,11 +144,13 @@ class ILQR:
     def _step(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Step the model for arrays of any leading shape."""
         shape = actions.shape
-        goals = None
-        if self.task.target_range is not None:
-            goals = np.broadcast_to(targets, shape).ravel()
+        goals = self._goals(targets, shape)
         z, reward, ended = self.model(x.reshape(-1, x.shape[-1]), actions.ravel(), goals)
         return z.reshape(x.shape), reward.reshape(shape), ended.reshape(shape)
+
+    def _goals(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
+        """Return the targets of as many steps, or None where the task has none."""
+        return None if self.task.target_range is None else np.broadcast_to(targets, shape).ravel()
 
     def _guess(self, guess: Any, starts: Array, targets: Array) -> Array:
         """Return the actions (n, steps) of a controller."""
@@ -228,30 +228,18 @@ class ILQR:
         """
         n, steps, width = states.shape
         m = width + 1
-        h = np.full(m, WIDTH)
-        i, j = np.triu_indices(m, 1)
-        moves = np.zeros((1 + 2 * m + 2 * len(i), m))
-        moves[1 : m + 1], moves[m + 1 : 2 * m + 1] = np.diag(h), -np.diag(h)
-        pairs = moves[1 + i] + moves[1 + j]
-        moves[2 * m + 1 :: 2], moves[2 * m + 2 :: 2] = pairs, -pairs
         slopes = np.empty((n, steps, m, width))
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
         # The action is moved inward from its bounds, beyond which it has no effect.
-        inner = np.clip(actions, -1.0 + WIDTH, 1.0 - WIDTH)
-        size = max(1, 200_000 // (steps * len(moves)))
+        inner = np.clip(actions, -1.0 + REACH, 1.0 - REACH)
+        size = max(1, 4_000 // steps)  # what finds room in memory nearby
         for first in range(0, n, size):
             part = slice(first, first + size)
-            x = states[part, :, None] + moves[:, :width]
-            u = inner[part, :, None] + moves[:, width]
-            z, r, _ = self._step(x, u, targets[part, None, None])
-            slopes[part] = (z[..., 1 : m + 1, :] - z[..., m + 1 : 2 * m + 1, :]) / (2.0 * WIDTH)
-            plus, minus, middle = r[..., 1 : m + 1], r[..., m + 1 : 2 * m + 1], r[..., :1]
-            gradient[part] = (plus - minus) / (2.0 * WIDTH)
-            own = plus + minus - 2.0 * middle
-            curvature[part][..., range(m), range(m)] = own / WIDTH**2
-            both = r[..., 2 * m + 1 :: 2] + r[..., 2 * m + 2 :: 2] - 2.0 * middle
-            mixed = 0.5 * (both - own[..., i] - own[..., j]) / WIDTH**2
-            curvature[part][..., i, j] = curvature[part][..., j, i] = mixed
+            x, u = states[part].reshape(-1, width), inner[part].ravel()
+            found = self.model.expand(x, u, self._goals(targets[part, None], actions[part].shape))
+            slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
+            gradient[part] = found.gradient.reshape(gradient[part].shape)
+            curvature[part] = found.curvature.reshape(curvature[part].shape)
         # At a bound the reward is as steep as just inside, but for the curvature.
         gradient[..., -1] += curvature[..., -1, -1] * (actions - inner)
         curvature = concave(curvature)
@@ -264,7 +252,7 @@ class ILQR:
         assert self.tail is not None
         ends = self._step(states[:, -1], actions[:, -1], targets)[0]
         n, width = ends.shape
-        moves = WIDTH * np.eye(width)
+        moves = REACH * np.eye(width)
 
         def value(move: Array) -> Array:
             assert self.tail is not None
@@ -277,8 +265,8 @@ class ILQR:
             for b in range(width):
                 corner = value(moves[a] + moves[b]) - value(moves[a] - moves[b])
                 corner += value(-moves[a] - moves[b]) - value(moves[b] - moves[a])
-                curvature[:, a, b] = corner / (4.0 * WIDTH**2)
-        return (plus - minus) / (2.0 * WIDTH), concave(curvature)
+                curvature[:, a, b] = corner / (4.0 * REACH**2)
+        return (plus - minus) / (2.0 * REACH), concave(curvature)
 
     def _solve(
         self, actions: Array, damping: Array, slopes: Array, gradient: Array, curvature: Array,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,28 @@ from lag_envs.scenes.checks import real_array
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
+
+
+#: How far states and actions are moved where guard and reward are expanded.
+REACH = 5e-3
+
+
+class Expansion(NamedTuple):
+    """Derivatives of a step by the m entries of state and action.
+
+    Attributes
+    ----------
+    slopes : ndarray, shape (n, n_state, m)
+        Of the state at the step's end.
+    gradient : ndarray, shape (n, m)
+        Of the reward.
+    curvature : ndarray, shape (n, m, m)
+        Its second derivatives, without what the motion's own second derivatives add.
+    """
+
+    slopes: Array
+    gradient: Array
+    curvature: Array
 
 
 class Model:
@@ -99,6 +122,68 @@ class Model:
             )
         return ends, rewards, ended
 
+    def expand(self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None) -> Expansion:
+        """Expand one step about each state and action: its motion to first order, its reward to second.
+
+        The motion's derivatives are those of the scene's control step. Guard and reward have kinks, of which
+        a planner should see as much as lies within reach: their formulas are expanded by central differences
+        of `REACH`, along the motion so linearised. That actions beyond [-1, 1] are clipped is left aside.
+
+        Parameters
+        ----------
+        states, actions, targets : array_like
+            As for a step.
+
+        Returns
+        -------
+        Expansion
+            The derivatives by the state's entries and the actions.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As a step does; ValueError also for a task whose actions are choices.
+        """
+        formulas, form, k = self.task.formulas, self.task.scene._form, self._constants
+        if formulas.choices:
+            raise ValueError(
+                f"{type(self.task).__name__} has a list of actions to choose from, by which no step has "
+                "derivatives"
+            )
+        ends, _, _ = self(states, actions, targets)
+        states = real_array("states", states)
+        n, width = states.shape
+        acting = real_array("actions", actions).reshape(n, -1)
+        goals = list(self._targets(targets, n).T)
+        m = width + acting.shape[1]
+        moves = _moves(m)
+        given = np.concatenate([states, acting], axis=-1).T + moves[..., None]  # (moves, m, n)
+
+        def lifted(y: Array) -> list[Array]:
+            rows = list(np.moveaxis(y, -2, 0))
+            angle = None if form is None else form.angle
+            return rows if angle is None else [*rows, np.cos(rows[angle]), np.sin(rows[angle])]
+
+        with np.errstate(all="ignore"):
+            y = lifted(given[:, :width])
+            applied = formulas.control(np, list(np.moveaxis(given[:, width:], 1, 0)), y, goals, k)
+            u = np.zeros((len(moves), len(applied), n))
+            for i, values in enumerate(applied):
+                u[:, i] = values
+            by_state, by_control = self.task.scene.jacobian(states, u[0].T, self.task.dt)
+            by_both = np.concatenate([by_state, by_control], axis=-1)
+            inner = np.concatenate([given[:, :width] - states.T, u - u[0]], axis=1)
+            after = ends.T + np.einsum("nij,pjn->pin", by_both, inner)
+            z = lifted(after)
+            reward, ended = formulas.judge(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
+            if formulas.has_last:
+                last = formulas.last(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
+                reward = np.where(ended, last, reward)
+        slopes = (after[1 : m + 1] - after[m + 1 : 2 * m + 1]) / (2.0 * REACH)
+        return Expansion(
+            np.moveaxis(slopes, (0, 2), (2, 0)), *_differences(np.broadcast_to(reward, (len(moves), n)), m)
+        )
+
     def kicked(self, states: ArrayLike, draws: ArrayLike) -> Array:
         """Return the states after the task's random kick.
 
@@ -129,3 +214,23 @@ class Model:
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
             raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
         return np.ascontiguousarray(np.broadcast_to(array.reshape(-1, count), (n, count)))
+
+
+def _moves(m: int) -> Array:
+    """Return where m variables are moved for differences: not at all, by ± each, by ± each pair."""
+    i, j = np.triu_indices(m, 1)
+    single = REACH * np.eye(m)
+    pairs = single[i] + single[j]
+    return np.concatenate([np.zeros((1, m)), single, -single, pairs, -pairs])
+
+
+def _differences(values: Array, m: int) -> tuple[Array, Array]:
+    """Return gradient (n, m) and second derivatives (n, m, m) from values (moves, n)."""
+    i, j = np.triu_indices(m, 1)
+    middle, plus, minus = values[0], values[1 : m + 1], values[m + 1 : 2 * m + 1]
+    own = plus + minus - 2.0 * middle
+    both = values[2 * m + 1 : 2 * m + 1 + len(i)] + values[2 * m + 1 + len(i) :] - 2.0 * middle
+    curvature = np.empty((values.shape[1], m, m))
+    curvature[:, range(m), range(m)] = own.T
+    curvature[:, i, j] = curvature[:, j, i] = 0.5 * (both - own[i] - own[j]).T
+    return (plus - minus).T / (2.0 * REACH), curvature / REACH**2

@@ -28,7 +28,8 @@ from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row
-from lag_envs.scenes.base import Scene, StepRefused
+from lag_envs.scenes.base import Scene
+from lag_envs.scenes.checks import StepRefused
 
 SECTION = "own"
 #: States whose exact ends are computed, and those whose certificate is asked for; the same for a quick look.

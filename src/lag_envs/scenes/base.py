@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import copyreg
 import dataclasses
 import inspect
 import math
-import sys
-import weakref
 from abc import ABCMeta
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform
 
@@ -17,16 +14,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.mechanics import motion, recording
-from lag_envs.mechanics.algebra import Atom, FormulaError, evaluate
+from lag_envs.mechanics.algebra import Atom, FormulaError
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point
-from lag_envs.mechanics.layout import Layout, check_name, make_layout, units
+from lag_envs.mechanics.layout import Layout, make_layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
-from lag_envs.scenes import picture
-from lag_envs.scenes.checks import SMALLEST, StepRefused, check_number, check_step, real_array, shown
+from lag_envs.scenes import picture, steps
+from lag_envs.scenes.checks import check_both
+from lag_envs.scenes.declaring import MAPPINGS, SEQUENCES, complete, controls_of, declare
+from lag_envs.scenes.door import admit
+from lag_envs.scenes.parameters import parameter as parameter
 from lag_envs.scenes.shapes import Moment, Shape, Window
-from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
     import sympy
@@ -36,84 +35,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Class attributes that are mappings, and those that are names in order.
-MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
-SEQUENCES = ("state", "left_out")
-
 #: Where a task notes the order of the series that it chose for its scene.
 ORDER = "_order_of_task"
 
-#: What a scene may define; all other public names of `Scene` are its calls.
-DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
-
-
-def parameter(
-    default: float | Callable[[Any], float | None] | None,
-    unit: str,
-    *,
-    above: float | None = None,
-    least: float | None = None,
-    below: float | None = None,
-    most: float | None = None,
-    usable: tuple[float, float] = (-math.inf, math.inf),
-    optional: bool = False,
-    endless: bool = False,
-) -> Any:
-    """Declare a physical parameter.
-
-    Parameters
-    ----------
-    default : float, None, or function of the scene
-        Its value unless another is given. A function takes it from the other parameters:
-        ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
-    unit : str
-        Its unit, for tables and errors.
-    above, least, below, most : float, optional
-        The range that it must lie in: above, at least, below, at most.
-    usable : (float, float)
-        The range in which an environment can be used, whatever its other parameters, see `Task.usable`; a
-        scene alone may be stepped beyond it.
-    optional : bool
-        Whether None may be given; a default of None says so too.
-    endless : bool
-        Whether infinity may be given.
-    """
-    made = callable(default)
-    return dataclasses.field(
-        default=None if made else default,
-        metadata={
-            "unit": unit,
-            "above": above,
-            "least": least,
-            "below": below,
-            "most": most,
-            "made": default if made else None,
-            "optional": optional or (default is None),
-            "endless": endless,
-            "usable": usable,
-        },
-    )
-
-
-# A class that goes to another process by value before it is used takes its fields along, and in them this
-# mark, which is known by its identity: as a copy it would be taken for a default.
-copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
-
 #: Where a motion is singular, or a number too large, that state's results are not finite, and no others'.
 _QUIET = np.errstate(all="ignore")
-
-#: What was derived of scenes whose formulas passed the door: by class, and by `Scene._structure`.
-_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
-    weakref.WeakKeyDictionary()
-)
-
-
-def is_own(kind: type) -> bool:
-    """Tell whether a class is the package's: then nothing but its structure decides what formulas give.
-
-    A formula of somebody else may use what is defined outside, and see it changed.
-    """
-    return kind.__module__.startswith("lag_envs.")
 
 
 class SceneType(ABCMeta):
@@ -123,7 +49,7 @@ class SceneType(ABCMeta):
         """Return a scene whose parameters and formulas have been checked."""
         complete(cls)
         scene = super().__call__(*args, **keywords)
-        scene._admit()
+        admit(scene, Scene)
         return scene
 
     @property
@@ -132,31 +58,6 @@ class SceneType(ABCMeta):
         complete(cls)
         signature = inspect.signature(cls.__init__)  # type: ignore[misc]
         return signature.replace(parameters=list(signature.parameters.values())[1:])
-
-
-def _annotations(cls: type) -> dict[str, Any]:
-    """Return the class's own annotations; from Python 3.14 on they may name what is not there yet."""
-    if sys.version_info >= (3, 14):
-        import annotationlib
-
-        return dict(annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF))
-    return dict(inspect.get_annotations(cls))
-
-
-def _frozen(given: Mapping) -> Mapping:
-    """Return a copy of a mapping, and of those in it, that cannot be changed."""
-    items = {key: _frozen(value) if isinstance(value, Mapping) else value for key, value in given.items()}
-    return MappingProxyType(items)
-
-
-def complete(cls: type) -> None:
-    """Make the class a frozen dataclass, unless a decorator has."""
-    if cls is Scene:
-        raise FormulaError(
-            "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
-        )
-    if "__dataclass_fields__" not in vars(cls):
-        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -261,71 +162,9 @@ class Scene(metaclass=SceneType):
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        for parent in cls.__mro__[1:]:
-            if isinstance(parent, SceneType) and parent is not Scene:
-                complete(parent)
-        own, annotations = vars(cls), _annotations(cls)
-        faults = []
-        for name in (*MAPPINGS, *SEQUENCES):
-            kind = str(annotations.get(name, "ClassVar")).removeprefix("typing.")
-            if kind.startswith("ClassVar"):
-                continue
-            # A dataclass would take it for a field; what is wrong is said when the class is used.
-            if isinstance(own.get(name), dataclasses.Field):
-                faults.append(f"{name} is part of every scene; give the parameter another name")
-                delattr(cls, name)
-            else:
-                faults.append(f"{name} has an annotation; write {name} = ... without one")
-            del annotations[name]
-        if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
-            annotations["control"] = "str"
-            if "control" not in own:
-                cls.control = next(iter(own["modes"]))  # type: ignore[attr-defined]
-        if annotations != _annotations(cls):
-            cls.__annotations__ = annotations
-        for name in MAPPINGS:
-            if isinstance(own.get(name), Mapping):
-                setattr(cls, name, _frozen(own[name]))
-        for name in SEQUENCES:
-            if isinstance(own.get(name), list):
-                setattr(cls, name, tuple(own[name]))
-        cls._faults = tuple(faults)
+        declare(cls, SceneType)
 
     _faults: ClassVar[tuple[str, ...]] = ()
-
-    def _admit(self) -> None:
-        """Check parameters and, for the first scene of its kind, names and formulas."""
-        _check_class(type(self))
-        if self.modes:
-            mode = self.control  # type: ignore[attr-defined]
-            if not isinstance(mode, str) or mode not in self.modes:
-                raise ValueError(f"control must be one of {', '.join(self.modes)}, got {shown(mode)}")
-        fields = {f.name: f for f in dataclasses.fields(self) if "unit" in f.metadata}  # type: ignore[arg-type]
-        made = [f for f in fields.values() if f.metadata["made"] and getattr(self, f.name) is None]
-        for field in (*(f for f in fields.values() if f not in made), *made):
-            value = getattr(self, field.name)
-            if field in made:  # where it is out of range, those that it is made from are
-                value = field.metadata["made"](self)
-                value = None if value is None else check_number(field.name, value)
-            elif value is not None or not field.metadata["optional"]:
-                value = _check_range(field, value)
-            object.__setattr__(self, field.name, value)
-        self.check()
-        try:
-            key = self._structure
-            known = _admitted.setdefault(type(self), {}).get(key)
-        except TypeError as error:
-            raise FormulaError(
-                f"{type(self).__name__}: {error}; structural fields must be hashable"
-            ) from error
-        if known is not None and is_own(type(self)):
-            vars(self)["_cached_layout"], vars(self)["_cached_mechanics"] = known
-        elif known is None:
-            _check_names(self)
-            recording.check_again(self, self._layout, recording.record(self, self._layout))
-            _check_motion(self, self.mechanics)
-            _check_bodies(self)
-            _admitted[type(self)][key] = self._layout, self.mechanics
 
     def _numbers(self) -> tuple[str, ...]:
         """Return the names of the parameters that have a value."""
@@ -366,7 +205,7 @@ class Scene(metaclass=SceneType):
             for name in (*MAPPINGS, *SEQUENCES):
                 with recording.formula(self, name):
                     declared[name] = getattr(copy, name)
-            controls, absent = _controls(self, declared.pop("modes"), declared.pop("controls"))
+            controls, absent = controls_of(self, declared.pop("modes"), declared.pop("controls"))
             found = make_layout(type(self).__name__, controls=controls, absent=absent, **declared)
             vars(self)["_cached_layout"] = found
         return found
@@ -406,60 +245,9 @@ class Scene(metaclass=SceneType):
 
     # --- what follows: numbers -----------------------------------------------------------------------------
 
-    def _check_state(self, state: ArrayLike) -> Array:
-        """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
-        array = self._check_states(state)
-        if array.ndim != 1:
-            raise ValueError(
-                f"state must be ({', '.join(self.state_names)}), got shape {array.shape}: {shown(state)}"
-            )
-        return array
-
-    def _check_states(self, states: ArrayLike) -> Array:
-        """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
-        array, names = real_array("state", states), self.state_names
-        if array.shape[-1:] != (len(names),):
-            raise ValueError(f"state must be ({', '.join(names)}), got shape {array.shape}: {shown(states)}")
-        bad = ~np.isfinite(array)
-        if bad.any():
-            row = array[tuple(np.argwhere(bad)[0][:-1])]
-            raise ValueError(f"state must be finite, got {dict(zip(names, row.tolist(), strict=True))}")
-        return array
-
-    def _check_controls(self, control: ArrayLike, ndim: int) -> Array:
-        """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
-
-        A single control may stand without its axis; `ndim` is that of the states, by which this is told.
-        """
-        array, names = real_array("the control", control), self.control_names
-        bad = ~np.isfinite(array)
-        if bad.any():
-            raise ValueError(
-                f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
-            )
-        if array.ndim == 0 and (len(names) == 1 or array == 0.0):
-            return np.full(len(names), float(array))
-        if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):
-            return array[..., None]
-        if array.shape[-1:] != (len(names),):
-            wanted = f"({', '.join(names)})" if names else "left out, since the scene has none"
-            raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
-        return array
-
-    def _check_both(self, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-        """Return states and controls with their last axes, and the shape of what follows from both."""
-        states = self._check_states(state)
-        controls = self._check_controls(control, states.ndim)
-        try:
-            return states, controls, np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
-        except ValueError:
-            raise ValueError(
-                f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
-            ) from None
-
     def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
-        states, controls, shape = self._check_both(state, control)
+        states, controls, shape = check_both(self, state, control)
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
         return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
 
@@ -571,7 +359,7 @@ class Scene(metaclass=SceneType):
         B : ndarray, shape (..., n_state, n_controls)
             ∂(d state/dt)/∂control.
         """
-        states, controls, shape = self._check_both(state, control)
+        states, controls, shape = check_both(self, state, control)
         n = states.shape[-1]
         unit = np.eye(n + controls.shape[-1])
         numbers = [Dual(states[..., i], unit[i]) for i in range(n)]
@@ -652,43 +440,7 @@ class Scene(metaclass=SceneType):
             Where a step cannot be certified within the cap on substeps, or has no finite result. Its
             attribute `trajectory` holds the rows before that.
         """
-        start, dt = self._check_state(state), check_step(dt)
-        given = self._check_sequence(controls)
-        trajectory = np.empty((len(given) + 1, len(start)))
-        trajectory[0] = start
-        code, constants = self._code(dt), self._constants()
-        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-        row = code.simulation(trajectory, given, dt, self._limit(dt), *numbers)
-        if not row and not np.isfinite(trajectory[-1]).all():
-            row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
-        if row:
-            raise self._refusal(
-                trajectory[row - 1], given[row - 1], dt, trajectory[:row], f"step {row - 1} of {len(given)}"
-            )
-        return trajectory
-
-    def _check_sequence(self, controls: ArrayLike | int) -> Array:
-        """Return controls as an array of shape (T, n_controls), or raise a ValueError."""
-        n = len(self.control_names)
-        if n == 0:
-            if isinstance(controls, bool) or not isinstance(controls, int | np.integer) or controls < 0:
-                raise ValueError(
-                    "this scene has no control: give the number of steps in place of controls, "
-                    f"got {controls!r:.60}"
-                )
-            return np.empty((int(controls), 0))
-        array = real_array("controls", controls)
-        if array.ndim == 1 and n == 1:
-            array = array[:, None]
-        if array.ndim != 2 or array.shape[1] != n:
-            wanted = "(T,)" if n == 1 else f"(T, {n}), in each row {', '.join(self.control_names)}"
-            raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
-        bad = ~np.isfinite(array)
-        if bad.any():
-            raise ValueError(
-                f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}"
-            )
-        return array
+        return steps.simulate(self, state, controls, dt)
 
     def step_bound(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> StepBound:
         """Return how a control step is divided, and what its series leave out at most.
@@ -716,22 +468,7 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        from lag_envs.stepping.general import StepBound
-
-        start, dt = self._check_state(state), check_step(dt)
-        held = self._check_controls(control, 1).reshape(-1)
-        if self._form:
-            return self._form.step_bound(start, list(held), dt, self._constants())
-        code, constants = self._code(dt), self._constants()
-        numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-        order = self._order(dt)
-        status, bounds = code.bounded(start.tolist(), held.tolist(), dt, order, numbers)
-        if status < 0:
-            raise self._refusal(start, held, dt, None, "the step")
-        of = {("place", name): bounds[0][i] for i, name in enumerate(self._layout.free)}
-        of |= {("velocity", name): bounds[1][i] for i, name in enumerate(self._layout.free)}
-        by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in self._layout.state}
-        return StepBound(status, order, by_state, "proved with the step")
+        return steps.step_bound(self, state, control, dt)
 
     truncation_bound = step_bound
 
@@ -761,40 +498,7 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        from lag_envs.stepping.general import usual_order
-
-        states, controls, shape = self._check_both(state, control)
-        dt = check_step(dt)
-        n, m = states.shape[-1], controls.shape[-1]
-        count = math.prod(shape)
-        states = np.broadcast_to(states, (*shape, n)).reshape(count, n)
-        controls = np.broadcast_to(controls, (*shape, m)).reshape(count, m)
-        parameters = {name: getattr(self, name) for name in self._numbers()}
-        found, refused = self._stepper.jacobian(
-            states, controls, parameters, dt, self._order(dt) or usual_order(dt)
-        )
-        if refused:
-            i = refused - 1
-            raise self._refusal(states[i], controls[i], dt, None, f"the step of row {i}")
-        found = found.reshape(*shape, n, n + m)
-        return found[..., :n], found[..., n:]
-
-    def _refusal(
-        self, state: Array, control: ArrayLike, dt: float, trajectory: Array | None, where: str
-    ) -> StepRefused:
-        """Return the error for a step that was refused."""
-        start = ", ".join(f"{n}={v:g}" for n, v in zip(self.state_names, state, strict=True))
-        held = zip(self.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
-        why = "it could not be certified within the largest number of substeps"
-        if self._form is not None:
-            why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
-        error = StepRefused(
-            f"{where} was refused: from ({start}) with "
-            f"{', '.join(f'{n}={v:g}' for n, v in held) or 'no control'} and dt={dt:g} s {why}, or has no "
-            "finite result; take a smaller dt or milder parameters"
-        )
-        error.trajectory = None if trajectory is None else trajectory.copy()
-        return error
+        return steps.jacobian(self, state, control, dt)
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
@@ -885,20 +589,7 @@ class Scene(metaclass=SceneType):
             ``change`` of energy, or of Jacobi's integral where `energy` has it; ``work`` of drive and applied
             forces, ``loss`` to drag, and ``residual`` = change - work + loss.
         """
-        dt = check_step(dt)
-        controls = self._check_controls(control, 1)
-        points, weights = np.polynomial.legendre.leggauss(nodes)
-        times = 0.5 * dt * (points + 1.0)
-        held: Any = controls[None] if self.control_names else 1
-        states = np.array([self.simulate(state, held, t)[1] for t in [*times, dt]])
-        power = self.power(states[:-1], controls)
-        work, loss = (
-            float(np.sum(0.5 * dt * weights * value))
-            for value in (power["drive"] + power["applied"], power["drag"])
-        )
-        name = "total" if self.mechanics.gyroscopic is None else "jacobi"
-        change = float(self.energy(states[-1], controls)[name] - self.energy(state, controls)[name])
-        return {"change": change, "work": work, "loss": loss, "residual": change - work + loss}
+        return steps.energy_balance(self, state, control, dt, nodes)
 
 
 def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
@@ -912,130 +603,5 @@ def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
     scene = object.__new__(cls)
     for name, value in state.items():
         object.__setattr__(scene, name, value)
-    scene._admit()
+    admit(scene, Scene)
     return scene
-
-
-def _controls(scene: Scene, modes: Any, controls: Any) -> tuple[Any, tuple[str, ...]]:
-    """Return the mode's controls, and the names of all modes' controls."""
-    of = type(scene).__name__
-    if not isinstance(modes, Mapping):
-        raise FormulaError(f"{of}.modes must map names to controls, got {modes!r:.80}")
-    if not modes:
-        return controls, ()
-    if controls:
-        raise FormulaError(f"{of} has controls and modes; put the controls into the modes")
-    every: dict[str, str] = {}
-    for mode, given in modes.items():
-        every |= units(f"{of}.modes[{mode!r}]", given)
-    return modes[scene.control], tuple(every)  # type: ignore[attr-defined]
-
-
-def _check_class(cls: type[Scene]) -> None:
-    """Raise a FormulaError for what can be seen of a class without running its formulas."""
-    of = cls.__name__
-    for c in cls.__mro__[: cls.__mro__.index(Scene)]:
-        if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
-            raise FormulaError(
-                f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
-                "dissipation and applied, from which these follow (see CHANGELOG.md)"
-            )
-    faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
-    if faults:
-        raise FormulaError(f"{of}.{faults[0]}")
-    if not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-        raise FormulaError(
-            f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)"
-        )
-
-
-def _check_names(scene: Scene) -> None:
-    """Raise a FormulaError where a name is taken."""
-    cls, of = type(scene), type(scene).__name__
-    public = {name for name in dir(Scene) if not name.startswith("_")}
-    for c in cls.__mro__[: cls.__mro__.index(Scene)]:
-        for name in (*_annotations(c), *vars(c)):
-            if name in public and name not in DEFINED:
-                raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
-    layout = scene._layout
-    derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
-    taken = {
-        **dict.fromkeys(DEFINED, "part of every scene"),
-        **dict.fromkeys((e.name for e in layout.state), "an entry of the state"),
-        **dict.fromkeys(derived, "a coordinate or its derivative"),
-        **dict.fromkeys((*layout.controls, *layout.absent), "a control"),
-    }
-    for field in dataclasses.fields(scene):  # type: ignore[arg-type]
-        check_name(of, field.name)
-        if field.name in taken:
-            raise FormulaError(
-                f"{of}: the field {field.name!r} has the name of {taken[field.name]}; choose another"
-            )
-    others = set(layout.controls) - {p.control for p in layout.prescribed}
-    for name in sorted(others & {e.name for e in layout.state}):
-        raise FormulaError(
-            f"{of}: the control {name!r} has the name of an entry of the state; choose another"
-        )
-
-
-def _check_bodies(scene: Scene) -> None:
-    """Raise a FormulaError where a body has no place, or a force no equation."""
-    of, found = type(scene).__name__, scene.mechanics
-    with recording.formula(scene, "bodies"):
-        bodies = scene.bodies()
-    if not isinstance(bodies, Mapping):
-        raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
-    for body in bodies:
-        if body not in found.record.poses:
-            raise FormulaError(
-                f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
-            )
-    try:
-        found.full  # noqa: B018
-    except FormulaError as error:
-        raise FormulaError(f"{of}.{error}") from error
-
-
-def _check_motion(scene: Scene, found: Mechanics) -> None:
-    """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
-    n = len(found.free)
-    values = {recording.parameter(name): np.float64(getattr(scene, name)) for name in scene._numbers()}
-    generator = np.random.default_rng(11)
-    symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
-    seen = []
-    with np.errstate(all="ignore"):
-        for low, high in ((0.1, 1.5), (-3.0, 3.0), (0.01, 0.1), (1.0, 10.0)) * 4:
-            at = values | {symbol: generator.uniform(low, high) for symbol in symbols}
-            matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
-            if not np.isfinite(matrix).all():
-                continue
-            size = np.sqrt(np.abs(np.diag(matrix)))
-            if not (size > 0.0).all():
-                seen.append(0.0)
-                continue
-            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]))
-    if seen and max(seen) < 1e-13:
-        what = "singular" if max(seen) > -1e-13 else "not positive"
-        raise FormulaError(
-            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; "
-            "every motion of the free coordinates needs a positive kinetic energy"
-        )
-
-
-def _check_range(field: dataclasses.Field, value: Any) -> float:
-    unit = field.metadata["unit"]
-    number = check_number(field.name, value, unit, endless=field.metadata["endless"])
-    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
-    for rule, limit, broken in (
-        ("above", above, above is not None and not number > above),
-        ("at least", least, least is not None and not number >= least),
-        ("below", below, below is not None and not number < below),
-        ("at most", most, most is not None and not number <= most),
-        ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
-        ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
-    ):
-        if broken:
-            raise ValueError(
-                f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
-            )
-    return number

@@ -77,3 +77,83 @@ def check_step(dt: Any) -> float:
     if not dt >= sys.float_info.min:  # what lies between has no inverse
         raise ValueError(f"dt must be above 0 s, got {dt:g} s")
     return dt
+
+
+# --- states and controls ------------------------------------------------------------------------------------
+
+
+def check_state(scene: Any, state: ArrayLike) -> Array:
+    """Return the state as a float64 array of shape (n_state,), or raise a ValueError."""
+    array = check_states(scene, state)
+    if array.ndim != 1:
+        raise ValueError(
+            f"state must be ({', '.join(scene.state_names)}), got shape {array.shape}: {shown(state)}"
+        )
+    return array
+
+
+def check_states(scene: Any, states: ArrayLike) -> Array:
+    """Return states as a float64 array of shape (..., n_state), or raise a ValueError."""
+    array, names = real_array("state", states), scene.state_names
+    if array.shape[-1:] != (len(names),):
+        raise ValueError(f"state must be ({', '.join(names)}), got shape {array.shape}: {shown(states)}")
+    bad = ~np.isfinite(array)
+    if bad.any():
+        row = array[tuple(np.argwhere(bad)[0][:-1])]
+        raise ValueError(f"state must be finite, got {dict(zip(names, row.tolist(), strict=True))}")
+    return array
+
+
+def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
+    """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
+
+    A single control may stand without its axis; `ndim` is that of the states, by which this is told.
+    """
+    array, names = real_array("the control", control), scene.control_names
+    bad = ~np.isfinite(array)
+    if bad.any():
+        raise ValueError(
+            f"the control must be finite, got {array[bad].flat[0]} at {np.argwhere(bad)[0].tolist()}"
+        )
+    if array.ndim == 0 and (len(names) == 1 or array == 0.0):
+        return np.full(len(names), float(array))
+    if len(names) == 1 and not (array.shape[-1] == 1 and array.ndim >= ndim):
+        return array[..., None]
+    if array.shape[-1:] != (len(names),):
+        wanted = f"({', '.join(names)})" if names else "left out, since the scene has none"
+        raise ValueError(f"the control must be {wanted}, got an array of shape {array.shape}")
+    return array
+
+
+def check_both(scene: Any, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return states and controls with their last axes, and the shape of what follows from both."""
+    states = check_states(scene, state)
+    controls = check_controls(scene, control, states.ndim)
+    try:
+        return states, controls, np.broadcast_shapes(states.shape[:-1], controls.shape[:-1])
+    except ValueError:
+        raise ValueError(
+            f"states of shape {states.shape} and controls of shape {controls.shape} do not fit together"
+        ) from None
+
+
+def check_sequence(scene: Any, controls: ArrayLike | int) -> Array:
+    """Return controls as an array of shape (T, n_controls), or raise a ValueError."""
+    n = len(scene.control_names)
+    if n == 0:
+        if isinstance(controls, bool) or not isinstance(controls, int | np.integer) or controls < 0:
+            raise ValueError(
+                "this scene has no control: give the number of steps in place of controls, "
+                f"got {controls!r:.60}"
+            )
+        return np.empty((int(controls), 0))
+    array = real_array("controls", controls)
+    if array.ndim == 1 and n == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[1] != n:
+        wanted = "(T,)" if n == 1 else f"(T, {n}), in each row {', '.join(scene.control_names)}"
+        raise ValueError(f"controls must have shape {wanted}, got {array.shape}")
+    bad = ~np.isfinite(array)
+    if bad.any():
+        raise ValueError(f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}")
+    return array

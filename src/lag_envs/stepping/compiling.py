@@ -55,7 +55,9 @@ def count_operations(lines: Iterable[str]) -> int:
 
 
 @cache
-def compile_function(name: str, source: str, /, *helpers: Callable, **constants: float) -> Callable:
+def compile_function(
+    name: str, source: str, /, *helpers: Callable, **constants: float | tuple[int, ...]
+) -> Callable:
     """Compile the function ``name`` that ``source`` defines.
 
     Parameters
@@ -67,7 +69,7 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
         and the constants.
     *helpers : callable
         What this function returned for the functions that the source calls, known there by their names.
-    **constants : float
+    **constants : float or tuple of int
         Numbers that the source names.
 
     Returns
@@ -99,7 +101,9 @@ def compile_function(name: str, source: str, /, *helpers: Callable, **constants:
     return jit(namespace[unique], unique)
 
 
-def compile_python(name: str, function: Callable, *helpers: Callable, **constants: float) -> Callable:
+def compile_python(
+    name: str, function: Callable, *helpers: Callable, **constants: float | tuple[int, ...]
+) -> Callable:
     """Compile, under a name, a function that is written out in Python; otherwise like `compile_function`."""
     source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)
     return compile_function(name, source, *helpers, **constants)

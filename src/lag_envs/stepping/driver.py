@@ -147,8 +147,7 @@ def compile_advance_block(
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane. `slopes` are those of `compile_tangent`, and their matrix is that of unit
-    vectors to begin with.
+    `rows` are those of a lane, `slopes` those of `compile_tangent`.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = dt
@@ -169,23 +168,21 @@ def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
 def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take a control step from each row of `values`; return the row that was refused, or 0.
 
-    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes`
-    becomes the matrix of derivatives of places and velocities, row by row.
+    A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` is the
+    matrix of derivatives of places and velocities, row by row, and is replaced too.
     """
     rows, matrix = np.zeros(size), status + 2
-    moving = np.zeros(matrix + 2 * n * width)
+    moving = np.zeros(matrix + slopes.shape[1])
     for i in range(values.shape[0]):
         for j in range(status):
             rows[j] = moving[j] = values[i, j]
-        for j in range(2 * n * width):
-            moving[matrix + j] = 0.0
-        for j in range(2 * n):
-            moving[matrix + j * width + j] = 1.0
+        for j in range(slopes.shape[1]):
+            moving[matrix + j] = slopes[i, j]
         if advance(rows, moving, dt, order) < 0:
             return i + 1
         for j in range(2 * n):
             values[i, q + j] = rows[q + j]
-        for j in range(2 * n * width):
+        for j in range(slopes.shape[1]):
             slopes[i, j] = moving[matrix + j]
             if not abs(slopes[i, j]) < np.inf:
                 return i + 1
@@ -196,19 +193,8 @@ def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def
 def compile_advance_tangents(
     record: SeriesRecord, columns: tuple[str, ...], tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents`.
-
-    Parameters
-    ----------
-    record : SeriesRecord
-        What is stepped, made with tangents.
-    columns : tuple of str
-        Inputs by which derivatives are taken, besides places and velocities.
-    tolerance : float
-        What a substep may leave out, relative to the size of the velocities.
-    """
+    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents` and `compile_tangent`."""
     helpers = compile_attempt(record, 1), compile_tangent(record, columns)
     numbers = _numbers(record, tolerance)
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
-    width = 2 * record.size + len(columns)
-    return compile_python("advance_tangents", _advance_tangents, advance, width=width, **numbers)
+    return compile_python("advance_tangents", _advance_tangents, advance, **numbers)

@@ -1,7 +1,8 @@
 """Derivatives of a step: the same algorithm on numbers that carry derivatives along.
 
-A dual number is a value with one derivative per column; None stands for a derivative that is zero. `Dual`
-makes a target of such numbers from a target of plain ones, so that every recurrence stands once. It takes
+A dual number is a value with one derivative per column; None stands for derivatives that are all zero. `Dual`
+makes a target of such numbers from two targets, one of plain numbers and one whose numbers are vectors with
+an entry per column, so that every recurrence stands once and all columns go through one operation. It takes
 what `Series.expand` and `Series.advance` need, not what the certificate does: comparisons have no derivative.
 """
 
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.stepping.lowering import SeriesRecord
 
 
@@ -19,7 +21,7 @@ class Number(NamedTuple):
     """A value and its derivatives."""
 
     value: Any
-    slopes: tuple[Any, ...]
+    slopes: Any = None
 
 
 class Dual:
@@ -28,81 +30,60 @@ class Dual:
     Parameters
     ----------
     target : Target
-        The plain numbers; its memory has `columns` + 1 slots for each slot here.
-    columns : int
-        Number of derivatives.
+        The values.
+    wide : Target
+        The derivatives, vectors with an entry per column.
+    spread : callable
+        Makes of a value the vector whose entries are all this value.
     tangents : mapping
-        For each input that has a derivative its column.
+        For each input that has a derivative the vector that is 1 in its column.
     """
 
-    def __init__(self, target: Any, columns: int, tangents: Mapping[str, int]) -> None:
-        self._t, self._columns, self._tangents = target, columns, tangents
-        self._flat = (None,) * columns
+    def __init__(self, target: Any, wide: Any, spread: Callable, tangents: Mapping[str, Any]) -> None:
+        self._t, self._wide, self._spread, self._tangents = target, wide, spread, tangents
 
     def number(self, value: float) -> Number:
-        return Number(self._t.number(value), self._flat)
-
-    def plain(self, value: Any) -> Number:
-        """Return a plain number as one without derivatives."""
-        return Number(value, self._flat)
-
-    def _map(self, change: Callable, *slopes: Sequence) -> tuple:
-        return tuple(change(*column) for column in zip(*slopes, strict=True))
-
-    def _sum(self, a: Any, b: Any) -> Any:
-        return b if a is None else a if b is None else self._t.add(a, b)
+        return Number(self._t.number(value))
 
     def add(self, a: Number, b: Number) -> Number:
-        return Number(self._t.add(a.value, b.value), self._map(self._sum, a.slopes, b.slopes))
+        both = a.slopes is not None and b.slopes is not None
+        slopes = self._wide.add(a.slopes, b.slopes) if both else b.slopes if a.slopes is None else a.slopes
+        return Number(self._t.add(a.value, b.value), slopes)
 
     def neg(self, a: Number) -> Number:
-        return Number(
-            self._t.neg(a.value), self._map(lambda s: None if s is None else self._t.neg(s), a.slopes)
-        )
+        return Number(self._t.neg(a.value), None if a.slopes is None else self._wide.neg(a.slopes))
 
     def sub(self, a: Number, b: Number) -> Number:
-        t = self._t
+        p, q, w = a.slopes, b.slopes, self._wide
+        slopes = p if q is None else w.neg(q) if p is None else w.sub(p, q)
+        return Number(self._t.sub(a.value, b.value), slopes)
 
-        def less(p: Any, q: Any) -> Any:
-            return p if q is None else t.neg(q) if p is None else t.sub(p, q)
-
-        return Number(t.sub(a.value, b.value), self._map(less, a.slopes, b.slopes))
-
-    def _times(self, p: Any, y: Any, total: Any) -> Any:
-        """Return p y + total, where p and total may be zero."""
-        if p is None:
+    def _times(self, slopes: Any, factor: Any, total: Any = None) -> Any:
+        """Return slopes times a value, plus a total; either may be zero."""
+        if slopes is None:
             return total
-        return self._t.mul(p, y) if total is None else self._t.fma(p, y, total)
+        w, every = self._wide, self._spread(factor)
+        return w.mul(slopes, every) if total is None else w.fma(slopes, every, total)
 
     def mul(self, a: Number, b: Number) -> Number:
-        slopes = self._map(
-            lambda p, q: self._times(p, b.value, self._times(q, a.value, None)), a.slopes, b.slopes
-        )
+        slopes = self._times(a.slopes, b.value, self._times(b.slopes, a.value))
         return Number(self._t.mul(a.value, b.value), slopes)
 
     def fma(self, a: Number, b: Number, c: Number) -> Number:
-        slopes = self._map(
-            lambda p, q, r: self._times(p, b.value, self._times(q, a.value, r)), a.slopes, b.slopes, c.slopes
-        )
+        slopes = self._times(a.slopes, b.value, self._times(b.slopes, a.value, c.slopes))
         return Number(self._t.fma(a.value, b.value, c.value), slopes)
 
     def div(self, a: Number, b: Number) -> Number:
-        t = self._t
-        value = t.div(a.value, b.value)
-
-        def slope(p: Any, q: Any) -> Any:
-            rest = self._times(q, t.neg(value), p)
-            return None if rest is None else t.div(rest, b.value)
-
-        return Number(value, self._map(slope, a.slopes, b.slopes))
-
-    def _chain(self, value: Any, rate: Any, a: Number) -> Number:
-        return Number(value, self._map(lambda p: self._times(p, rate, None), a.slopes))
+        value = self._t.div(a.value, b.value)
+        slopes = self._times(b.slopes, self._t.neg(value), a.slopes)
+        if slopes is not None:
+            slopes = self._wide.div(slopes, self._spread(b.value))
+        return Number(value, slopes)
 
     def sqrt(self, a: Number) -> Number:
         t = self._t
         root = t.sqrt(a.value)
-        return self._chain(root, t.div(t.number(0.5), root), a)
+        return Number(root, self._times(a.slopes, t.div(t.number(0.5), root)))
 
     def less(self, a: Number, b: Number) -> Any:
         return self._t.less(a.value, b.value)
@@ -111,10 +92,10 @@ class Dual:
         return self._t.both(a, b)
 
     def real(self, k: Any) -> Number:
-        return self.plain(self._t.real(k))
+        return Number(self._t.real(k))
 
     def reciprocal(self, k: Any) -> Number:
-        return self.plain(self._t.reciprocal(k))
+        return Number(self._t.reciprocal(k))
 
     def index(self, k: int) -> Any:
         return self._t.index(k)
@@ -128,30 +109,27 @@ class Dual:
     def minus(self, a: Any, b: Any) -> Any:
         return self._t.minus(a, b)
 
+    def _slopes(self, number: Number) -> Any:
+        return self._wide.number(0.0) if number.slopes is None else number.slopes
+
     def load(self, slot: int, k: Any) -> Number:
-        first = slot * (self._columns + 1)
-        value, *slopes = (self._t.load(first + i, k) for i in range(self._columns + 1))
-        return Number(value, tuple(slopes))
+        return Number(self._t.load(slot, k), self._wide.load(slot, k))
 
     def store(self, slot: int, k: Any, value: Number) -> None:
-        first = slot * (self._columns + 1)
-        for i, number in enumerate((value.value, *value.slopes)):
-            self._t.store(first + i, k, self._t.number(0.0) if number is None else number)
+        self._t.store(slot, k, value.value)
+        self._wide.store(slot, k, self._slopes(value))
 
     def loop(
         self, first: Any, end: Any, carried: Sequence[Number], body: Callable, step: int = 1
     ) -> list[Number]:
-        width = self._columns + 1
+        def flat(numbers: Sequence[Number]) -> list:
+            return [part for number in numbers for part in (number.value, self._slopes(number))]
 
-        def flatten(values: Sequence[Number]) -> list:
-            zero = self._t.number(0.0)
-            return [zero if x is None else x for v in values for x in (v.value, *v.slopes)]
+        def paired(parts: Sequence) -> list[Number]:
+            return [Number(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
 
-        def gather(flat: Sequence) -> list[Number]:
-            return [Number(flat[i], tuple(flat[i + 1 : i + width])) for i in range(0, len(flat), width)]
-
-        return gather(
-            self._t.loop(first, end, flatten(carried), lambda k, flat: flatten(body(k, gather(flat))), step)
+        return paired(
+            self._t.loop(first, end, flat(carried), lambda k, parts: flat(body(k, paired(parts))), step)
         )
 
     def elementary(self, name: str, x: Number) -> Number:
@@ -166,18 +144,18 @@ class Dual:
             "atan": lambda: t.div(one, t.fma(x.value, x.value, one)),
             "tanh": lambda: t.sub(one, t.mul(value, value)),
         }[name]()
-        return self._chain(value, rate, x)
+        return Number(value, self._times(x.slopes, rate))
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Number]:
         known = self._t.scalars(record, {name: number.value for name, number in inputs.items()})
         found = {}
         for name, value in known.items():
-            slopes: list[Any] = [None] * self._columns
+            slopes = None
             for source, weight in record.tangents.get(name, {}).items():
-                column = self._tangents.get(source)
-                if column is not None and weight != 0.0:
-                    slopes[column] = known[weight] if isinstance(weight, str) else self._t.number(weight)
-            found[name] = Number(value, tuple(slopes))
+                if source in self._tangents and weight != 0.0:
+                    factor = known[weight] if isinstance(weight, str) else self._t.number(weight)
+                    slopes = self._times(self._tangents[source], factor, slopes)
+            found[name] = Number(value, slopes)
         return found
 
 
@@ -188,6 +166,11 @@ class Variable:
 
     def __init__(self, value: Any, slopes: Any) -> None:
         self.value, self.slopes = value, slopes
+
+    @classmethod
+    def of_column(cls, columns: Sequence[str], name: str, value: Any) -> Variable:
+        """Return the number of that name among those by which derivatives are taken, or a constant."""
+        return cls(value, np.array([float(name == column) for column in columns], dtype=object))
 
     def _other(self, other: Any) -> Variable:
         return other if isinstance(other, Variable) else Variable(other, 0.0)
@@ -222,8 +205,33 @@ class Variable:
         return self._other(other) / self
 
 
+def variables_of(states: Any, controls: Any) -> tuple[list[Variable], list[Variable]]:
+    """Return the columns of states (n, n_state) and of controls (n, n_controls), each a column of its own."""
+    columns = [*states.T, *controls.T]
+    unit = np.eye(len(columns))[:, :, None]
+    given = [Variable(x, unit[i]) for i, x in enumerate(columns)]
+    return given[: states.shape[1]], given[states.shape[1] :]
+
+
+def stacked(numbers: Sequence[Variable], count: int) -> Any:
+    """Return the slopes of numbers as an array of shape (count, len(numbers), columns)."""
+    found = np.empty((count, len(numbers), len(numbers[0].slopes)))
+    for i, number in enumerate(numbers):
+        found[:, i] = number.slopes.T
+    return found
+
+
 class VariableFunctions:
-    """The functions of `Variable`."""
+    """The functions of `Variable`.
+
+    Parameters
+    ----------
+    xp : namespace
+        Those of its values.
+    """
+
+    def __init__(self, xp: Any = Numeric) -> None:
+        self._xp = xp
 
     def _of(self, x: Any, value: Any, rate: Any) -> Any:
         return Variable(value, x.slopes * rate) if isinstance(x, Variable) else value
@@ -231,34 +239,34 @@ class VariableFunctions:
     def sin(self, x: Any) -> Any:
         """Return the sine."""
         a = getattr(x, "value", x)
-        return self._of(x, np.sin(a), np.cos(a))
+        return self._of(x, self._xp.sin(a), self._xp.cos(a))
 
     def cos(self, x: Any) -> Any:
         """Return the cosine."""
         a = getattr(x, "value", x)
-        return self._of(x, np.cos(a), -np.sin(a))
+        return self._of(x, self._xp.cos(a), -self._xp.sin(a))
 
     def exp(self, x: Any) -> Any:
         """Return the exponential."""
-        value = np.exp(getattr(x, "value", x))
+        value = self._xp.exp(getattr(x, "value", x))
         return self._of(x, value, value)
 
     def log(self, x: Any) -> Any:
         """Return the natural logarithm."""
         a = getattr(x, "value", x)
-        return self._of(x, np.log(a), 1.0 / a)
+        return self._of(x, self._xp.log(a), 1.0 / a)
 
     def sqrt(self, x: Any) -> Any:
         """Return the square root."""
-        value = np.sqrt(getattr(x, "value", x))
+        value = self._xp.sqrt(getattr(x, "value", x))
         return self._of(x, value, 0.5 / value)
 
     def atan(self, x: Any) -> Any:
         """Return the arc tangent."""
         a = getattr(x, "value", x)
-        return self._of(x, np.arctan(a), 1.0 / (1.0 + a * a))
+        return self._of(x, self._xp.atan(a), 1.0 / (1.0 + a * a))
 
     def tanh(self, x: Any) -> Any:
         """Return the hyperbolic tangent."""
-        value = np.tanh(getattr(x, "value", x))
+        value = self._xp.tanh(getattr(x, "value", x))
         return self._of(x, value, 1.0 - value * value)

@@ -14,8 +14,11 @@ from itertools import islice
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.compiling import compile_function, count_operations, record_block
+from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
 
 if TYPE_CHECKING:
@@ -27,8 +30,9 @@ class Flow(NamedTuple):
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step. ``order`` is that of the series, 0 for a closed form;
-    ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
+    makes the scalar function for any step. ``compile_tangent(present, by)`` makes the one that differentiates
+    steps, by the variables and by the coefficients that are named. ``order`` is that of the series, 0 for a
+    closed form; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
     """
 
     size: int
@@ -37,6 +41,7 @@ class Flow(NamedTuple):
     fast: Callable
     within: Callable
     compile: Callable
+    compile_tangent: Callable
     tolerance: float = pendulum.TOLERANCE
 
 
@@ -55,6 +60,7 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda present: pendulum.compile_flow(present, order, tolerance),
+        lambda present, by: pendulum.compile_tangent(present, by, order, tolerance),
         tolerance,
     )
 
@@ -71,9 +77,16 @@ SLIDE = Flow(
     lambda variables, pull, dt, xp: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
+    slope.compile_slide_tangent,
 )
 TURN = Flow(
-    4, slope.Turn, 0, _turn, lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp), slope.compile_turn
+    4,
+    slope.Turn,
+    0,
+    _turn,
+    lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp),
+    slope.compile_turn,
+    slope.compile_turn_tangent,
 )
 
 
@@ -194,6 +207,8 @@ class Stepper:
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         self._any = [*prepared, call, *finished]
         self._flow = lambda: flow.compile(present)
+        self._tangent = lambda by: flow.compile_tangent(present, by)
+        self._given, self._prepare, self._finish = given, prepare, finish
 
     @property
     def operations(self) -> int:
@@ -212,6 +227,67 @@ class Stepper:
         """
         body = [f"def advance({self.arguments}):", *self._any, f"return {', '.join(self.end)}, status"]
         return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
+
+    @cache  # noqa: B019 - steppers are kept anyway
+    def compile_jacobian(self, by: tuple[str, ...]) -> Callable:
+        """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
+
+        It fills ``out[i]`` with the derivatives of the state after step i by state and controls, and returns
+        the row whose step was refused, counted from 1, or 0. `by` names the coefficients that states or
+        controls change.
+        """
+        n = self._n_state
+        columns = [*self.start[:n], *self.controls]
+        wide, size, rows = len(columns), self.flow.size, self.flow.size + len(self.terms)
+
+        def given(names: Sequence[Any], numbers: Sequence) -> list[Variable]:
+            found = [Variable.of_column(columns, name, x) for name, x in zip(names, numbers, strict=True)]
+            if self._angle is not None:
+                angle, (c, s) = found[self._angle].slopes, numbers[n : n + 2]
+                found[n : n + 2] = [Variable(c, -(angle * s)), Variable(s, angle * c)]
+            return found
+
+        def prepare(xp: Any, *numbers: Any) -> list:
+            names = [*self.start, *self.controls, *self._given]
+            found = self._prepare(VariableFunctions(xp), *given(names, numbers))
+            results = [x if isinstance(x, Variable) else Variable.of_column(columns, "", x) for x in found]
+            return [x.value for x in results] + [slope for x in results for slope in x.slopes]
+
+        def finish(xp: Any, *numbers: Any) -> list:
+            slopes, rest = split(numbers, 2 * wide)
+            names = [*self.start, *self.controls, "dt", *self._given]
+            moved = [Variable(0.0, np.array(part, dtype=object)) for part in split(slopes, wide)]
+            others = [Variable(0.0, 0.0)] * (size - 2)
+            ends = self._finish(VariableFunctions(xp), *moved, *others, *given(names, rest))
+            return [slope for x in ends[:n] for slope in x.slopes]
+
+        held = [f"value{i}" for i in range(rows)] + [f"slope{i}" for i in range(rows * wide)]
+        moved = [f"moved{i}" for i in range(2 * wide)]
+        prepared, before = section(prepare, [*self.start, *self.controls, *self._given], held)
+        ends = [f"end{i}" for i in range(n * wide)]
+        finished, after = section(finish, [*moved, *self.start, *self.controls, "dt", *self._given], ends)
+        loop = [
+            *(f"{y} = states[i, {j}]" for j, y in enumerate(self.start[:n])),
+            *lift_lines(n, self._angle, "y"),
+            *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
+            *prepared,
+            *(f"values[{j}] = {x}" for j, x in enumerate(before[:rows])),
+            *(f"slopes[{j // wide}, {j % wide}] = {x}" for j, x in enumerate(before[rows:])),
+            "if tangent(values, slopes, scratch, dt, x) < 0:",
+            "    return i + 1",
+            *(f"{name} = slopes[{j // wide}, {j % wide}]" for j, name in enumerate(moved)),
+            *finished,
+            *(f"out[i, {j // wide}, {j % wide}] = {x}" for j, x in enumerate(after)),
+        ]
+        body = [
+            f"def jacobian({', '.join(['states, controls, out, dt, x', *self.constants])}):",
+            f"values, slopes = np.empty({rows}), np.empty(({rows}, {wide}))",
+            f"scratch = np.empty((4, {max(rows, wide)}))",
+            "for i in range(states.shape[0]):",
+            *("    " + line for line in loop),
+            "return 0",
+        ]
+        return compile_function("jacobian", "\n    ".join(body) + "\n", self._tangent(by))
 
     @cached_property
     def simulation(self) -> Callable:

@@ -20,7 +20,7 @@ from lag_envs.mechanics.evaluation import eliminated
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
-from lag_envs.stepping.dual import Variable, VariableFunctions
+from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variables_of
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
@@ -64,8 +64,7 @@ class SeriesStepper:
 
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
-        values = {parameter(name): value for name, value in parameters.items()}
-        return _evaluated(self._whole, values) | {
+        return _evaluated(self._whole.constants, parameters) | {
             f"p_{name}": float(parameters[name]) for name in self._parameters
         }
 
@@ -151,63 +150,17 @@ class SeriesStepper:
     # --- derivatives ---------------------------------------------------------------------------------------
 
     @cached_property
-    def _tangents(self) -> SeriesRecord:
+    def _tangents(self) -> tuple[Lowering, tuple[list[int], dict]]:
         lowering = Lowering(self._layout.free, self._moving(), tangents=True)
-        return lowering.record(self.mechanics.mass, self.mechanics.force)
+        return lowering, lowering.parts(self.mechanics.mass, self.mechanics.force)
 
-    def jacobian(
-        self, states: Any, controls: Any, parameters: Mapping[str, float], dt: float, order: int
-    ) -> tuple[Any, int]:
-        """Return the derivatives of the states at the step's end by states and controls.
-
-        Parameters
-        ----------
-        states : ndarray, shape (n, n_state)
-            Where the steps begin.
-        controls : ndarray, shape (n, n_controls)
-            The controls that are held.
-        parameters : mapping
-            The scene's parameters.
-        dt : float
-            Length of the step [s].
-        order : int
-            Order of the series.
-
-        Returns
-        -------
-        derivatives : ndarray, shape (n, n_state, n_state + n_controls)
-            The derivatives.
-        refused : int
-            The row whose step was refused, counted from 1; 0 where there is none.
-        """
-        from lag_envs.stepping.driver import compile_advance_tangents
-
-        record, n = self._tangents, len(self._layout.free)
-        columns = tuple(x for x in record.inputs if x.startswith(("control_", "start_")))
-        k: dict[str, Any] = {f"p_{name}": parameters[name] for name in self._parameters}
-        constants = _evaluated(record, {parameter(name): value for name, value in parameters.items()})
-        count, wide = len(states), states.shape[1] + controls.shape[1]
-        unit = np.eye(wide)[:, :, None] * np.ones(count)
-        given = [Variable(x, unit[i]) for i, x in enumerate([*states.T, *controls.T])]
-        y, u = given[: states.shape[1]], given[states.shape[1] :]
-        before = self.prepare(VariableFunctions(), y, u, k)
-        moving = [f"q{i}" for i in range(n)] + [f"v{i}" for i in range(n)]
-        values = np.zeros((count, len(record.given) + 2 * n))
-        for i, name in enumerate([*record.given, *moving]):
-            if name in before:
-                values[:, i] = before[name].value
-            elif name in constants:
-                values[:, i] = constants[name]
-        slopes = np.empty((count, 2 * n * (2 * n + len(columns))))
-        refused = compile_advance_tangents(record, columns)(values, slopes, dt, order)
-        if refused:
-            return None, refused
-        core = slopes.reshape(count, 2 * n, -1)
-        inner = np.stack([before[name].slopes for name in [*moving, *columns]])
-        ends = np.einsum("bik,kjb->ijb", core, inner)
-        after = [Variable(values[:, len(record.given) + i], ends[i]) for i in range(2 * n)]
-        finished = self.finish(VariableFunctions(), after[:n], after[n:], y, u, dt, k)
-        return np.stack([z.slopes for z in finished]).transpose(2, 0, 1), 0
+    def tangent(self, parameters: Mapping[str, float]) -> SeriesTangent:
+        """Return what differentiates steps of a scene with these parameters."""
+        lowering, parts = self._tangents
+        constants = _evaluated(lowering.constants, parameters)
+        zero = frozenset(name for name, value in constants.items() if value == 0.0)
+        numbers = {f"p_{name}": float(parameters[name]) for name in self._parameters}
+        return SeriesTangent(self, lowering.without(*parts, zero), constants, numbers)
 
     # --- code -----------------------------------------------------------------------------------------------
 
@@ -222,11 +175,108 @@ class SeriesStepper:
         return self._codes[absent, fused]
 
 
-def _evaluated(record: SeriesRecord, parameters: Mapping[Atom, float]) -> dict[str, float]:
+def _evaluated(constants: Mapping[str, Expr], parameters: Mapping[str, float]) -> dict[str, float]:
     """Return the values of a record's constants."""
-    names = list(record.constants)
-    numbers = evaluate([record.constants[name] for name in names], parameters, math)
-    return {name: float(value) for name, value in zip(names, numbers, strict=True)}
+    values = {parameter(name): value for name, value in parameters.items()}
+    numbers = evaluate(list(constants.values()), values, math)
+    return {name: float(value) for name, value in zip(constants, numbers, strict=True)}
+
+
+class SeriesTangent:
+    """What differentiates control steps of one scene.
+
+    Only what the equations contain has a column that is computed: by a coordinate that they do not contain
+    the derivatives are those of a shift.
+
+    Parameters
+    ----------
+    stepper : SeriesStepper
+        The scene's stepper.
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    constants, numbers : mapping from str to float
+        Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
+    """
+
+    def __init__(
+        self,
+        stepper: SeriesStepper,
+        record: SeriesRecord,
+        constants: Mapping[str, float],
+        numbers: Mapping[str, float],
+    ) -> None:
+        from lag_envs.stepping.driver import compile_advance_tangents
+        from lag_envs.stepping.machine import slots_for
+
+        self._stepper, self._numbers, self._given = stepper, numbers, record.given
+        n = record.size
+        seen = {(node.op, node.index) for node in record.nodes}
+        self._still = [i for i in range(n) if ("place", i) not in seen]
+        self._free = [i for i in self._still if ("velocity", i) not in seen]
+        self._moving = [*(f"q{i}" for i in range(n)), *(f"v{i}" for i in range(n))]
+        without = {*(f"q{i}" for i in self._still), *(f"v{i}" for i in self._free)}
+        inputs = [name for name in record.given if name.startswith(("control_", "start_"))]
+        self._columns = tuple(name for name in [*self._moving, *inputs] if name not in without)
+        self._first = np.zeros((2 * n, slots_for(len(self._columns))))
+        for i, name in enumerate(self._moving):
+            if name in self._columns:
+                self._first[i, self._columns.index(name)] = 1.0
+        self._constants = np.array([constants.get(name, 0.0) for name in record.given])
+        self._advance = compile_advance_tangents(record, self._columns)
+
+    def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
+        """Return the derivatives of the states at the step's end by states and controls.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n, n_state)
+            Where the steps begin.
+        controls : ndarray, shape (n, n_controls)
+            The controls that are held.
+        dt : float
+            Length of the step [s].
+        order : int
+            Order of the series.
+
+        Returns
+        -------
+        derivatives : ndarray, shape (n, n_state, n_state + n_controls)
+            The derivatives; None where a step was refused.
+        refused : int
+            The row whose step was refused, counted from 1; 0 where there is none.
+        """
+        count, size, first = len(states), len(self._moving) // 2, len(self._given)
+        xp = VariableFunctions()
+        y, u = variables_of(states, controls)
+        before = self._stepper.prepare(xp, y, u, self._numbers)
+        values = np.empty((count, first + 2 * size))
+        values[:, :first] = self._constants
+        for i, name in enumerate([*self._given, *self._moving]):
+            if name in before:
+                values[:, i] = getattr(before[name], "value", before[name])
+        slopes = np.repeat(self._first[None], count, axis=0)
+        refused = self._advance(values, slopes.reshape(count, -1), dt, order)
+        if refused:
+            return None, refused
+
+        def stack(names: Sequence[str]) -> Any:
+            found = np.zeros((len(names), len(y) + len(u), width))
+            for i, name in enumerate(names):
+                found[i] = getattr(before[name], "slopes", 0.0)
+            return found.transpose(2, 0, 1)
+
+        # Where no rate is held, these derivatives are the same for all states.
+        width = max(np.shape(getattr(x, "slopes", 0.0))[-1:] for x in before.values())[0]
+        ends = slopes[..., : len(self._columns)] @ stack(self._columns)
+        start = stack(self._moving)
+        for i in self._still:
+            ends[:, i] += start[:, i]
+        for i in self._free:
+            ends[:, i] += dt * start[:, size + i]
+            ends[:, size + i] += start[:, size + i]
+        after = [Variable(values[:, first + i], ends[:, i].T) for i in range(2 * size)]
+        finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, self._numbers)
+        return stacked(finished, count), 0
 
 
 class StepBound(NamedTuple):

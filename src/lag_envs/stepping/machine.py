@@ -117,7 +117,7 @@ class Machine:
         return self._b.not_(condition)
 
     def real(self, k: Any) -> ir.Value:
-        return self._splat(self._b.sitofp(k, _DOUBLE))
+        return self.spread(self._b.sitofp(k, _DOUBLE))
 
     def reciprocal(self, k: Any) -> ir.Value:
         table = self._b.module.globals.get("reciprocals")
@@ -127,9 +127,9 @@ class Machine:
             table = ir.GlobalVariable(self._b.module, kind, "reciprocals")
             table.linkage, table.global_constant = "internal", True
             table.initializer = ir.Constant(kind, values)
-        return self._splat(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
+        return self.spread(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
 
-    def _splat(self, value: Any) -> ir.Value:
+    def spread(self, value: Any) -> ir.Value:
         return value if self._lanes == 1 else primitives.splat(self._b, value, self._lanes)
 
     def index(self, k: int) -> ir.Value:
@@ -350,19 +350,24 @@ def _write(
     return function
 
 
+def slots_for(columns: int) -> int:
+    """Return how many numbers a row of derivatives takes: whole vectors."""
+    return 1 << max(columns - 1, 0).bit_length()
+
+
 def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     """Return ``tangent(rows, at, order)``: a step of given length and its derivatives, for compiled code.
 
     The rows are inputs, places and velocities as in `Layout`, the time since the control step began, the
-    step, and then the derivatives of the places and velocities by places, velocities and the inputs named in
-    `columns`, as a matrix. Places, velocities and the matrix are replaced by those after the step.
+    step, and then the derivatives of the places and velocities by `columns`, as a matrix with `slots_for`
+    columns. Places, velocities and the matrix are replaced by those after the step.
 
     Parameters
     ----------
     record : SeriesRecord
         What is stepped, made with tangents.
     columns : tuple of str
-        Inputs by which derivatives are taken.
+        By what derivatives are taken: names of inputs are told from others.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
     kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])
@@ -376,31 +381,40 @@ def _write_tangent(
 ) -> ir.Function:
     """Write the function ``name(rows, order)`` into a module."""
     step, layout, n = Series(record), Layout(record), record.size
-    width, matrix = 2 * n + len(columns), layout.status + 2
+    width, matrix = slots_for(len(columns)), layout.status + 2
     function = ir.Function(module, kind, name)
+    set.add(function.attributes, '"prefer-vector-width"="512"')
     rows, order = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    plain = Machine(builder, step.slots * (width + 1) * STRIDE, 1, True)
-    t: Any = Dual(plain, width, {source: 2 * n + i for i, source in enumerate(columns)})
+    plain, wide = (Machine(builder, step.slots * STRIDE, lanes, True) for lanes in (1, width))
+
+    def unit(column: int) -> Any:
+        numbers = [ir.Constant(_DOUBLE, float(i == column)) for i in range(width)]
+        return numbers[0] if width == 1 else ir.Constant(wide.kind, numbers)
+
+    tangents = {source: unit(i) for i, source in enumerate(columns) if source in layout.inputs}
+    t: Any = Dual(plain, wide, wide.spread, tangents)
 
     def at(row: int) -> ir.Value:
         return builder.gep(rows, [ir.Constant(_INT, row)])
 
-    def moving(row: int, i: int) -> dual.Number:
-        return dual.Number(
-            builder.load(at(row)), tuple(builder.load(at(matrix + i * width + k)) for k in range(width))
-        )
+    def slopes(i: int) -> ir.Value:
+        return builder.bitcast(at(matrix + i * width), wide.kind.as_pointer())
 
-    inputs = {name: t.plain(builder.load(at(row))) for name, row in layout.inputs.items()}
-    inputs[ELAPSED] = t.plain(builder.load(at(layout.status)))
+    def moving(row: int, i: int) -> dual.Number:
+        derivatives = builder.load(slopes(i))
+        derivatives.align = 8
+        return dual.Number(builder.load(at(row)), derivatives)
+
+    inputs = {name: dual.Number(builder.load(at(row))) for name, row in layout.inputs.items()}
+    inputs[ELAPSED] = dual.Number(builder.load(at(layout.status)))
     q = [moving(layout.q + i, i) for i in range(n)]
     v = [moving(layout.v + i, n + i) for i in range(n)]
-    h = t.plain(builder.load(at(layout.status + 1)))
+    h = dual.Number(builder.load(at(layout.status + 1)))
     step.expand(t, inputs, q, v, h, order)
     q, v = step.advance(t, q, h, order)
     for i, number in enumerate([*q, *v]):
         builder.store(number.value, at(layout.q + i))
-        for k, slope in enumerate(number.slopes):
-            builder.store(plain.number(0.0) if slope is None else slope, at(matrix + i * width + k))
+        builder.store(wide.number(0.0) if number.slopes is None else number.slopes, slopes(i)).align = 8
     builder.ret_void()
     return function

@@ -174,6 +174,30 @@ class NormalForm:
                 after.append(given[by.name] + dt * (rate + 0.5 * dt * push))
         return [*after, *moved[2:]]
 
+    # --- derivatives ---------------------------------------------------------------------------------------
+
+    def jacobian(
+        self, states: Any, controls: Any, constants: Mapping[str, float], dt: float
+    ) -> tuple[Any, int]:
+        """Return the derivatives of the states at the step's end by states and controls.
+
+        Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form.
+        """
+        absent = frozenset(name for name, value in constants.items() if value == 0.0)
+        stepper = self.stepper(dt, absent)
+        by = tuple(
+            name
+            for name, terms in self.terms.items()
+            if any(term.held.number is None and term.constant not in absent for term in terms)
+        )
+        found = np.empty((*states.shape, states.shape[1] + controls.shape[1]))
+        numbers = (constants[name.removeprefix("k_")] for name in stepper.constants)
+        jacobian = stepper.compile_jacobian(by)
+        refused = jacobian(states, controls, found, dt, self.largest_x(dt), *numbers)
+        if not refused and not np.isfinite(found).all():
+            refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
+        return found, refused
+
     # --- what depends on numbers ---------------------------------------------------------------------------
 
     def coefficients(self, state: ArrayLike, controls: Sequence, constants: Mapping[str, float]) -> Any:

@@ -25,14 +25,15 @@ digits (`substep`), and where damping is heavy most of them are spared by follow
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.stepping.compiling import compile_python, compile_traced
-from lag_envs.stepping.tracing import pairwise_sum, polynomial, sum_of_products
+from lag_envs.stepping.compiling import compile_function, compile_python, compile_traced, record_block
+from lag_envs.stepping.dual import Variable
+from lag_envs.stepping.tracing import Trace, pairwise_sum, polynomial, sum_of_products
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
 ORDER = 16
@@ -143,6 +144,39 @@ def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: in
     """Advance (θ, θ', cosθ, sinθ) by one step of the series."""
     angle, change, c, s = step_change(omega, c, s, drive, h, order)
     return theta + angle, omega + change * (1.0 / h), c, s
+
+
+def step_slopes(
+    omega: Any, c: Any, s: Any, drive: Drive, h: Any, elapsed: Any, columns: Sequence[str], order: int
+) -> list:
+    """Return the derivatives of what one step of the series adds to θ, then of what it adds to θ'.
+
+    Parameters
+    ----------
+    omega, c, s : number
+        θ', cosθ and sinθ at the start.
+    drive : Drive
+        Coefficients, those at the time 0.
+    h, elapsed : number
+        The step, and the time at which it begins.
+    columns : sequence of str
+        By what derivatives are taken: ``theta``, ``omega`` and names of coefficients.
+    order : int
+        The highest coefficient of W.
+    """
+    number = partial(Variable.of_column, columns)
+    a, b, gamma, delta, ramp = (number(name, value) for name, value in zip(Drive._fields, drive, strict=True))
+    theta = number("theta", 0.0).slopes
+    W, _ = taylor_coefficients(
+        number("omega", omega) * h,
+        Variable(c, -(theta * s)),
+        Variable(s, theta * c),
+        scaled(Drive(a, b, gamma, delta + ramp * elapsed, ramp), h),
+        order,
+    )
+    turned = [w.slopes for w in W]
+    angle = pairwise_sum([w * (1.0 / (k + 1)) for k, w in enumerate(turned)])
+    return [*angle, *(pairwise_sum(turned[1:]) * (1.0 / h))]
 
 
 def certified(omega: Any, drive: Drive, h: Any, x: Any, xp: Any) -> Any:
@@ -257,8 +291,11 @@ def _divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, n):  # typ
     return theta + turned, omega + (fma(-omega, h, w) + (w_low - omega * h_low)) / h, c, s
 
 
-def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  # type: ignore[no-untyped-def]
+def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slopes):  # type: ignore[no-untyped-def]
     """Advance by dt along the slow manifold in n equal substeps; return θ, θ', cosθ, sinθ.
+
+    A column of `slopes` holds the derivatives, by anything, of θ, θ', cosθ, sinθ and the coefficients at the
+    start; those of θ and θ' are replaced.
 
     There θ' is the drift that drive and drag alone lead to, known in closed form, plus a part V due to the
     field. In a substep V = -(P + V')/Γ has a series of its own. It is found by sweeps, each of which gains a
@@ -290,6 +327,8 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  #
                         q += P[j] * V[k - j]
                     P[k + 1] = p / (k + 1)
                     Q[k + 1] = -q / (k + 1)
+        if slopes.shape[1] > 0:
+            slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, i * h, gamma, delta, ramp, order)
         w = angle = 0.0
         for k in range(order, -1, -1):
             w += V[k]
@@ -305,20 +344,54 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order):  #
     return theta + turned, (w + (drift + slope)) / h, c, s
 
 
-def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: ignore[no-untyped-def]
-    """Advance by dt with as many substeps as the bound asks for; return the state and their number.
+def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
+    """Carry derivatives over a substep along the slow manifold: `_slow_motion` differentiated."""
+    drift = (delta + ramp * elapsed - ramp / gamma) / gamma * h
+    slope = ramp / gamma * h * h
+    U = V.copy()
+    U[0] += drift
+    U[1] += slope
+    dU, dV, dP, dQ = np.zeros(order + 2), np.zeros(order + 2), np.zeros(order + 2), np.zeros(order + 2)
+    for column in range(slopes.shape[1]):
+        turn, _, _, _, d_alpha, d_beta, d_gamma, d_delta, d_ramp = slopes[:, column]
+        rate = (delta + ramp * elapsed - 2.0 * ramp / gamma) / gamma * d_gamma
+        d_drift = (d_delta + d_ramp * (elapsed - 1.0 / gamma) - rate) / gamma * h
+        d_slope = (d_ramp - ramp / gamma * d_gamma) / gamma * h * h
+        dP[0] = (d_alpha * s + d_beta * c) * h * h + Q[0] * turn
+        dQ[0] = (d_alpha * c - d_beta * s) * h * h - P[0] * turn
+        for k in range(order + 2):
+            dV[k] = 0.0
+        for _ in range(8):
+            for k in range(order + 1):
+                dV[k] = -(dP[k] + (k + 1) * dV[k + 1] + V[k] * d_gamma * h) / g
+                dU[k] = dV[k] + (d_drift if k == 0 else d_slope if k == 1 else 0.0)
+                if k < order:
+                    p = q = 0.0
+                    for j in range(k + 1):
+                        p += dQ[j] * U[k - j] + Q[j] * dU[k - j]
+                        q += dP[j] * U[k - j] + P[j] * dU[k - j]
+                    dP[k + 1] = p / (k + 1)
+                    dQ[k + 1] = -q / (k + 1)
+        speed = angle = 0.0
+        for k in range(order, -1, -1):
+            speed += dU[k]
+            angle += dU[k] / (k + 1)
+        slopes[0, column] += angle
+        slopes[1, column] = speed / h
 
-    The number is negative where the step is refused: too many substeps, or no finite result.
+
+def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # type: ignore[no-untyped-def]
+    """Return how a step is divided: until when, into how many substeps, how many follow the slow manifold.
+
+    Last comes whether drive and drag alone move it there. That is not asked for where derivatives by the
+    field are wanted (`field_counts`). The second number is negative where there would be too many.
     """
-    if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
-        angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta, ramp, dt)
-        return theta + angle, fma(change, 1.0 / dt, omega), c, s, 1
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
     # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then follow the slow
     # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. Where the
     # field is nothing beside the push, the drift is all there is.
-    drift = field <= 1e-18 * push
+    drift = field <= 1e-18 * push and not field_counts
     layer = dt
     if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or push <= 1e-2 * gamma * gamma):
         layer = (40.0 + math.log(max(1.0, abs(omega) + (field + push) / gamma))) / gamma
@@ -333,13 +406,29 @@ def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: 
             m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
     # A substep along the slow manifold costs as much as 50 others.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
+        n = -1.0
+    return layer, n, m, drift
+
+
+def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: ignore[no-untyped-def]
+    """Advance by dt with as many substeps as the bound asks for; return the state and their number.
+
+    The number is negative where the step is refused: too many substeps, or no finite result.
+    """
+    if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
+        angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta, ramp, dt)
+        return theta + angle, fma(change, 1.0 / dt, omega), c, s, 1
+    layer, n, m, drift = plan(omega, alpha, beta, gamma, delta, ramp, dt, order, False)
+    if n < 0.0:
         return theta, omega, c, s, -1
     theta, omega, c, s = divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, layer, n)
-    if slow:
+    if m > 0.0:
         if drift:
             alpha = beta = 0.0
         delta += ramp * layer
-        theta, omega, c, s = slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order)
+        theta, omega, c, s = slow_motion(
+            theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order, np.empty((9, 0))
+        )
     if not (abs(theta) < math.inf and abs(omega) < math.inf):
         return theta, omega, c, s, -2
     return theta, omega, c, s, int(n + m)
@@ -364,6 +453,15 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
         ``flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x)`` to
         ``(theta, omega, c, s, substeps)``; `substeps` is negative where the step is refused.
     """
+    holds, series = _compile_parts(present, order)
+    divided = compile_python("divided", _divided, *_divided_parts(order))
+    plan, slow = _compile_plan(tolerance), _compile_slow_motion()
+    return compile_python("flow", _flow, holds, series, plan, divided, slow, order=order)
+
+
+@cache
+def _compile_parts(present: tuple[bool, ...], order: int) -> tuple[Callable, Callable]:
+    """Compile the condition of the bound, and one step of the series."""
     absent = frozenset(name for name, there in zip(Drive._fields, present, strict=True) if not there)
     coefficients = "alpha, beta, gamma, delta, ramp"
     series = compile_traced(
@@ -378,15 +476,23 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
         lambda xp, omega, *rest: (certified(omega, Drive(*rest[:5]), rest[5], rest[6], xp),),
         absent,
     )
-    count = compile_python("_substeps", _substeps, compile_python("_rate", _rate))
-    divided, slow_motion = _compile_divided(order), compile_python("slow_motion", _slow_motion)
-    limits = {"TOLERANCE": tolerance, "MAX_SUBSTEPS": MAX_SUBSTEPS}
-    return compile_python("flow", _flow, holds, series, count, divided, slow_motion, order=order, **limits)
+    return holds, series
 
 
 @cache
-def _compile_divided(order: int) -> Callable:
-    """Compile `_divided` once for all pendulums; what is zero adds nothing."""
+def _compile_plan(tolerance: float) -> Callable:
+    count = compile_python("_substeps", _substeps, compile_python("_rate", _rate))
+    return compile_python("plan", _plan, count, TOLERANCE=tolerance, MAX_SUBSTEPS=MAX_SUBSTEPS)
+
+
+@cache
+def _compile_slow_motion() -> Callable:
+    return compile_python("slow_motion", _slow_motion, compile_python("slow_slopes", _slow_slopes))
+
+
+@cache
+def _divided_parts(order: int) -> tuple[Callable, Callable]:
+    """Compile what `_divided` calls, once for all pendulums; what is zero adds nothing."""
     coefficients = ", ".join(Drive._fields)
     pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Drive._fields))
 
@@ -402,9 +508,106 @@ def _compile_divided(order: int) -> Callable:
         w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
         return twofold_parts(w, c, s, turned + angle)
 
-    return compile_python(
-        "divided",
-        _divided,
+    return (
         compile_traced("scale", f"omega, {coefficients}, h, h_low", scale),
         compile_traced("substep", f"{pairs}, i", one),
+    )
+
+
+# --- derivatives --------------------------------------------------------------------------------------------
+
+
+def _carry(slopes, lost, change):  # type: ignore[no-untyped-def]
+    """Carry derivatives of θ and θ' over a substep, whose own are `change`, by those that `ROWS` names.
+
+    What rounding takes is handed on in `lost` (Kahan), as many substeps add up.
+    """
+    for column in range(slopes.shape[1]):
+        before = slopes[0, column], slopes[1, column]
+        for row in range(2):
+            added = change[row, 0] * before[0] + change[row, 1] * before[1] - lost[row, column]
+            for i in range(2, len(ROWS)):
+                added += change[row, i] * slopes[ROWS[i], column]
+            slopes[row, column] = before[row] + added
+            lost[row, column] = (slopes[row, column] - before[row]) - added
+
+
+def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
+    """Differentiate a step; return 0, or -1 where it is refused.
+
+    `values` are θ, θ', cosθ, sinθ and the coefficients, `slopes` their derivatives at the step's start, by
+    anything, of shape (9, columns). Those of θ and θ' are replaced by those at its end.
+    """
+    theta, omega, c, s, alpha, beta, gamma, delta, ramp = values
+    change, lost = scratch[:2], scratch[2:]
+    lost[:] = 0.0
+    if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
+        local(change, omega, c, s, alpha, beta, gamma, delta, ramp, dt, 0.0)
+        carry(slopes, lost, change)
+        return 0
+    layer, n, m, drift = plan(omega, alpha, beta, gamma, delta, ramp, dt, order, FIELD_COUNTS)
+    if n < 0.0:
+        return -1
+    h = layer / n
+    scaled = scale(omega, alpha, beta, gamma, delta, ramp, h, fma(-h, n, layer) / n)
+    w, w_low = scaled[0], scaled[1]
+    c_low = s_low = turned = turned_low = 0.0
+    for j in range(int(n)):
+        local(change, w / h, c, s, alpha, beta, gamma, delta, ramp, h, j * h)
+        carry(slopes, lost, change)
+        w, w_low, c, c_low, s, s_low, turned, turned_low = substep(
+            w, w_low, c, c_low, s, s_low, turned, turned_low, *scaled[2:], float(j)
+        )
+    if m > 0.0:
+        if drift:
+            alpha = beta = 0.0
+        delta += ramp * layer
+        slopes[7] += slopes[8] * layer
+        slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt - layer, m, order, slopes)
+    return 0
+
+
+@cache
+def compile_tangent(
+    present: tuple[bool, ...], by: tuple[str, ...], order: int = ORDER, tolerance: float = TOLERANCE
+) -> Callable:
+    """Compile ``tangent(values, slopes, scratch, dt, x)``, see `_tangent`; `scratch` has four rows.
+
+    Parameters
+    ----------
+    present : tuple of bool
+        For each coefficient of `Drive`, whether it is there.
+    by : tuple of str
+        Coefficients that have derivatives.
+    order, tolerance : int, float
+        As for `compile_flow`.
+    """
+    absent = frozenset(name for name, there in zip(Drive._fields, present, strict=True) if not there)
+    columns, n = ("theta", "omega", *by), len(by) + 2
+    numbers = ("omega", "c", "s", *Drive._fields, "h", "elapsed")
+    trace = Trace()
+    omega, c, s, *rest, h, elapsed = (
+        trace.zero() if name in absent else trace.inputs(name)[0] for name in numbers
+    )
+    found = step_slopes(omega, c, s, Drive(*rest), h, elapsed, columns, order)
+    lines, entries = record_block(trace, {f"out{i}": x for i, x in enumerate(found)})
+    body = [
+        f"def local(change, {', '.join(numbers)}):",
+        *lines,
+        *(f"change[{i // n}, {i % n}] = {x}" for i, x in enumerate(entries)),
+    ]
+    rows = (0, 1, *(4 + Drive._fields.index(name) for name in by))
+    holds, _ = _compile_parts(present, order)
+    return compile_python(
+        "tangent",
+        _tangent,
+        holds,
+        compile_function("local", "\n    ".join(body) + "\n"),
+        compile_python("carry", _carry, ROWS=rows),
+        _compile_plan(tolerance),
+        _compile_slow_motion(),
+        *_divided_parts(order),
+        order=order,
+        ROWS=rows,
+        FIELD_COUNTS=bool({"alpha", "beta"} & set(by)),
     )

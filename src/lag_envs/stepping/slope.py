@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping.compiling import compile_python, compile_traced
+from lag_envs.stepping.dual import Variable
 from lag_envs.stepping.pendulum import TWOFOLD, rotate
 from lag_envs.stepping.tracing import clip, pairwise_sum, polynomial
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
@@ -137,6 +138,47 @@ def compile_slide(present: tuple[bool, ...]) -> Callable:
     )
     holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(Pull(p, d), dt),), absent)
     return compile_python("flow", _slide_any, fast, holds)
+
+
+def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
+    """Differentiate a step; see `pendulum._tangent`. The values are x, x', pull and drag."""
+    _x, v, pull, drag = values
+    z = drag * dt
+    if abs(z) <= SMALL_DECAY:
+        phi2, slope2 = short(z)
+    else:
+        phi2, slope2, term = 0.5, 0.0, 0.5
+        for k in range(1, 24):
+            slope2 += term * -k / (k + 2)
+            term *= -z / (k + 2)
+            phi2 += term
+    phi1 = 1.0 - z * phi2
+    slope1 = -(phi2 + z * slope2)
+    decay = 1.0 - z * phi1
+    if not abs(z) < 1.5:  # where those would cancel
+        decay = math.exp(-z)
+        phi1 = -math.expm1(-z) / z
+        phi2 = (1.0 - phi1) / z
+        slope1 = (decay - phi1) / z
+        slope2 = -(slope1 + phi2) / z
+    far, fast = dt * dt * (v * slope1 + pull * dt * slope2), dt * (pull * dt * slope1 - v * decay)
+    for j in range(slopes.shape[1]):
+        dv, d_pull, d_drag = slopes[1, j], slopes[2, j], slopes[3, j]
+        slopes[0, j] += dt * (dv * phi1 + d_pull * dt * phi2) + far * d_drag
+        slopes[1, j] = dv * decay + d_pull * dt * phi1 + fast * d_drag
+    return 0
+
+
+@cache
+def compile_slide_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
+    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_slide_tangent`; it takes any terms."""
+
+    def short(xp: Any, z: Any) -> tuple:
+        phi2 = polynomial(_PHI2, Variable.of_column(["z"], "z", z))
+        return phi2.value, *phi2.slopes
+
+    helper = compile_traced("short", "z", short)
+    return compile_python("tangent", _slide_tangent, helper, SMALL_DECAY=SMALL_DECAY)
 
 
 class Turn(NamedTuple):
@@ -298,4 +340,69 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
         compile_traced("start", "v, h, h_low", lambda xp, v, *h: twofold_parts(Twofold(*h) * v)),
         compile_traced("substep", f"{names}, carry, weight, drag, rate, h, h_low", substep, absent),
         SMALL_TURN=SMALL_TURN,
+    )
+
+
+# --- derivatives of the turning slope -----------------------------------------------------------------------
+
+
+def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
+    """Differentiate a step; see `pendulum._tangent`.
+
+    The values are x, x', cosφ, sinφ, carry, weight, drag and rate; carry, weight and drag have no
+    derivatives. A long step is made of a short one by squaring, as in `_turn_any`.
+    """
+    x, v, c, s, carry, weight, drag, rate = values
+    m, by_rate = scratch[:2], scratch[2:]
+    growth = dt * (2.0 * drag + (1.0 + 2.0 * math.sqrt(max(abs(carry), 1.0))) * abs(rate))
+    doublings = 0
+    h = dt
+    while growth > SMALL_TURN:
+        growth *= 0.5
+        h *= 0.5
+        doublings += 1
+        if doublings > 60:
+            return -1
+    for j in range(4):
+        one = 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0, 1.0 if j == 3 else 0.0
+        m[0, j], m[1, j], by_rate[0, j], by_rate[1, j] = change(*one, carry, weight, drag, rate, h)
+    for _d in range(doublings):
+        p, q = math.cos(rate * h), math.sin(rate * h)
+        a, b = m.copy(), by_rate.copy()
+        for r in range(2):
+            for j in range(4):
+                m[r, j] += a[r, 0] * a[0, j] + a[r, 1] * a[1, j]
+                by_rate[r, j] += b[r, 0] * a[0, j] + b[r, 1] * a[1, j]
+                by_rate[r, j] += a[r, 0] * b[0, j] + a[r, 1] * b[1, j]
+            for j in range(2):
+                m[r, j] += a[r, j]
+                by_rate[r, j] += b[r, j]
+            m[r, 2] += a[r, 2] * p + a[r, 3] * q
+            m[r, 3] += a[r, 3] * p - a[r, 2] * q
+            by_rate[r, 2] += b[r, 2] * p + b[r, 3] * q + (a[r, 3] * p - a[r, 2] * q) * h
+            by_rate[r, 3] += b[r, 3] * p - b[r, 2] * q - (a[r, 2] * p + a[r, 3] * q) * h
+        h *= 2.0
+    for j in range(slopes.shape[1]):
+        dx, dv, dc, ds = slopes[0, j], slopes[1, j], slopes[2, j], slopes[3, j]
+        for r in range(2):
+            moved = m[r, 0] * dx + m[r, 1] * dv + (m[r, 2] * dc + m[r, 3] * ds)
+            turned = by_rate[r, 0] * x + by_rate[r, 1] * v + (by_rate[r, 2] * c + by_rate[r, 3] * s)
+            slopes[r, j] += moved + turned * slopes[7, j]
+    return 0
+
+
+@cache
+def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
+    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; it takes any terms."""
+    names = ("x", "v", "c", "s", *Turn._fields, "h")
+
+    def change(xp: Any, *numbers: Any) -> tuple:
+        x, v, c, s, *rest, h = (
+            Variable.of_column(["rate"], name, number) for name, number in zip(names, numbers, strict=True)
+        )
+        dx, dv = turn_change(x, v, c, s, Turn(*rest), h)
+        return dx.value, dv.value, *dx.slopes, *dv.slopes
+
+    return compile_python(
+        "tangent", _turn_tangent, compile_traced("change", ", ".join(names), change), SMALL_TURN=SMALL_TURN
     )

@@ -18,9 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.mechanics.recording import Values, formula, twin
 from lag_envs.scenes import picture
-from lag_envs.scenes.base import ORDER, Scene, complete, is_own
-from lag_envs.scenes.checks import StepRefused, check_number, real_array
+from lag_envs.scenes.base import ORDER, Scene
+from lag_envs.scenes.checks import StepRefused, check_number, check_state, real_array
+from lag_envs.scenes.declaring import complete
+from lag_envs.scenes.door import is_own
 from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
+from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.stepping.series import check_order
@@ -316,7 +319,7 @@ class Task:
 
     def start_state(self, state: ArrayLike) -> NDArray[np.float64]:
         """Return a given start as float64 array, or raise a ValueError where the task cannot start there."""
-        array = self.scene._check_state(state)
+        array = check_state(self.scene, state)
         for entry, value in zip(self.scene._layout.state, array, strict=True):
             if entry.kind != "place" and abs(value) > FASTEST_START:
                 raise ValueError(
@@ -515,7 +518,7 @@ class TaskFormulas:
 
     def refusal(self, *arguments: Any) -> StepRefused:
         """Return the error for a step that was refused."""
-        return self._task.scene._refusal(*arguments)
+        return refusal(self._task.scene, *arguments)
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""

@@ -1,0 +1,156 @@
+"""What the Jacobian of a control step costs beside the step: a section of ``lag-envs bench``.
+
+Both start from the same states. The step is the compiled one, state after state; `Scene.simulate` would have
+the states of one motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from lag_envs import scenes
+from lag_envs.scenes import Scene
+from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.flows import lift_lines
+
+#: Length of the step [s], states in a batch, and calls in a sample of single ones.
+DT, BATCH, CALLS = 0.02, 1024, 20
+#: Scenes of the package, each with the control that asks most of it.
+CASES: dict[str, Callable[[], Scene]] = {
+    "PivotedBar": scenes.PivotedBar,
+    "Incline": scenes.Incline,
+    "Incline, tilt_rate": lambda: scenes.Incline(control="tilt_rate"),
+    "CylinderInCylinder": lambda: scenes.CylinderInCylinder(damping=0.24),
+    "CylinderInCylinder, damping": lambda: scenes.CylinderInCylinder(control="damping"),
+    "CartPole": scenes.CartPole,
+    "Acrobot": scenes.Acrobot,
+    "Chain(2)": lambda: scenes.Chain(bars=2),
+    "Chain(3)": lambda: scenes.Chain(bars=3),
+    "RotaryPendulum": scenes.RotaryPendulum,
+    "TwoLinkArm": scenes.TwoLinkArm,
+}
+
+
+def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
+    """Return a function that takes a step from each of many states, and returns the sum of what came out."""
+    code, constants = scene._code(dt), scene._constants()
+    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    general, n = scene._form is None, len(scene.state_names)
+    angle = None if scene._form is None else scene._form.angle
+    held = ["order" if general else "x", *code.constants]
+    call = [*(["rows"] if general else []), *code.start, *code.controls, "dt", *held]
+    loop = [
+        *(f"{y} = states[i, {j}]" for j, y in enumerate(code.start[:n])),
+        *lift_lines(n, angle, "y"),
+        *(f"{u} = controls[i, {j}]" for j, u in enumerate(code.controls)),
+        f"{', '.join(code.end)}, status = advance({', '.join(call)})",
+        f"total += {' + '.join(code.end[:n])}",
+    ]
+    body = [
+        f"def steps({', '.join(['states', 'controls', 'dt', *held])}):",
+        *([f"rows = np.zeros({code.scratch})"] if general else []),
+        "total = 0.0",
+        "for i in range(states.shape[0]):",
+        *("    " + line for line in loop),
+        "return total",
+    ]
+    steps = compile_function("steps", "\n    ".join(body) + "\n", code.compile())
+    limit = scene._limit(dt)
+    return lambda states, controls: steps(states, controls, dt, limit, *numbers)
+
+
+def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Measure the cost of `Scene.jacobian`, in a batch and one by one.
+
+    Parameters
+    ----------
+    rounds : int
+        How often; all are measured in turn, and the least counts.
+    clock : callable
+        Returns the time [s].
+    names : sequence of str
+        Some of `CASES`; by default all.
+
+    Returns
+    -------
+    list of dict
+        For each scene its ``name``; ``columns`` K, by states and controls; ``step_ns`` and ``jacobian_ns`` of
+        a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio`` to one
+        of `Scene.simulate`.
+    """
+    found = []
+    for name in names or CASES:
+        scene = CASES[name]()
+        rng = np.random.default_rng(0)
+        states = rng.uniform(-1.0, 1.0, (BATCH, len(scene.state_names)))
+        controls = rng.uniform(0.0, 1.0, (BATCH, len(scene.control_names)))
+        steps = compile_steps(scene, DT)
+
+        def run_steps(steps: Any = steps, states: Any = states, controls: Any = controls) -> None:
+            for _ in range(CALLS):
+                steps(states, controls)
+
+        def run_batch(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
+            scene.jacobian(states, controls, DT)
+
+        def simulate(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
+            for i in range(CALLS):
+                scene.simulate(states[i], controls[i : i + 1], DT)
+
+        def call(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
+            for i in range(CALLS):
+                scene.jacobian(states[i], controls[i], DT)
+
+        times = _least((run_steps, run_batch, simulate, call), rounds, clock)
+        step, batch, one, single = times[0] / CALLS / BATCH, times[1] / BATCH, times[2], times[3]
+        columns = states.shape[1] + controls.shape[1]
+        found.append(
+            {
+                "name": name,
+                "columns": columns,
+                "step_ns": round(1e9 * step, 1),
+                "jacobian_ns": round(1e9 * batch, 1),
+                "ratio": round(batch / step, 2),
+                "aim": 1 + 2 * columns,
+                "call_us": round(1e6 * single / CALLS, 1),
+                "call_ratio": round(single / one, 2),
+            }
+        )
+    return found
+
+
+def _least(runs: Sequence[Callable[[], None]], rounds: int, clock: Callable[[], float]) -> list[float]:
+    """Return the least time of each [s]; all of them run once before."""
+    least = [float("inf")] * len(runs)
+    for run in runs:
+        run()
+    for _ in range(rounds):
+        for i, run in enumerate(runs):
+            start = clock()
+            run()
+            least[i] = min(least[i], clock() - start)
+    return least
+
+
+def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the rows of a table, the first with the columns' names."""
+    head = ("Jacobian of a step", "columns", "step, ns", "row, ns", "steps", "aim", "call, µs", "of a step's")
+    return [
+        head,
+        *(
+            (
+                row["name"],
+                str(row["columns"]),
+                f"{row['step_ns']:,.0f}",
+                f"{row['jacobian_ns']:,.0f}",
+                f"{row['ratio']:.1f}",
+                f"{row['aim']}",
+                f"{row['call_us']:.0f}",
+                f"{row['call_ratio']:.1f}",
+            )
+            for row in rows
+        ),
+    ]

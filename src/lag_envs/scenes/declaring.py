@@ -1,0 +1,108 @@
+"""How a scene's class is made: attributes that cannot be changed, fields, a frozen dataclass."""
+
+from __future__ import annotations
+
+import copyreg
+import dataclasses
+import inspect
+import sys
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from lag_envs.mechanics import recording
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.mechanics.layout import units
+
+#: Class attributes that are mappings, and those that are names in order.
+MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "ratios")
+SEQUENCES = ("state", "left_out")
+
+#: What a scene may define; all other public names of `Scene` are its calls.
+DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
+
+
+# A class that goes to another process by value before it is used takes its fields along, and in them this
+# mark, which is known by its identity: as a copy it would be taken for a default.
+copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
+
+
+def own_annotations(cls: type) -> dict[str, Any]:
+    """Return the class's own annotations; from Python 3.14 on they may name what is not there yet."""
+    if sys.version_info >= (3, 14):
+        import annotationlib
+
+        return dict(annotationlib.get_annotations(cls, format=annotationlib.Format.FORWARDREF))
+    return dict(inspect.get_annotations(cls))
+
+
+def _frozen(given: Mapping) -> Mapping:
+    """Return a copy of a mapping, and of those in it, that cannot be changed."""
+    items = {key: _frozen(value) if isinstance(value, Mapping) else value for key, value in given.items()}
+    return MappingProxyType(items)
+
+
+def complete(cls: type) -> None:
+    """Make the class a frozen dataclass, unless a decorator has."""
+    if cls.__base__ is object:
+        raise FormulaError(
+            "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
+        )
+    if "__dataclass_fields__" not in vars(cls):
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
+def declare(cls: Any, meta: type[type]) -> None:
+    """Prepare a new class of scenes: its mappings are copied, and what is wrong with its names is noted.
+
+    Parameters
+    ----------
+    cls : type
+        The class.
+    meta : type
+        The type of scenes; parents of this type are made dataclasses first.
+    """
+    for parent in cls.__mro__[1:]:
+        if isinstance(parent, meta) and parent.__base__ is not object:
+            complete(parent)
+    own, annotations = vars(cls), own_annotations(cls)
+    faults = []
+    for name in (*MAPPINGS, *SEQUENCES):
+        kind = str(annotations.get(name, "ClassVar")).removeprefix("typing.")
+        if kind.startswith("ClassVar"):
+            continue
+        # A dataclass would take it for a field; what is wrong is said when the class is used.
+        if isinstance(own.get(name), dataclasses.Field):
+            faults.append(f"{name} is part of every scene; give the parameter another name")
+            delattr(cls, name)
+        else:
+            faults.append(f"{name} has an annotation; write {name} = ... without one")
+        del annotations[name]
+    if isinstance(own.get("modes"), Mapping) and own["modes"] and "control" not in annotations:
+        annotations["control"] = "str"
+        if "control" not in own:
+            cls.control = next(iter(own["modes"]))
+    if annotations != own_annotations(cls):
+        cls.__annotations__ = annotations
+    for name in MAPPINGS:
+        if isinstance(own.get(name), Mapping):
+            setattr(cls, name, _frozen(own[name]))
+    for name in SEQUENCES:
+        if isinstance(own.get(name), list):
+            setattr(cls, name, tuple(own[name]))
+    cls._faults = tuple(faults)
+
+
+def controls_of(scene: Any, modes: Any, controls: Any) -> tuple[Any, tuple[str, ...]]:
+    """Return the mode's controls, and the names of all modes' controls."""
+    of = type(scene).__name__
+    if not isinstance(modes, Mapping):
+        raise FormulaError(f"{of}.modes must map names to controls, got {modes!r:.80}")
+    if not modes:
+        return controls, ()
+    if controls:
+        raise FormulaError(f"{of} has controls and modes; put the controls into the modes")
+    every: dict[str, str] = {}
+    for mode, given in modes.items():
+        every |= units(f"{of}.modes[{mode!r}]", given)
+    return modes[scene.control], tuple(every)

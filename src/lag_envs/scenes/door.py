@@ -1,0 +1,155 @@
+"""What is checked when a scene's class is used: its names, its formulas, and whether they move."""
+
+from __future__ import annotations
+
+import dataclasses
+import weakref
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lag_envs.mechanics import recording
+from lag_envs.mechanics.algebra import FormulaError, evaluate
+from lag_envs.mechanics.evaluation import Numeric
+from lag_envs.mechanics.layout import Layout, check_name
+from lag_envs.mechanics.motion import Mechanics
+from lag_envs.scenes.checks import shown
+from lag_envs.scenes.declaring import DEFINED, own_annotations
+from lag_envs.scenes.parameters import fill_in
+
+#: What was derived of scenes whose formulas passed the door: by class, and by `Scene._structure`.
+_admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
+    weakref.WeakKeyDictionary()
+)
+
+
+def is_own(kind: type) -> bool:
+    """Tell whether a class is the package's: then nothing but its structure decides what formulas give.
+
+    A formula of somebody else may use what is defined outside, and see it changed.
+    """
+    return kind.__module__.startswith("lag_envs.")
+
+
+def admit(scene: Any, base: type) -> None:
+    """Check a new scene: its parameters and, for the first of its kind, names and formulas.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    base : type
+        The class that all scenes are derived from.
+    """
+    _check_class(type(scene), base)
+    if scene.modes:
+        mode = scene.control
+        if not isinstance(mode, str) or mode not in scene.modes:
+            raise ValueError(f"control must be one of {', '.join(scene.modes)}, got {shown(mode)}")
+    fill_in(scene)
+    scene.check()
+    try:
+        key = scene._structure
+        known = _admitted.setdefault(type(scene), {}).get(key)
+    except TypeError as error:
+        raise FormulaError(f"{type(scene).__name__}: {error}; structural fields must be hashable") from error
+    if known is not None and is_own(type(scene)):
+        vars(scene)["_cached_layout"], vars(scene)["_cached_mechanics"] = known
+    elif known is None:
+        _check_names(scene, base)
+        recording.check_again(scene, scene._layout, recording.record(scene, scene._layout))
+        _check_motion(scene, scene.mechanics)
+        _check_bodies(scene)
+        _admitted[type(scene)][key] = scene._layout, scene.mechanics
+
+
+def _check_class(cls: type, base: type) -> None:
+    """Raise a FormulaError for what can be seen of a class without running its formulas."""
+    of = cls.__name__
+    for c in cls.__mro__[: cls.__mro__.index(base)]:
+        if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
+            raise FormulaError(
+                f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
+                "dissipation and applied, from which these follow (see CHANGELOG.md)"
+            )
+    faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
+    if faults:
+        raise FormulaError(f"{of}.{faults[0]}")
+    if not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
+        raise FormulaError(
+            f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)"
+        )
+
+
+def _check_names(scene: Any, base: type) -> None:
+    """Raise a FormulaError where a name is taken."""
+    cls, of = type(scene), type(scene).__name__
+    public = {name for name in dir(base) if not name.startswith("_")}
+    for c in cls.__mro__[: cls.__mro__.index(base)]:
+        for name in (*own_annotations(c), *vars(c)):
+            if name in public and name not in DEFINED:
+                raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
+    layout = scene._layout
+    derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
+    taken = {
+        **dict.fromkeys(DEFINED, "part of every scene"),
+        **dict.fromkeys((e.name for e in layout.state), "an entry of the state"),
+        **dict.fromkeys(derived, "a coordinate or its derivative"),
+        **dict.fromkeys((*layout.controls, *layout.absent), "a control"),
+    }
+    for field in dataclasses.fields(scene):
+        check_name(of, field.name)
+        if field.name in taken:
+            raise FormulaError(
+                f"{of}: the field {field.name!r} has the name of {taken[field.name]}; choose another"
+            )
+    others = set(layout.controls) - {p.control for p in layout.prescribed}
+    for name in sorted(others & {e.name for e in layout.state}):
+        raise FormulaError(
+            f"{of}: the control {name!r} has the name of an entry of the state; choose another"
+        )
+
+
+def _check_bodies(scene: Any) -> None:
+    """Raise a FormulaError where a body has no place, or a force no equation."""
+    of, found = type(scene).__name__, scene.mechanics
+    with recording.formula(scene, "bodies"):
+        bodies = scene.bodies()
+    if not isinstance(bodies, Mapping):
+        raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
+    for body in bodies:
+        if body not in found.record.poses:
+            raise FormulaError(
+                f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
+            )
+    try:
+        found.full  # noqa: B018
+    except FormulaError as error:
+        raise FormulaError(f"{of}.{error}") from error
+
+
+def _check_motion(scene: Any, found: Mechanics) -> None:
+    """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
+    n = len(found.free)
+    values = {recording.parameter(name): np.float64(getattr(scene, name)) for name in scene._numbers()}
+    generator = np.random.default_rng(11)
+    symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
+    seen = []
+    with np.errstate(all="ignore"):
+        for low, high in ((0.1, 1.5), (-3.0, 3.0), (0.01, 0.1), (1.0, 10.0)) * 4:
+            at = values | {symbol: generator.uniform(low, high) for symbol in symbols}
+            matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
+            if not np.isfinite(matrix).all():
+                continue
+            size = np.sqrt(np.abs(np.diag(matrix)))
+            if not (size > 0.0).all():
+                seen.append(0.0)
+                continue
+            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]))
+    if seen and max(seen) < 1e-13:
+        what = "singular" if max(seen) > -1e-13 else "not positive"
+        raise FormulaError(
+            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; "
+            "every motion of the free coordinates needs a positive kinetic energy"
+        )

@@ -1,0 +1,91 @@
+"""How a scene declares its parameters, and the check of each one's range."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+from lag_envs.scenes.checks import SMALLEST, check_number
+
+
+def parameter(
+    default: float | Callable[[Any], float | None] | None,
+    unit: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    usable: tuple[float, float] = (-math.inf, math.inf),
+    optional: bool = False,
+    endless: bool = False,
+) -> Any:
+    """Declare a physical parameter.
+
+    Parameters
+    ----------
+    default : float, None, or function of the scene
+        Its value unless another is given. A function takes it from the other parameters:
+        ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
+    unit : str
+        Its unit, for tables and errors.
+    above, least, below, most : float, optional
+        The range that it must lie in: above, at least, below, at most.
+    usable : (float, float)
+        The range in which an environment can be used, whatever its other parameters, see `Task.usable`; a
+        scene alone may be stepped beyond it.
+    optional : bool
+        Whether None may be given; a default of None says so too.
+    endless : bool
+        Whether infinity may be given.
+    """
+    made = callable(default)
+    return dataclasses.field(
+        default=None if made else default,
+        metadata={
+            "unit": unit,
+            "above": above,
+            "least": least,
+            "below": below,
+            "most": most,
+            "made": default if made else None,
+            "optional": optional or (default is None),
+            "endless": endless,
+            "usable": usable,
+        },
+    )
+
+
+def fill_in(scene: Any) -> None:
+    """Check the parameters of a new scene, each in its range, and make those that follow from others."""
+    fields = {f.name: f for f in dataclasses.fields(scene) if "unit" in f.metadata}
+    made = [f for f in fields.values() if f.metadata["made"] and getattr(scene, f.name) is None]
+    for field in (*(f for f in fields.values() if f not in made), *made):
+        value = getattr(scene, field.name)
+        if field in made:  # where it is out of range, those that it is made from are
+            value = field.metadata["made"](scene)
+            value = None if value is None else check_number(field.name, value)
+        elif value is not None or not field.metadata["optional"]:
+            value = _check_range(field, value)
+        object.__setattr__(scene, field.name, value)
+
+
+def _check_range(field: dataclasses.Field, value: Any) -> float:
+    unit = field.metadata["unit"]
+    number = check_number(field.name, value, unit, endless=field.metadata["endless"])
+    above, least, below, most = (field.metadata[key] for key in ("above", "least", "below", "most"))
+    for rule, limit, broken in (
+        ("above", above, above is not None and not number > above),
+        ("at least", least, least is not None and not number >= least),
+        ("below", below, below is not None and not number < below),
+        ("at most", most, most is not None and not number <= most),
+        ("at least", SMALLEST, above == 0.0 and number < SMALLEST),
+        ("at most", 1.0 / SMALLEST, math.isfinite(number) and number > 1.0 / SMALLEST),
+    ):
+        if broken:
+            raise ValueError(
+                f"{field.name} must be {rule} {limit:g} {unit}, got {number:g} {unit}".replace("  ", " ")
+            )
+    return number
