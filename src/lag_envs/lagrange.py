@@ -62,13 +62,26 @@ def motion(scene: Scene) -> tuple[Values, Values, Values]:
     )
 
 
-def lagrangian(scene: Scene) -> sympy.Expr:
+def decimal(expression: Any) -> sympy.Expr:
+    """Return an expression with rational numbers in place of floats: 1/10 for 0.1."""
+    return sympy.nsimplify(sympy.sympify(expression), rational=True)
+
+
+def binary(expression: Any) -> sympy.Expr:
+    """Return an expression with the rational numbers that its floats are, to the last bit."""
+    expression = sympy.sympify(expression)
+    return expression.xreplace({number: sympy.Rational(number) for number in expression.atoms(sympy.Float)})
+
+
+def lagrangian(scene: Scene, rational: Callable[[Any], sympy.Expr] = decimal) -> sympy.Expr:
     """Return T - V of the scene with symbols for its parameters."""
     copy, (q, v, _) = symbolic(scene), motion(scene)
-    return sympy.nsimplify(copy.kinetic(q, v, Symbolic) - copy.potential(q, Symbolic), rational=True)
+    return rational(copy.kinetic(q, v, Symbolic) - copy.potential(q, Symbolic))
 
 
-def euler_lagrange(scene: Scene, coordinate: str) -> sympy.Expr:
+def euler_lagrange(
+    scene: Scene, coordinate: str, rational: Callable[[Any], sympy.Expr] = decimal
+) -> sympy.Expr:
     """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that moves it.
 
     Parameters
@@ -77,11 +90,13 @@ def euler_lagrange(scene: Scene, coordinate: str) -> sympy.Expr:
         The scene; its numbers do not matter.
     coordinate : str
         A coordinate that is free or moves.
+    rational : callable, default `decimal`
+        What makes rational numbers of the formulas' floats; `binary` takes them as they are.
     """
     copy, (q, v, u) = symbolic(scene), motion(scene)
-    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene)
-    loss = sympy.nsimplify(sympy.sympify(copy.dissipation(q, v, u, Symbolic)), rational=True)
-    force = sympy.nsimplify(sympy.sympify(copy.applied(q, v, u, Symbolic).get(coordinate, 0)), rational=True)
+    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene, rational)
+    loss = rational(copy.dissipation(q, v, u, Symbolic))
+    force = rational(copy.applied(q, v, u, Symbolic).get(coordinate, 0))
     return energy.diff(rate).diff(t) - energy.diff(of) + loss.diff(rate) - force
 
 

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.exact import ends
 from lag_envs.report.linkages import ENGINES, SYSTEMS, System, differences
 from lag_envs.report.motions import Array, Certified, SceneProblems
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row, describe
 from lag_envs.report.timing import Sample, interleaved

@@ -22,10 +22,11 @@ from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
 from lag_envs.report import general
 from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.exact import Unresolved, ends
 from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.scenes.base import Scene, StepRefused

@@ -172,7 +172,7 @@ def judge(case: Case, dt: float, ends: dict[str, Any]) -> Row:
     """Return the largest error of each end relative to the scales; where there is none, why."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)
-    except ArithmeticError as error:  # such as reference.Unresolved
+    except ArithmeticError as error:  # such as oracle.Unresolved
         kept = {key: end if isinstance(end, str) else NO_REFERENCE for key, end in ends.items()}
         return {"errors": kept, "problem": describe(error)}
     sizes = scales(case, dt)
