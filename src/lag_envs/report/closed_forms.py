@@ -69,13 +69,12 @@ def elliptic(alpha: mpf, beta: mpf, theta: mpf, rate: mpf, dt: mpf) -> tuple[mpf
 
 
 def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, sympy.Rational] | None:
-    """Return (alpha, beta) where a scene's motion is that of `elliptic` and nothing else, or None."""
+    """Return (alpha, beta) where the one free coordinate moves as in `elliptic`, or None."""
     names, equations = oracle.names, oracle.equations
-    if len(names.free) != 1 or names.state != [(names.free[0], "place"), (names.free[0], "velocity")]:
+    if len(names.free) != 1 or any(kind == "momentum" for _, kind in names.state):
         return None
-    q, v = equations.q[names.free[0]], equations.v[names.free[0]]
-    given: dict[Any, Any] = {symbol: 0 for symbol in equations.inputs if symbol not in (q, v)}
-    given |= dict(zip(equations.u.values(), map(sympy.Rational, map(float, controls)), strict=True))
+    q = equations.q[names.free[0]]
+    given = dict(zip(equations.u.values(), map(sympy.Rational, map(float, controls)), strict=True))
     mass, force = (
         reduced(oracle.exactly(e).xreplace(given)) for e in (equations.mass[0], equations.force[0])
     )
@@ -85,3 +84,17 @@ def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, s
     rest = sympy.expand(force / mass + alpha * sympy.sin(q) + beta * sympy.cos(q))
     turns = alpha.is_Rational and beta.is_Rational and rest == 0 and (alpha, beta) != (0, 0)
     return (alpha, beta) if turns else None
+
+
+def flow(
+    oracle: Oracle, coefficients: Sequence[Any], state: Sequence, controls: Sequence, dt: Any, digits: int
+) -> list[mpf]:
+    """Return the state after a time dt where `pendulum` has found these coefficients."""
+    with mp.workdps(digits + 40):
+        t = mpf(dt)
+        q, v = oracle.start([mpf(x) for x in state], [mpf(u) for u in controls], mpf)
+        for name, (_, _, push) in oracle.driven(q, v, [mpf(u) for u in controls], mpf(0)).items():
+            q[name], v[name] = q[name] + t * (v[name] + t * push / 2), v[name] + t * push
+        (free,), (alpha, beta) = oracle.names.free, (mpf(int(x.p)) / int(x.q) for x in coefficients)
+        q[free], v[free] = elliptic(alpha, beta, q[free], v[free], t)
+        return [(q if kind == "place" else v)[name] for name, kind in oracle.names.state]

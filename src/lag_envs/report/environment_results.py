@@ -71,9 +71,9 @@ def _text() -> list[str]:
         "the environment's own random numbers, without rounding.",
         "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
         "cut speeds: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 wraps "
-        "are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its actions are; "
-        "that counts as its error. CartPole-v1 falls within a second under random actions, so its update is "
-        "also carried on past that end, to 10 s.",
+        "are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its actions "
+        "are; that counts as its error. CartPole-v1 falls within a second under random actions, so its "
+        "update is also carried on past that end, to 10 s.",
         "An error is the largest over the entries of the state and over the time until then, each entry "
         "relative to the largest that it gets in the episode, at least 1 in SI units. No method that starts "
         "from float64 numbers can do better than about one rounding of the start, amplified by the system. "

@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from operator import mul
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import flint
@@ -41,6 +41,8 @@ MOST_STEPS = 20_000
 DOUBLINGS = 2
 #: Damping times what is left of the time: above it collocation is tried.
 STIFF = 300.0
+#: After so many series, and half as many more each time; the layer takes about as many.
+FIRST_TRY = 16
 
 
 class Unresolved(ArithmeticError):
@@ -446,6 +448,8 @@ class Oracle:
     ----------
     scene : Scene
         Its parameters are taken as the exact numbers that they are.
+    numbers : mapping, optional
+        Other numbers for some of them, which SymPy takes as exact too.
 
     Examples
     --------
@@ -455,10 +459,10 @@ class Oracle:
     [3.5, 3.0]
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, numbers: Mapping[str, Any] = MappingProxyType({})) -> None:
         self.equations = equations_of(scene)
         self.names = self.equations.names
-        values = {name: getattr(scene, name) for name in scene._numbers()}
+        values = {name: getattr(scene, name) for name in scene._numbers()} | dict(numbers)
         symbols = {symbol for e in (*self.equations.mass, *self.equations.force) for symbol in e.free_symbols}
         symbols |= {symbol for e in self.equations.coupling for symbol in e.free_symbols}
         self._values = {s: sympy.Rational(values[s.name]) for s in symbols if s.name in values}
@@ -577,11 +581,11 @@ class Oracle:
         u, left = [_ball(x) for x in listed(controls)], _ball(dt)
         q, v = self.start([_ball(x) for x in state], u, flint.arb)
         v = self._shifted(plan, q, v, u, -1)
-        h = left
+        h, again = left, FIRST_TRY
         for step in range(MOST_STEPS):
-            if step >= 8 and step & (step - 1) == 0 and self._damping(q, v, u) * float(left) > STIFF:
-                slow = self._slow(plan, q, v, u, left)
-                if slow is not None:
+            if step == again:
+                again += again // 2
+                if self._damping(q, v, u) * float(left) > STIFF and (slow := self._slow(plan, q, v, u, left)):
                     q, v = slow
                     break
             q, v, part = self._series(plan, q, v, u, h)
@@ -602,11 +606,11 @@ class Oracle:
         more = self.shift(q, v, u, BALLS, plan.bits)
         return v | {name: v[name] + sign * x for name, x in zip(self.names.free, more, strict=True)}
 
-    def _driven(self, q: dict, v: dict, u: Sequence) -> dict[str, list]:
+    def driven(self, q: Mapping, v: Mapping, u: Sequence, zero: Any) -> dict[str, list]:
         """Return for each coordinate that moves from outside its place, rate and acceleration."""
         held = dict(zip(self.names.controls, u, strict=True))
         return {
-            name: [q[name], v[name], held[control] if level == "acceleration" else flint.arb(0)]
+            name: [q[name], v[name], held[control] if level == "acceleration" else zero]
             for name, (control, level) in self.names.moved.items()
         }
 
@@ -648,7 +652,7 @@ class Oracle:
         mass, force = [series.found[i * n : (i + 1) * n] for i in range(n)], series.found[n * n :][:n]
         driven = {
             name: ([h * rate, h * h * push / 2], [h * push])
-            for name, (_, rate, push) in self._driven(q, v, u).items()
+            for name, (_, rate, push) in self.driven(q, v, u, flint.arb(0)).items()
         }
         a: list[list] = [[] for _ in free]
         for k in itertools.count():
@@ -706,7 +710,7 @@ class Oracle:
 
     def _slow(self, plan: Plan, q: dict, v: dict, u: Sequence, left: Any) -> tuple[dict, dict] | None:
         """Return places and velocities after the time that is left, or None if they are not smooth."""
-        h, shortest = left, left / 16
+        h, shortest = left, left / 8
         while True:
             found = self._collocated(plan, q, v, u, h)
             if found is None:
@@ -725,46 +729,48 @@ class Oracle:
         free, n, arb_mat = self.names.free, len(self.names.free), flint.arb_mat
         formulas, nodes = self.equations.residuals, _nodes(plan.digits, plan.bits)
         constants, count = self._constants(formulas, plan.bits), len(nodes.x)
-        driven = self._driven(q, v, u)
+        driven = self.driven(q, v, u, flint.arb(0))
         once, twice = (h * nodes.once).mid(), (h * h * nodes.twice).mid()
         a = arb_mat(count, n)
         limits = [plan.small(v[name]) for name in free]
+        rows = list(zip(nodes.x, once.tolist(), twice.tolist(), strict=True))
         for _ in range(20):
-            along, about = once * a, twice * a
-            left: list[Any] = []
-            matrix = arb_mat(count * n, count * n)
-            places: list[tuple[dict, dict]] = []
-            for i, x in enumerate(nodes.x):
+            along, about = (once * a).tolist(), (twice * a).tolist()
+            left: list[list] = []
+            matrix: list[list] = []
+            for i, (x, once_row, twice_row) in enumerate(rows):
                 t = h * x
-                q_now = {name: q[name] + t * v[name] + about[i, c] for c, name in enumerate(free)}
-                v_now = {name: v[name] + along[i, c] for c, name in enumerate(free)}
+                q_now = {name: q[name] + t * v[name] + about[i][c] for c, name in enumerate(free)}
+                v_now = {name: v[name] + along[i][c] for c, name in enumerate(free)}
                 for name, (place, rate, push) in driven.items():
                     q_now[name], v_now[name] = place + t * (rate + t * push / 2), rate + t * push
-                places.append((q_now, v_now))
+                if i == 0:
+                    end = q_now, v_now
                 given = [*(q_now[m] for m in self.equations.q), *(v_now[m] for m in self.equations.v)]
                 found = formulas.numbers([*given, *(a[i, c] for c in range(n)), *u], constants, BALLS)
-                left += found[:n]
+                left += [[x.mid()] for x in found[:n]]
                 for c in range(n):
                     by_q, by_v, by_a = (found[n + 3 * n * c + part * n :][:n] for part in range(3))
+                    row = []
                     for d in range(n):
-                        for j in range(count):
-                            matrix[i * n + c, j * n + d] = by_q[d] * twice[i, j] + by_v[d] * once[i, j]
-                        matrix[i * n + c, i * n + d] += by_a[d]
-            right = arb_mat([[x.mid()] for x in left])
-            change = matrix.mid().solve(right, algorithm="approx").mid()
-            a = arb_mat([[(a[i, c] - change[i * n + c, 0]).mid() for c in range(n)] for i in range(count)])
-            sizes = [[abs(h * change[i * n + c, 0]) for i in range(count)] for c in range(n)]
-            if all(x < limit for some, limit in zip(sizes, limits, strict=True) for x in some):
+                        row += [by_q[d] * y + by_v[d] * z for y, z in zip(twice_row, once_row, strict=True)]
+                        row[d * count + i] += by_a[d]
+                    matrix.append(row)
+            change = arb_mat(matrix).mid().solve(arb_mat(left), algorithm="approx").tolist()
+            by_node = [[change[c * count + i][0] for c in range(n)] for i in range(count)]
+            a = (a - arb_mat(by_node)).mid()
+            if all(abs(h * x) < limit for row in by_node for x, limit in zip(row, limits, strict=True)):
                 break
         else:
             return None
+        along = once * a
         # Is it smooth? What has a layer in it misses the start, by what has died out long before the end.
         rest, first = nodes.last * along, nodes.first * along
         for c, name in enumerate(free):
             smooth = all(abs(rest[k, c]) < 10 * limits[c] for k in range(rest.nrows()))
             if not (smooth and abs(h * first[0, c]) < 10 * plan.small(q[name])):
                 return None
-        q_end, v_end = ({name: x.mid() for name, x in of.items()} for of in places[0])
+        q_end, v_end = ({name: x.mid() for name, x in of.items()} for of in end)
         return q_end, v_end
 
 

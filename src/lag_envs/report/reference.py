@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Sequence
 from functools import lru_cache
@@ -15,19 +16,29 @@ from mpmath import mp, mpf
 from numpy.typing import NDArray
 
 from lag_envs.report import closed_forms
-from lag_envs.report.oracle import agreed, listed, oracle_of
+from lag_envs.report.oracle import Oracle, agreed, listed, oracle_of
 from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 #: Folder in which the exact ends are kept; None keeps nothing.
 store: Path | None = None
 #: An undamped pendulum that turns or swings through so many radians, about, ends by elliptic functions.
-FAR = 50.0
+FAR = 5.0
 
 
 @lru_cache(maxsize=256)
-def _pendulum(scene: Scene, controls: tuple[float, ...]) -> tuple[Any, Any] | None:
-    return closed_forms.pendulum(oracle_of(scene), controls)
+def _pendulum(oracle: Oracle, controls: tuple[float, ...]) -> tuple[Any, Any] | None:
+    return closed_forms.pendulum(oracle, controls)
+
+
+def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: int) -> list[mpf]:
+    """Return the state after a time dt, as one computation with so many digits gives it."""
+    held = listed(controls)
+    if known := _pendulum(oracle, tuple(map(float, held))):
+        (_, speed), (alpha, beta) = oracle.start(state, held, float), known
+        if float(dt) * (abs(speed[oracle.names.free[0]]) + math.hypot(alpha, beta) ** 0.5) > FAR:
+            return closed_forms.flow(oracle, known, state, held, dt, digits)
+    return oracle.once(state, held, dt, digits)
 
 
 def flow(scene: Scene, state: Sequence[Any], controls: Any, dt: Any, digits: int = 30) -> list[mpf]:
@@ -35,17 +46,8 @@ def flow(scene: Scene, state: Sequence[Any], controls: Any, dt: Any, digits: int
 
     By the oracle, see `Oracle.flow`; undamped pendulums that go far are by their closed form.
     """
-    if len(state) == 2 and (known := _pendulum(scene, tuple(map(float, listed(controls))))):
-        alpha, beta = (mpf(int(x.p)) / int(x.q) for x in known)
-        if dt * (abs(state[1]) + mp.sqrt(mp.hypot(alpha, beta))) > FAR:
-            return agreed(lambda working: _elliptic(known, state, dt, working), digits)
-    return oracle_of(scene).flow(state, controls, dt, digits)
-
-
-def _elliptic(known: Sequence[Any], state: Sequence[Any], dt: Any, digits: int) -> list[mpf]:
-    with mp.workdps(digits + 40):
-        alpha, beta = (mpf(int(x.p)) / int(x.q) for x in known)
-        return list(closed_forms.elliptic(alpha, beta, *map(mpf, state), mpf(dt)))
+    oracle = oracle_of(scene)
+    return agreed(lambda working: once(oracle, state, controls, dt, working), digits)
 
 
 def remembered(scene: Scene, state: Sequence[float], controls: Any, dt: float) -> list[mpf]:
