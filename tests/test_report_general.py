@@ -5,16 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from series_systems import SYSTEMS as TYPED
-from series_systems import acceleration
-from test_series import FLOATS
 
 from lag_envs.report import general
-from lag_envs.report.exact import Motion, Unresolved, ends, motion_of
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
 from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
+from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled
 from lag_envs.scenes import Scene, parameter
 
@@ -62,19 +60,6 @@ def worst(rival, name, together=False):
 # --- the reference ---
 
 
-@pytest.mark.parametrize("system", TYPED, ids=lambda system: system.name)
-def test_sympy_gives_the_equations_that_were_typed_in(system):
-    generator = np.random.default_rng(5)
-    motion = Motion(system.scene)
-    first = 2 * system.driven
-    for _ in range(10):
-        state, control = system.draw(generator)
-        q, v = state[first::2], state[first + 1 :: 2]
-        typed = acceleration(system, q, v, control, state[0], control[0] if system.driven else None, FLOATS)
-        found = motion.at(state, control)[1]
-        np.testing.assert_allclose(found, typed, rtol=1e-11, atol=1e-11 * np.abs(typed).max())
-
-
 @pytest.mark.parametrize("control", ["rate", "place", "acceleration"])
 def test_what_moves_a_support(control):
     """The exact end, and the steppers' equation, whether acceleration, rate or place is held."""
@@ -91,20 +76,6 @@ def test_what_moves_a_support(control):
         assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
 
 
-def test_a_motion_into_a_singular_point_is_unresolved():
-    class Fall(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
-        def potential(self, q, xp):
-            return -xp.log(q.x)
-
-    with pytest.raises(Unresolved):
-        motion_of(Fall()).end([1e-3, -10.0], [], 0.01)
-
-
 # --- the rivals ---
 
 
@@ -112,11 +83,11 @@ def test_a_motion_into_a_singular_point_is_unresolved():
 def test_equations_of_the_rivals_are_those_of_sympy(name):
     system = SYSTEMS[name]
     starts, controls = system.draw(20, seed=7)
-    problems, motion = SceneProblems(system.scene, starts, controls), motion_of(system.scene)
+    problems, oracle = SceneProblems(system.scene, starts, controls), oracle_of(system.scene)
     rates = SceneEquation(system.scene).rate(0.0, problems.y, problems.p, np)
     n = problems.equation.size // 2
     for j in range(20):
-        exact = motion.at(starts[j].tolist(), controls[j].tolist())[1]
+        exact = oracle.at(starts[j].tolist(), controls[j].tolist())[1]
         np.testing.assert_allclose(
             [r[j] for r in rates[n:]], exact, rtol=1e-10, atol=1e-11 * np.abs(exact).max()
         )

@@ -22,15 +22,32 @@ from lag_envs.scenes.base import Scene, parameter
 t = sympy.Symbol("t", real=True)
 
 
-class Symbolic:
-    """The namespace ``xp`` of a formula on SymPy's expressions."""
+_FUNCTIONS = {
+    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
+}
 
-    pi = sympy.pi
-    sin, cos, tan, exp, log, sqrt, tanh = (
-        staticmethod(f)
-        for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.sqrt, sympy.tanh)
-    )
-    atan = arctan = staticmethod(sympy.atan)
+
+def decimal(expression: Any) -> sympy.Expr:
+    """Return an expression with rational numbers in place of floats: 1/10 for 0.1."""
+    return sympy.nsimplify(sympy.sympify(expression), rational=True)
+
+
+def binary(expression: Any) -> sympy.Expr:
+    """Return an expression with the rational numbers that its floats are, to the last bit."""
+    expression = sympy.sympify(expression)
+    return expression.xreplace({number: sympy.Rational(number) for number in expression.atoms(sympy.Float)})
+
+
+def _functions(of: Callable[[Any], Any], rational: Callable[[Any], sympy.Expr]) -> types.SimpleNamespace:
+    """Return the namespace of a formula on SymPy's expressions; functions are taken of what `of` returns."""
+    named = {name: (lambda x, f=f: f(of(x))) for f, name in _FUNCTIONS.items()}
+    named |= {"sqrt": lambda x: sympy.sqrt(of(x)), "arctan": named["atan"]}
+    return types.SimpleNamespace(pi=sympy.pi, rational=rational, **named)
+
+
+#: The namespace ``xp`` of a formula on SymPy's expressions, which people read; and one where a float is the
+#: number that it is, and no function is taken of one.
+Symbolic, Exact = _functions(lambda x: x, decimal), _functions(binary, binary)
 
 
 # --- a scene as expressions --------------------------------------------------------------------------------
@@ -62,26 +79,13 @@ def motion(scene: Scene) -> tuple[Values, Values, Values]:
     )
 
 
-def decimal(expression: Any) -> sympy.Expr:
-    """Return an expression with rational numbers in place of floats: 1/10 for 0.1."""
-    return sympy.nsimplify(sympy.sympify(expression), rational=True)
-
-
-def binary(expression: Any) -> sympy.Expr:
-    """Return an expression with the rational numbers that its floats are, to the last bit."""
-    expression = sympy.sympify(expression)
-    return expression.xreplace({number: sympy.Rational(number) for number in expression.atoms(sympy.Float)})
-
-
-def lagrangian(scene: Scene, rational: Callable[[Any], sympy.Expr] = decimal) -> sympy.Expr:
+def lagrangian(scene: Scene, xp: Any = Symbolic) -> sympy.Expr:
     """Return T - V of the scene with symbols for its parameters."""
     copy, (q, v, _) = symbolic(scene), motion(scene)
-    return rational(copy.kinetic(q, v, Symbolic) - copy.potential(q, Symbolic))
+    return xp.rational(copy.kinetic(q, v, xp) - copy.potential(q, xp))
 
 
-def euler_lagrange(
-    scene: Scene, coordinate: str, rational: Callable[[Any], sympy.Expr] = decimal
-) -> sympy.Expr:
+def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.Expr:
     """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that moves it.
 
     Parameters
@@ -90,13 +94,13 @@ def euler_lagrange(
         The scene; its numbers do not matter.
     coordinate : str
         A coordinate that is free or moves.
-    rational : callable, default `decimal`
-        What makes rational numbers of the formulas' floats; `binary` takes them as they are.
+    xp : namespace, default `Symbolic`
+        Functions of SymPy's expressions; with `Exact` the formulas' floats are taken to the last bit.
     """
     copy, (q, v, u) = symbolic(scene), motion(scene)
-    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene, rational)
-    loss = rational(copy.dissipation(q, v, u, Symbolic))
-    force = rational(copy.applied(q, v, u, Symbolic).get(coordinate, 0))
+    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene, xp)
+    loss = xp.rational(copy.dissipation(q, v, u, xp))
+    force = xp.rational(copy.applied(q, v, u, xp).get(coordinate, 0))
     return energy.diff(rate).diff(t) - energy.diff(of) + loss.diff(rate) - force
 
 
@@ -209,11 +213,6 @@ def _name(symbol: Any) -> str:
     if isinstance(symbol, sympy.Symbol):
         return symbol.name
     raise FormulaError(f"{symbol!r} is no SymPy symbol or function of time; it cannot be a name")
-
-
-_FUNCTIONS = {
-    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
-}
 
 
 def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:

@@ -83,7 +83,7 @@ class Driven(Scene):
         return {"theta": self.delta + v.turn}
 
 
-def _driven(drive: Drive) -> tuple[Scene, list[float]]:
+def driven(drive: Drive) -> tuple[Scene, list[float]]:
     """Return the scene of a drive, and its control."""
     alpha, beta, gamma, delta, ramp = map(float, drive)
     return Driven(alpha=alpha, beta=beta, gamma=gamma, delta=delta), [ramp]
@@ -96,7 +96,7 @@ def truncation(
 
     It is the sum of the oracle's coefficients beyond the order, of which `MORE` are taken.
     """
-    scene, control = _driven(drive)
+    scene, control = driven(drive)
     state = [0.0, 0.0, theta, omega]
     found = oracle_of(scene).coefficients(state, control, h, order + 2 + MORE, digits)
     with mp.workdps(digits):
@@ -155,7 +155,7 @@ def cost(n: int, seed: int) -> Iterator[Row]:
         h = step_at(omega, drive, float(0.1 * 40.0 ** rng.uniform()))
         while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
             h /= 2.0
-        scene, control = _driven(drive)
+        scene, control = driven(drive)
         exact = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
         field = math.sqrt(math.hypot(drive.alpha, drive.beta))
         limits = (

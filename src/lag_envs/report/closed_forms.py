@@ -15,8 +15,8 @@ from mpmath import mp, mpf
 from lag_envs.report.oracle import Oracle, reduced
 
 
-def linear(gamma: mpf, delta: mpf, x: mpf, v: mpf, dt: mpf) -> tuple[mpf, mpf]:
-    """Return (x, v) after dt under x'' = delta - gamma x'.
+def linear(gamma: mpf, delta: mpf, slope: mpf, x: mpf, v: mpf, dt: mpf) -> tuple[mpf, mpf]:
+    """Return (x, v) after dt under x'' = -gamma x' + delta + slope t.
 
     Written with phi_k(-z) = sum_j (-z)^j / (j + k)! = 1F1(1; k + 1; -z) / k!, which has no singular case at
     z = gamma dt = 0.
@@ -26,7 +26,10 @@ def linear(gamma: mpf, delta: mpf, x: mpf, v: mpf, dt: mpf) -> tuple[mpf, mpf]:
         return mp.hyp1f1(1, k + 1, -gamma * dt) / mp.factorial(k)
 
     lag = delta - gamma * v
-    return x + v * dt + lag * dt**2 * phi(2), v + lag * dt * phi(1)
+    return (
+        x + v * dt + lag * dt**2 * phi(2) + slope * dt**3 * phi(3),
+        v + lag * dt * phi(1) + slope * dt**2 * phi(2),
+    )
 
 
 def elliptic(alpha: mpf, beta: mpf, theta: mpf, rate: mpf, dt: mpf) -> tuple[mpf, mpf]:

@@ -116,7 +116,7 @@ class SceneProblems(Problems):
         layout = scene._layout
         zero = np.zeros(len(starts))
         held = dict(zip(layout.controls, controls.T, strict=True))
-        self._q, self._v = oracle_of(scene).start(starts.T, controls.T, lambda x: zero + x)
+        self._q, self._v = oracle_of(scene).start(list(starts.T), list(controls.T), lambda x: zero + x)
         self._shift(-1.0)
         free, moving = layout.free, [m.name for m in layout.at("acceleration", "rate")]
         self.y = np.array([*(self._q[name] for name in free), *(self._v[name] for name in free)])

@@ -36,7 +36,7 @@ from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
 #: Series of one motion at most, before it counts as unresolved.
-MOST_STEPS = 20_000
+MOST_STEPS = 5_000
 #: Digits are doubled so often.
 DOUBLINGS = 2
 #: Damping times what is left of the time: above it collocation is tried.
@@ -47,6 +47,10 @@ FIRST_TRY = 16
 
 class Unresolved(ArithmeticError):
     """The oracle cannot vouch for its own result: the motion is singular on the way, or nearly so."""
+
+
+class Singular(Unresolved):
+    """So short are the steps, or so many, that more digits would not help."""
 
 
 # --- formulas -----------------------------------------------------------------------------------------------
@@ -310,7 +314,7 @@ class Equations:
         for name, place in places.items():
             replaced |= {place: self.q[name], place.diff(t): self.v[name], place.diff(t, 2): a[name]}
         found = [
-            lagrange.euler_lagrange(scene, name, lagrange.binary).xreplace(replaced) for name in names.free
+            lagrange.euler_lagrange(scene, name, lagrange.Exact).xreplace(replaced) for name in names.free
         ]
         self.a = [a[name] for name in names.free]
         self.mass = [e.diff(symbol) for e in found for symbol in self.a]
@@ -426,6 +430,8 @@ def agreed(compute: Callable[[int], list[mpf]], digits: int) -> list[mpf]:
     for _ in range(DOUBLINGS + 1):
         try:
             coarse, fine = compute(working), compute(working + 9)
+        except Singular:
+            raise
         except Unresolved as error:
             why = str(error)
         else:
@@ -592,10 +598,12 @@ class Oracle:
             if part == 1 and h is left:
                 break
             done = part * h
+            if done < plan.small(flint.arb(0)) * left:
+                raise Singular(f"steps come to nothing with {left.str(5, radius=False)} s left")
             left = (left - done).mid()
             h = left if left < 2 * done else 2 * done
         else:
-            raise Unresolved(f"{MOST_STEPS} series leave {left.str(5, radius=False)} s")
+            raise Singular(f"{MOST_STEPS} series leave {left.str(5, radius=False)} s")
         v = self._shifted(plan, q, v, u, 1)
         return [(q if kind == "place" else v)[name] for name, kind in self.names.state]
 
@@ -669,8 +677,8 @@ class Oracle:
                 x[name].append(h * w[name][k] / (k + 1))
                 w[name].append(h * value / (k + 1))
             for name, some in driven.items():
-                for of, known in zip((x, w), some, strict=True):
-                    of[name].append(known[k] if k < len(known) else zero)
+                for coefficients, known in zip((x, w), some, strict=True):
+                    coefficients[name].append(known[k] if k < len(known) else zero)
             yield x, w
 
     def _series(self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict, Any]:
