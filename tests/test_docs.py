@@ -18,7 +18,8 @@ from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
 from lag_envs.leaderboard.protocol import REFERENCES
 from lag_envs.report.docs import generated
-from lag_envs.report.environments import LARGEST_STEP, play, random_actions
+from lag_envs.report.environment_results import LARGEST_STEP
+from lag_envs.report.episodes import play, random_actions
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.scores import KNOWN_RETURNS

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from lag_envs.report import bound, extremes, stability
+from lag_envs.report import bound, extremes, reference, stability
 from lag_envs.report.cases import Case, ensemble, scales
+from lag_envs.report.oracle import Unresolved
 from lag_envs.report.runner import Result
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
@@ -45,20 +46,27 @@ def test_bound_is_never_broken():
     assert claim.evidence.startswith("1 of 60")
 
 
-def test_the_formulas_are_run_without_rounding():
-    """The recurrence for floats, constants as 1.0 / 3 included, against the series multiplied out by hand."""
-    alpha, gamma, theta, omega, h = 3.0, 0.7, 0.4, 1.1, 0.125
+def test_what_is_left_out_is_the_sum_of_the_rest():
+    """The exact end less the series multiplied out by hand, and less the recurrence that is compiled."""
+    alpha, gamma, theta, omega, h = 3.0, 0.75, 0.4, 1.1, 0.125
+    drive = Drive(alpha, 0.0, gamma, 0.0, 0.0)
+    scene, control = bound.driven(drive)
+    end = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
     with mp.workdps(60):
-        angle, speed = bound.series(theta, omega, Drive(alpha, 0.0, gamma, 0.0, 0.0), h, 3)
         cos, sin = mp.cos_sin(mpf(theta))
         a, g, w, t = mpf(alpha), mpf(gamma), mpf(omega), mpf(h)
         first = -a * sin - g * w
         second = -a * cos * w - g * first
         third = a * sin * w**2 - a * cos * first - g * second
-        exact = w + first * t + second * t**2 / 2 + third * t**3 / 6
-        assert abs(speed - exact) < mpf(10) ** -55
-        exact = theta + w * t + first * t**2 / 2 + second * t**3 / 6 + third * t**4 / 24
-        assert abs(angle - exact) < mpf(10) ** -55
+        by_hand = [
+            theta + w * t + first * t**2 / 2 + second * t**3 / 6 + third * t**4 / 24,
+            w + first * t + second * t**2 / 2 + third * t**3 / 6,
+        ]
+        for found, kept, exact in zip(bound.truncation(theta, omega, drive, h, 3), by_hand, end, strict=True):
+            assert found == pytest.approx(float(abs(exact - kept)), rel=1e-12)
+    W, _ = pendulum.taylor_coefficients(omega * h, float(cos), float(sin), pendulum.scaled(drive, h), 3)
+    kept = [theta + sum(x / (k + 1) for k, x in enumerate(W)), sum(W) / h]
+    assert kept == pytest.approx([float(x) for x in by_hand], rel=1e-15)
 
 
 def test_bound_is_that_of_the_product():
@@ -213,7 +221,7 @@ def test_formulas_on_arrays_are_the_compiled_ones():
 
 def test_a_cell_without_a_reference_says_so(monkeypatch):
     def unresolved(*args):
-        raise stability.reference.Unresolved("two precisions differ")
+        raise Unresolved("two precisions differ")
 
     monkeypatch.setattr(stability.reference, "remembered", unresolved)
     (row,) = stability.cells("damping", "PivotedBar", 0.02, [1.0])
