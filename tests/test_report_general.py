@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lag_envs.report import general
+from lag_envs.report import general, general_results
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
 from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
 from lag_envs.report.oracle import oracle_of
@@ -48,13 +48,13 @@ def problem(name):
     system = SYSTEMS[name]
     starts, controls = system.draw(COUNT)
     return SceneProblems(system.scene, starts, controls, system), ends(
-        system.scene, starts, controls, general.DT
+        system.scene, starts, controls, general_results.DT
     )
 
 
 def worst(rival, name, together=False):
     problems, truth = problem(name)
-    return general.errors(rival.build(problems, general.DT, 1, together).end(), truth)[0]
+    return general.errors(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
 
 
 # --- the reference ---
@@ -96,7 +96,7 @@ def test_equations_of_the_rivals_are_those_of_sympy(name):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_mujoco_has_the_same_models(name):
     pytest.importorskip("mujoco")
-    assert max(differences(SYSTEMS[name], "mujoco")) < general.EQUAL
+    assert max(differences(SYSTEMS[name], "mujoco")) < general_results.EQUAL
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
     from lag_envs.report import reference
 
     monkeypatch.setattr(reference, "store", reference.store or tmp_path_factory.getbasetemp())
-    assert max(differences(SYSTEMS[name], "pinocchio")) < general.EQUAL
+    assert max(differences(SYSTEMS[name], "pinocchio")) < general_results.EQUAL
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -115,10 +115,12 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 def test_ours_is_what_simulate_does(name, together):
     """What is timed has the bits of `simulate`."""
     problems, _ = problem(name)
-    order = int(problems.scene._order(general.DT))
-    found = Certified(Certified.method_of(order), 1e-14).build(problems, general.DT, 1, together).end()
+    order = int(problems.scene._order(general_results.DT))
+    found = (
+        Certified(Certified.method_of(order), 1e-14).build(problems, general_results.DT, 1, together).end()
+    )
     paths = [
-        problems.scene.simulate(y, u[None], general.DT)[-1]
+        problems.scene.simulate(y, u[None], general_results.DT)[-1]
         for y, u in zip(problems.starts, problems.controls, strict=True)
     ]
     assert np.array_equal(found, paths)
@@ -158,7 +160,7 @@ ROWS = [
 
 
 def test_times_are_compared_at_equal_error_in_one_clock():
-    found = general.best(ROWS)
+    found = general_results.best(ROWS)
     assert found["cart-pole", "single", 1e-3]["lag_envs"].ns == 50.0
     assert found["cart-pole", "single", 1e-6]["lag_envs"].ns == 80.0
     assert found["cart-pole", "single", 1e-6]["heyoka"].ns == 80.0  # its job ran at half the speed
@@ -168,7 +170,7 @@ def test_times_are_compared_at_equal_error_in_one_clock():
 
 def test_a_defeat_is_told_like_a_win():
     rows = [*ROWS, point("compiled", "RK4", 1, 1e-4, 10.0)]
-    content = general.content(rows, [])
+    content = general_results.content(rows, [])
     alone = next(c for c in content.claims if "as ours is, alone" in c.text)
     assert alone.holds is False and "RK4, compiled by 5.00 (cart-pole, 0.001)" in alone.evidence
     assert any(
@@ -187,7 +189,7 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
         )
     )
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
-    assert "Not taken part: heyoka is not installed." in general.content(rows, []).text
+    assert "Not taken part: heyoka is not installed." in general_results.content(rows, []).text
 
 
 def test_certificates_of_a_scene():

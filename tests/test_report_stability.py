@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from lag_envs.report import bound, extremes, reference, stability
+from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
 from lag_envs.report.cases import Case, ensemble, scales
 from lag_envs.report.oracle import Unresolved
 from lag_envs.report.runner import Result
@@ -174,13 +174,13 @@ def test_heavy_damping():
     """At γ dt = 1e4 explicit Euler and RK4 diverge, ours and the exponential stepper do not."""
     (row,) = stability.cells("damping", "PivotedBar", 0.02, [1e4])
     errors = row["errors"]
-    assert errors["explicit Euler"] == errors["RK4, 16"] == stability.DIVERGED
+    assert errors["explicit Euler"] == errors["RK4, 16"] == stability_results.DIVERGED
     assert errors["ours"] < 1e-12
     assert errors["ours"] < errors["ETD4RK"] < 1e-10
-    assert errors["ours, float32"] == stability.TOO_LONG
+    assert errors["ours, float32"] == stability_results.TOO_LONG
 
 
-@pytest.mark.parametrize("name", stability.STARTS)
+@pytest.mark.parametrize("name", stability_maps.STARTS)
 def test_ordinary_cells(name):
     """In float64 ours is exact to rounding; in float32 every method is as exact as float32 can be."""
     rows = list(stability.cells("damping", name, 0.02, [1e-3, 1e-2]))
@@ -225,7 +225,7 @@ def test_a_cell_without_a_reference_says_so(monkeypatch):
 
     monkeypatch.setattr(stability.reference, "remembered", unresolved)
     (row,) = stability.cells("damping", "PivotedBar", 0.02, [1.0])
-    assert set(row["errors"].values()) == {stability.NO_REFERENCE}
+    assert set(row["errors"].values()) == {stability_results.NO_REFERENCE}
     content = stability.content([row], [])
     assert "1 without a reference" in content.claims[0].evidence
     assert "two precisions differ" in content.tables[-1].rows[0][1]
@@ -236,7 +236,7 @@ def test_refused_and_amplified_cells():
     """A fast start is refused; 850,000 substeps in a shell that leaves no room are accurate to rounding."""
     (fast,) = stability.cells("speed", "PivotedBar", 1.0, [1e7])
     (tight,) = stability.cells("arm", "CylinderInCylinder, drag", 1.0, [1e-9])
-    assert fast["errors"]["ours"] == stability.REFUSED
+    assert fast["errors"]["ours"] == stability_results.REFUSED
     assert tight["errors"]["ours"] > 1e-12
     assert tight["roundings"] < extremes.ROUNDINGS
     content = stability.content([fast, tight], [])

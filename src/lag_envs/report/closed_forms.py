@@ -12,7 +12,8 @@ from typing import Any
 import sympy
 from mpmath import mp, mpf
 
-from lag_envs.report.oracle import Oracle, reduced
+from lag_envs.report.formulas import reduced
+from lag_envs.report.oracle import Oracle
 
 
 def linear(gamma: mpf, delta: mpf, slope: mpf, x: mpf, v: mpf, dt: mpf) -> tuple[mpf, mpf]:
