@@ -378,7 +378,7 @@ def _extreme_case(label, scene, kind, draw):
 def _turning(case):
     """Return about how far the case turns, in units of what is worth computing."""
     scene, state, dt = scene_of(case["scene"], case["params"]), case["state"], case["dt"]
-    q, v, c = _moving(scene, state, case["control"])
+    _, v, c = _moving(scene, state, case["control"])
     push = abs(c.delta) + abs(c.ramp) * dt
     limit = 200 if c.gamma or push else 1e5
     return dt * (abs(v) + sqrt(hypot(c.alpha, c.beta)) + push * dt / 2) / limit

@@ -383,6 +383,14 @@ def test_a_power_that_it_does_not_know_is_named():
         Formulas([x ** sympy.Rational(1, 3)], [x], [])
 
 
+def test_a_state_of_another_length_is_refused():
+    oracle = oracle_of(scenes.PivotedBar(track=None))
+    with pytest.raises(ValueError, match="state must have 2 entries, got 4"):
+        oracle.flow([0.0, 0.0, 1.0, 2.0], 0.0, 0.02)
+    with pytest.raises(ValueError, match="controls must have 1 entries, got 2"):
+        oracle.flow([1.0, 2.0], [0.0, 0.0], 0.02)
+
+
 def test_it_shares_no_code_with_what_it_checks():
     """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of ours."""
     import ast

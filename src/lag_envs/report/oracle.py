@@ -374,12 +374,20 @@ class Oracle:
         ------
         Unresolved
             If they do not, even with four times the digits, or where the motion needs too many steps.
+        ValueError
+            For a state or controls of another length than the scene's.
         """
         return agreed(lambda working: self.once(state, controls, dt, working), digits)
 
     def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
         """Return the end as one computation gives it, each of whose steps keeps so many digits."""
         plan = Plan(digits)
+        for what, given, names in (
+            ("state", state, self.names.state),
+            ("controls", listed(controls), self.names.controls),
+        ):
+            if len(given) != len(names):
+                raise ValueError(f"{what} must have {len(names)} entries, got {len(given)}")
         with flint.ctx.workprec(plan.bits):
             try:
                 return [number(x) for x in self._end(plan, state, controls, dt)]
