@@ -1,21 +1,30 @@
-"""The three scenes in high precision, as an oracle that shares no formula of theirs with the package.
+"""Random problems on the three scenes that have flows of their own, and what is asked of a step there.
 
-The equations are those of the lecture, typed in again, from the exact values of the float64 inputs; they
-are solved by `lag_envs.report.reference`, whose methods stepping does not use, twice with different digits,
-orders and step sizes. ``test_reference.py`` holds those methods against each other and closed forms.
+The exact ends are those of the report: the oracle's, of which ``test_oracle.py`` knows why they are right.
 """
 
-from math import inf, pi, sqrt
+from fractions import Fraction
+from math import hypot, inf, pi, sqrt
 
 import numpy as np
 from mpmath import mp, mpf
 
-from lag_envs.report.reference import Pendulum, Unresolved, linear, pendulum
+from lag_envs import scenes
+from lag_envs.report import reference
+from lag_envs.report.oracle import Oracle
+from lag_envs.report.stepped import Stepped
 
 EPS = 2.0**-53
 
 
-# --- scenes ------------------------------------------------------------------------------------
+def scene_of(name, params):
+    """Return the scene; `params` are the keywords of its constructor."""
+    return getattr(scenes, name)(**params)
+
+
+def flow(scene_name, params, state, control, dt, dps=40):
+    """Return the state after one step with the control held, with dps - 10 digits at least."""
+    return reference.flow(scene_of(scene_name, params), state, control, dt, max(25, dps - 10))
 
 
 def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):
@@ -37,134 +46,12 @@ def moving_plane(k, beta, gravity, radius, tilt_rate, state, dt):
     return end[0], end[1], phi + turn * dt
 
 
-def _bar_field(q, u):
-    moment = q["mass"] * q["com_distance"]
-    inertia = moment * q["com_distance"] + q["inertia"]
-    return Pendulum(
-        moment * q["gravity"] / inertia,
-        moment * u / inertia,
-        q["damping"] / inertia,
-        mpf(0),
-        mpf(0),
-    )
-
-
-def _shell_field(q, control, state):
-    arm = q["shell_radius"] - q["radius"]
-    kappa = q["inertia"] / (q["mass"] * q["radius"] ** 2)
-    k = 1 / (1 + kappa)
-    per_drag = k / (q["mass"] * arm**2)
-    alpha = k * q["gravity"] / arm
-    if q["control"] == "damping":
-        return Pendulum(alpha, mpf(0), (q["damping"] + control) * per_drag, mpf(0), mpf(0))
-    beta = q["damping"] * per_drag
-    drive = k * kappa * q["shell_radius"] / arm * control + beta * state[2]
-    return Pendulum(alpha, mpf(0), beta, drive, beta * control)
-
-
-def _bar(q, state, u, dt, digits):
-    *track, theta, rate = state
-    if track:
-        s, v = track
-        track = [s + v * dt + u * dt**2 / 2, v + u * dt]
-    return [*track, *pendulum(_bar_field(q, u), theta, rate, dt, digits)]
-
-
-def _incline(q, state, control, dt, digits):
-    k = 1 / (1 + q["inertia"] / (q["mass"] * q["radius"] ** 2))
-    drag, tilt = q["damping"], q.get("tilt")
-    if q["control"] == "damping":
-        drag = drag + control
-    elif q["control"] == "tilt":
-        tilt = control
-    beta = drag * k / q["mass"]
-    if q["control"] == "tilt_rate":
-        return list(moving_plane(k, beta, q["gravity"], q["radius"], control, state, dt))
-    return list(linear(beta, k * q["gravity"] * mp.sin(tilt), mpf(0), *state, dt))
-
-
-def _shell(q, state, control, dt, digits):
-    theta, rate, *spin = state
-    end = pendulum(_shell_field(q, control, state), theta, rate, dt, digits)
-    return [*end, *(value + control * dt for value in spin)]
-
-
-_SCENES = {"PivotedBar": _bar, "Incline": _incline, "CylinderInCylinder": _shell}
-_CONTROL = {"Incline": "damping", "CylinderInCylinder": "tilt"}
-
-
-def _exact(scene_name, params, state, control, dt):
-    """Return the inputs as exact mpf, inertia and control kind filled in."""
-    control_kind = params.get("control") or _CONTROL.get(scene_name)
-    skip = ("control", "track")
-    q = {k: _number(v) for k, v in params.items() if k not in skip and v is not None}
-    if "inertia" not in q:
-        bar = scene_name == "PivotedBar"
-        q["inertia"] = q["mass"] * (q["com_distance"] ** 2 / 3 if bar else q["radius"] ** 2 / 2)
-    q.setdefault("damping", mpf(0))
-    q.setdefault("gravity", mpf(9.81))
-    if scene_name == "Incline" and control_kind == "damping":
-        q.setdefault("tilt", mpf(0.26))
-    q["control"] = control_kind
-    return q, [_number(x) for x in state], _number(control), _number(dt)
-
-
-def _number(x):
-    return x if isinstance(x, mpf) else mpf(float(x))
-
-
-def _once(scene_name, params, state, control, dt, digits):
-    with mp.workdps(digits + 30):
-        q, state, control, dt = _exact(scene_name, params, state, control, dt)
-        return _SCENES[scene_name](q, state, control, dt, digits)
-
-
-def flow(scene_name, params, state, control, dt, dps=40):
-    """Return the state after one step with the control held, in high precision.
-
-    Parameters
-    ----------
-    scene_name : {'PivotedBar', 'Incline', 'CylinderInCylinder'}
-    params : dict
-        The keywords of the scene's constructor in SI units, the control kind under ``'control'``
-        ('damping', 'tilt', 'tilt_rate'; 'damping', 'tilt'); ``'track'`` is ignored, missing
-        inertia is that of the uniform body. Floats are taken as the exact numbers they are.
-    state : sequence of float
-        (s, s', theta, theta') or (theta, theta'); (x, x') or (x, w, phi); (theta, theta') or
-        (theta, theta', psi').
-    control : float
-        s'' [m/s^2]; c [N s/m], phi [rad] or phi' [rad/s]; c [N m s] or psi'' [rad/s^2].
-    dt : float [s]
-    dps : int
-        Decimal digits aimed at.
-
-    Returns
-    -------
-    list of mpf
-        The state in the same order. Two computations with different digits, orders and steps
-        agree to 10**-max(25, dps - 10) times max(1, abs(entry)).
-
-    Raises
-    ------
-    Unresolved
-        If they do not, even with four times the digits, or if the case needs too many steps.
-
-    Examples
-    --------
-    >>> bar = {"mass": 1.0, "com_distance": 1.0, "inertia": 0.0, "damping": 0.0, "gravity": 0.0}
-    >>> [float(x) for x in flow("PivotedBar", bar, (0, 1, 2, 3), 0.0, 0.5)]
-    [0.5, 1.0, 3.5, 3.0]
-    """
-    target = mpf(10) ** -max(25, dps - 10)
-    digits = dps + 12
-    while digits <= 4 * dps + 12:
-        coarse = _once(scene_name, params, state, control, dt, digits)
-        fine = _once(scene_name, params, state, control, dt, digits + 9)
-        error = max(abs(a - b) / max(1, abs(b)) for a, b in zip(coarse, fine, strict=True))
-        if error <= target:
-            return fine
-        digits = 2 * digits
-    raise Unresolved(f"two precisions differ by {mp.nstr(error, 3)}")
+def _moving(scene, state, control):
+    """Return place and velocity of the free coordinate, and the coefficients of its flow."""
+    stepped = Stepped(scene)
+    y, k = stepped.lift(np.array([float(x) for x in state])), stepped.numbers()
+    q, v = stepped.unpack(y, float(control), k)[:2]
+    return float(q), float(v), stepped.drive(y, float(control), k, np)
 
 
 def scales(scene_name, params, state, control, dt):
@@ -177,32 +64,23 @@ def scales(scene_name, params, state, control, dt):
     -------
     list of float
     """
-    rough = _sizes(scene_name, params, state, control, dt)
-    return [max(1.0, float(x)) for x in rough]
+    return [max(1.0, x) for x in _sizes(scene_name, params, state, control, dt)]
 
 
 def _sizes(scene_name, params, state, control, dt):
-    q, state, control, dt = _exact(scene_name, params, state, control, dt)
+    scene, state, push = scene_of(scene_name, params), [abs(float(x)) for x in state], abs(float(control))
     if scene_name == "Incline":
         x, v, *tilt = state
-        gain = q["gravity"] * dt
-        out = [max(abs(x), abs(v) * dt, gain * dt), max(abs(v), gain)]
-        return out + [max(abs(phi), abs(control) * dt) for phi in tilt]
-    if scene_name == "PivotedBar":
-        *track, theta, rate = state
-        p = _bar_field(q, control)
-        spin = []
-    else:
-        theta, rate, *spin = state
-        p = _shell_field(q, control, state)
-        track = []
-    out = [abs(theta), abs(rate)]
-    out = [max(out[0], out[1] * dt), max(out[1], mp.sqrt(mp.hypot(p.alpha, p.beta)))]
-    if track:
-        s, v = map(abs, track)
-        u = abs(control)
-        out = [max(s, v * dt, u * dt**2), max(v, u * dt), *out]
-    return out + [max(abs(w), abs(control) * dt) for w in spin]
+        gain = scene.gravity * dt
+        return [max(x, v * dt, gain * dt), max(v, gain), *(max(phi, push * dt) for phi in tilt)]
+    c = _moving(scene, state, control)[2]
+    place = 2 if len(state) == 4 else 0
+    theta, rate = state[place : place + 2]
+    out = [max(theta, rate * dt), max(rate, sqrt(hypot(c.alpha, c.beta)))]
+    if place:
+        s, v = state[:2]
+        return [max(s, v * dt, push * dt**2), max(v, push * dt), *out]
+    return out + [max(w, push * dt) for w in state[2:]]
 
 
 def conditioning(scene_name, params, state, control, dt, include_params=False):
@@ -227,9 +105,8 @@ def conditioning(scene_name, params, state, control, dt, include_params=False):
         For each entry i of the final state, the sum over j of max abs(change of i) / 2**-53; a
         stable computation is off by a small multiple of 2**-53 times that.
     """
-    digits = 45
-    params = dict(params)
-    state = [_number(x) for x in state]
+    digits, scene = 45, scene_of(scene_name, params)
+    state = [mpf(x) for x in state]
     floors = {
         "PivotedBar": (0, 0, 1, 1)[-len(state) :],
         "Incline": (0, 0, 1),
@@ -237,11 +114,12 @@ def conditioning(scene_name, params, state, control, dt, include_params=False):
     }[scene_name]
     sizes = _sizes(scene_name, params, state, control, dt)
     rate_floor = {"PivotedBar": len(state) - 1, "CylinderInCylinder": 1}.get(scene_name)
-    base = _once(scene_name, params, state, control, dt, digits)
+    oracle = Oracle(scene)
+    base = reference.once(oracle, state, control, dt, digits)
     total = [mpf(0)] * len(state)
 
     def count(*moved):
-        ends = [_once(scene_name, *move, dt, digits) for move in moved]
+        ends = [reference.once(*move, dt, digits) for move in moved]
         for i, centre in enumerate(base):
             total[i] += max(abs(end[i] - centre) for end in ends) / EPS
 
@@ -252,14 +130,15 @@ def conditioning(scene_name, params, state, control, dt, include_params=False):
                 size = max(size, sizes[j] if j == rate_floor else 1)
             if size:
                 moved = [[*state[:j], value + sign * EPS * size, *state[j + 1 :]] for sign in (1, -1)]
-                count(*((params, y, control) for y in moved))
+                count(*((oracle, y, control) for y in moved))
         if include_params:
-            for name, value in params.items():
-                if isinstance(value, float) and value and value != inf:
-                    factors = (1 + mpf(EPS), 1 - mpf(EPS))
-                    count(*(({**params, name: value * f}, state, control) for f in factors))
+            for name in scene._numbers():
+                value = getattr(scene, name)
+                if value and value != inf:
+                    factors = (1 + Fraction(EPS), 1 - Fraction(EPS))
+                    count(*((Oracle(scene, {name: Fraction(value) * f}), state, control) for f in factors))
             if control:
-                count(*((params, state, control * (1 + sign * mpf(EPS))) for sign in (1, -1)))
+                count(*((oracle, state, control * (1 + sign * mpf(EPS))) for sign in (1, -1)))
     return [float(x) for x in total]
 
 
@@ -498,10 +377,8 @@ def _extreme_case(label, scene, kind, draw):
 
 def _turning(case):
     """Return about how far the case turns, in units of what is worth computing."""
-    q, state, control, dt = _exact(*(case[k] for k in ("scene", "params", "state", "control", "dt")))
-    bar = case["scene"] == "PivotedBar"
-    p = _bar_field(q, control) if bar else _shell_field(q, control, state)
-    rate = state[3 if bar else 1]
-    push = abs(p.delta) + abs(p.slope) * dt
-    limit = 200 if p.gamma or push else 1e5
-    return dt * (abs(rate) + mp.sqrt(mp.hypot(p.alpha, p.beta)) + push * dt / 2) / limit
+    scene, state, dt = scene_of(case["scene"], case["params"]), case["state"], case["dt"]
+    _, v, c = _moving(scene, state, case["control"])
+    push = abs(c.delta) + abs(c.ramp) * dt
+    limit = 200 if c.gamma or push else 1e5
+    return dt * (abs(v) + sqrt(hypot(c.alpha, c.beta)) + push * dt / 2) / limit

@@ -11,14 +11,15 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from reference import flow
 from rollouts import IDS, make
 
 from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
 from lag_envs.leaderboard.protocol import REFERENCES
 from lag_envs.report.docs import generated
-from lag_envs.report.environments import LARGEST_STEP, play, random_actions
+from lag_envs.report.environment_results import LARGEST_STEP
+from lag_envs.report.episodes import play, random_actions
+from lag_envs.report.reference import flow
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.scores import KNOWN_RETURNS
@@ -197,9 +198,7 @@ def test_measured_error(env_id):
     assert f"against 40 digits: below {limit} of the state's size" in plain(page(env)["Numerical Accuracy"])
     assert f"no step of any of the eight environments errs by more than {limit} of" in plain(readme())
     assert f"errs by less than {limit} of the largest that each entry" in plain(numerics())
-    scene, kind = env.scene, type(env.scene).__name__
-    fields = {field.name for field in dataclasses.fields(scene)} - {"track"}
-    params = {name: getattr(scene, name) for name in fields if getattr(scene, name) is not None}
+    scene = env.scene
     env.reset(seed=3)
     episode = play(env, random_actions(env, 3))
     sizes = np.maximum(1.0, np.abs(episode.states).max(axis=0))
@@ -208,7 +207,7 @@ def test_measured_error(env_id):
         after = episode.states[i + 1]
         if env.task.draws:
             after = scene.simulate(before, [control], env.task.dt)[1]  # without a kick
-        exact = flow(kind, params, before, control, env.task.dt, dps=40)
+        exact = flow(scene, before, control, env.task.dt)
         errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
         assert max(errors) < LARGEST_STEP
 

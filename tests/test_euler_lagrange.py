@@ -2,13 +2,15 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import contract_scenes
 import mpmath
 import numpy as np
 import pytest
-from lagrange_oracle import Oracle
+import sympy
 
+from lag_envs import lagrange
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter
@@ -51,9 +53,73 @@ def complete(case):
     return scene(**keywords, **dict.fromkeys(zero, 0.3))
 
 
+class Lagrange:
+    """Lagrange's equations of one scene by SymPy, as functions of mpmath's numbers.
+
+    Attributes
+    ----------
+    prescribed : tuple of str
+        The coordinates that are not free.
+    """
+
+    def __init__(self, scene):
+        self.scene, self.prescribed = scene, tuple(scene.prescribed)
+        self.coordinates = (*scene.coordinates, *self.prescribed)
+        self.parameters = tuple(scene._numbers())
+        of = {name: sympy.Function(name, real=True)(lagrange.t) for name in self.coordinates}
+        q, v, self.a = ({name: sympy.Symbol(f"{k}_{name}") for name in self.coordinates} for k in "qva")
+        u = {name: sympy.Symbol(f"u_{name}") for name in scene.control_names}
+        replaced = {sympy.Function(name, real=True)(lagrange.t): symbol for name, symbol in u.items()}
+        for name, q_t in of.items():
+            rates = q_t.diff(lagrange.t), q_t.diff(lagrange.t, 2)
+            replaced |= {q_t: q[name], rates[0]: v[name], rates[1]: self.a[name]}
+        twin = lagrange.symbolic(scene)
+        self.inputs = [*q.values(), *v.values(), *self.a.values(), *u.values()]
+        self.inputs += [getattr(twin, name) for name in self.parameters]
+        self.terms, self.mass = {}, {}
+        for name in self.coordinates:
+            equation = lagrange.euler_lagrange(scene, name).xreplace(replaced)
+            self.terms[name] = [self._function(term) for term in sympy.Add.make_args(equation)]
+            self.mass[name] = {other: self._function(equation.diff(a)) for other, a in self.a.items()}
+        self.rests = {name: self._function(sympy.sympify(value)) for name, value in twin.rests().items()}
+
+    def _function(self, expression):
+        return sympy.lambdify(self.inputs, expression, modules="mpmath")
+
+    def point(self, generator):
+        """Return random numbers for places, velocities, accelerations, controls and parameters.
+
+        Accelerations of free coordinates are 0.
+        """
+        real = lambda: mpmath.mpf(generator.uniform(-1.5, 1.5))  # noqa: E731
+        p = {name: mpmath.mpf(generator.uniform(0.3, 1.5)) for name in self.parameters}
+        u = {name: real() for name in self.scene.control_names}
+        q, v = ({name: real() for name in self.coordinates} for _ in range(2))
+        a = dict.fromkeys(self.coordinates, mpmath.mpf(0))
+        for name in self.prescribed:
+            if name + "_ddot" in u:
+                a[name] = u[name + "_ddot"]
+            elif name + "_dot" in u:
+                v[name] = u[name + "_dot"]
+            else:
+                v[name] = mpmath.mpf(0)
+                still = [mpmath.mpf(0)] * (len(self.inputs) - len(p))
+                at_rest = self.rests.get(name, lambda *numbers: mpmath.mpf(0))
+                q[name] = u[name] if name in u else at_rest(*still, *p.values())
+        return SimpleNamespace(q=q, v=v, a=a, u=u, p=p)
+
+    def numbers(self, point):
+        return [x for part in (point.q, point.v, point.a, point.u, point.p) for x in part.values()]
+
+    def residual(self, coordinate, point):
+        """Return what Lagrange's equation leaves for a coordinate, and the largest of its terms."""
+        terms = [f(*self.numbers(point)) for f in self.terms[coordinate]]
+        return mpmath.fsum(terms), max([*map(abs, terms), mpmath.mpf("1e-3")])
+
+
 @functools.cache
 def _oracle(scene):
-    return Oracle(scene)
+    return Lagrange(scene)
 
 
 def symbols(point):
@@ -81,7 +147,7 @@ def test_accelerations_and_forces_solve_lagranges_equations(case):
     generator = np.random.default_rng(3)
     with mpmath.workdps(40):
         for _ in range(5):
-            point = oracle.point(scene, generator)
+            point = oracle.point(generator)
             values = symbols(point)
             point.a |= dict(zip(mechanics.free, solved(mechanics, values), strict=True))
             for name in mechanics.free:
@@ -153,7 +219,7 @@ def test_held_rate_carries_what_stays_continuous():
     with mpmath.workdps(40):
         for _ in range(3):
             oracle = _oracle(scene)
-            point = oracle.point(scene, generator)
+            point = oracle.point(generator)
             point.p = {name: mpmath.mpf(getattr(scene, name)) for name in point.p}
             values = symbols(point)
             a = solved(scene.mechanics, values)
@@ -165,11 +231,10 @@ def test_held_rate_carries_what_stays_continuous():
                     q[name], v[name] = q[name] + t * v[name] + t * t * x / 2, v[name] + t * x
                 for name in ("s", "h"):
                     q[name] = q[name] + t * v[name]
-                numbers = [*q.values(), *v.values(), *point.u.values(), *point.p.values()]
-                mass = mpmath.matrix([[oracle.mass[i][j](*numbers) for j in (0, 1)] for i in (0, 1)])
-                drive = mpmath.matrix(
-                    [sum(oracle.mass[i][j](*numbers) * v[c] for j, c in ((2, "s"), (3, "h"))) for i in (0, 1)]
-                )
+                numbers = oracle.numbers(SimpleNamespace(q=q, v=v, a=point.a, u=point.u, p=point.p))
+                free = "alpha", "beta"
+                mass = mpmath.matrix([[oracle.mass[i][j](*numbers) for j in free] for i in free])
+                drive = mpmath.matrix([sum(oracle.mass[i][c](*numbers) * v[c] for c in "sh") for i in free])
                 shift = mpmath.lu_solve(mass, drive)
                 return [v["alpha"] + shift[0], v["beta"] + shift[1]]
 
@@ -234,7 +299,7 @@ def test_normal_form_is_the_derived_equation(case):
     free = mechanics.free[0]
     with mpmath.workdps(40):
         for _ in range(5):
-            point = oracle.point(scene, generator)
+            point = oracle.point(generator)
             values = symbols(point)
             inertia, *numbers = evaluate([form.inertia, *form.expressions.values()], values, mpmath)
             names = dict(zip(form.expressions, (x / inertia for x in numbers), strict=True))

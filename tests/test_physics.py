@@ -13,7 +13,7 @@ from sympy import cos, sin
 
 from lag_envs.lagrange import symbolic, t
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.report.reference import linear
+from lag_envs.report.closed_forms import linear
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 
 U = sympy.Symbol("u", real=True)

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +11,10 @@ from mpmath import mp, mpf
 from rollouts import actions
 
 from lag_envs import TASKS
-from lag_envs.report import environments, reference
+from lag_envs.report import environment_results, environments, episodes, gymnasium_peers
+from lag_envs.report.bound import Driven
+from lag_envs.report.episodes import Episode, play, random_actions, replay
+from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import Result
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.steppers import comparison
@@ -40,22 +44,30 @@ STEPS = {"Pendulum-v1": semi_implicit, "CartPole-v1": euler, "Acrobot-v1": rk4}
 
 
 def float_rates(env, peer, u):
-    """Return a peer's equations on floats."""
-    return lambda y: np.array(peer.rates(y, u, env, lambda x: (np.cos(x), np.sin(x))))
+    """Return the equations of a peer's scene on floats, as SymPy derives them."""
+    oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
+
+    def rates(y):
+        state = np.asarray(y)[list(peer.order)]
+        found = np.empty(len(state))
+        found[0::2], found[1::2] = state[1::2], oracle.at(state, [u])[1]
+        return found[own]
+
+    return rates
 
 
 def short_episode(id, seconds=1.0, seed=0):
-    peer = environments.PEERS[id]
+    peer = gymnasium_peers.PEERS[id]
     env = gym.make(id).unwrapped
     env.reset(seed=seed)
     steps = round(seconds / peer.step(env))
-    actions = environments.random_actions(env, seed)
+    actions = random_actions(env, seed)
     if id == "Pendulum-v1":
         actions = map(np.float64, actions)  # with float32 it rounds the torque's part to float32
-    return env, peer, environments.watch(env, peer, actions, steps, to_the_end=False)
+    return env, peer, gymnasium_peers.watch(env, peer, actions, steps, to_the_end=False)
 
 
-@pytest.mark.parametrize("id", environments.PEERS)
+@pytest.mark.parametrize("id", gymnasium_peers.PEERS)
 @pytest.mark.filterwarnings("ignore")
 def test_peers_equations_are_those_of_their_code(id):
     env, peer, episode = short_episode(id, 2.0)
@@ -66,7 +78,7 @@ def test_peers_equations_are_those_of_their_code(id):
         np.testing.assert_allclose(step, after, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("id", environments.PEERS)
+@pytest.mark.parametrize("id", gymnasium_peers.PEERS)
 @pytest.mark.filterwarnings("ignore")
 def test_peers_exact_states_agree_with_dop853(id):
     integrate = pytest.importorskip("scipy.integrate")
@@ -77,42 +89,42 @@ def test_peers_exact_states_agree_with_dop853(id):
         y = integrate.solve_ivp(
             lambda t, y, f=rates: f(y), (0, peer.step(env)), y, "DOP853", rtol=1e-13, atol=1e-13
         ).y[:, -1]
-    exact = environments.solve(env, peer, episode.states[0], episode.controls)[-1]
+    exact = gymnasium_peers.solve(env, peer, episode.states[0], episode.controls)[-1]
     np.testing.assert_allclose(np.array(exact, dtype=float), y, rtol=0, atol=1e-11)
 
 
-def test_peers_exact_states_agree_with_the_reference_of_ours():
+def test_exact_states_are_those_of_equations_that_are_typed_in():
+    """Pendulum-v1 and the bar as driven pendulums, with coefficients by hand in exact fractions."""
     env, peer, episode = short_episode("Pendulum-v1")
-    path = environments.solve(env, peer, episode.states[0], episode.controls)
-    with mp.workdps(60):
-        y = [mpf(x) for x in episode.states[0]]
-        for u in episode.controls:
-            p = reference.Pendulum(mpf(-15), mpf(0), mpf(0), 3 * mpf(u), mpf(0))
-            y = reference.pendulum(p, *y, mpf(env.dt), 45)
-        assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
+    path = gymnasium_peers.solve(env, peer, episode.states[0], episode.controls)
+    given = [({"alpha": -15, "delta": 3 * Fraction(u)}, env.dt) for u in episode.controls]
+    same(path, episode.states[0], given)
 
-
-def test_exact_states_of_ours_agree_with_the_solver_for_peers():
-    """The bar's equation typed in again, solved by the other method."""
     env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
     env.reset(seed=0)
-    episode = environments.play(env, environments.random_actions(env, 0))
-    path = environments.replay(env.task, 0, episode.states[0], episode.controls, 34)
-    with mp.workdps(60):
-        m, arm, i, b, g = (
-            mpf(getattr(env.scene, n)) for n in ("mass", "com_distance", "inertia", "damping", "gravity")
+    episode = play(env, random_actions(env, 0))
+    path = replay(env.task, 0, episode.states[0], episode.controls, 34)
+    names = "mass", "com_distance", "inertia", "damping", "gravity"
+    m, arm, i, b, g = (Fraction(getattr(env.scene, name)) for name in names)
+    about = m * arm**2 + i
+    given = [
+        (
+            {"alpha": m * arm * g / about, "beta": m * arm * Fraction(u) / about, "gamma": b / about},
+            env.task.dt,
         )
-        about = m * arm**2 + i
+        for u in episode.controls
+    ]
+    same(path, episode.states[0], given)
 
-        def rates(y, u):
-            c, s = environments.cos_sin(y[0])
-            return y[1], -1.0 * ((m * arm * u / about) * c + (m * arm * g / about) * s + (b / about) * y[1])
 
-        y = [environments.fixed(x) for x in episode.states[0]]
-        for u in episode.controls:
-            y = environments.taylor(lambda y, u=u: rates(y, mpf(u)), y, environments.fixed(env.task.dt))
-        for a, x in zip(y, path[-1], strict=True):
-            assert abs(mp.ldexp(a, -environments.BITS) - x) < mpf(10) ** -27
+def same(path, start, given):
+    """Hold a path's end against the driven pendulum's, with coefficients and length of each step."""
+    y = [mpf(x) for x in start]
+    for coefficients, dt in given:
+        numbers = {"alpha": 0, "beta": 0, "gamma": 0, "delta": 0} | coefficients
+        y = Oracle(Driven(), numbers).once([0.0, 0.0, *y], [0.0], dt, 45)[2:]
+    with mp.workdps(60):
+        assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
 
 
 @pytest.mark.parametrize("id", TASKS)
@@ -120,8 +132,8 @@ def test_one_second_of_every_environment(id):
     (row,) = environments.ours(id, seed=0, duration=1.0)
     assert row["seconds"] > 0.2
     assert row["error"]["the end"] <= ONE_SECOND
-    assert 0.0 < row["error"]["one step"] < environments.LARGEST_STEP
-    assert row["error"]["the end"] <= environments.ROUNDINGS * row["amplified"]["the end"]
+    assert 0.0 < row["error"]["one step"] < environment_results.LARGEST_STEP
+    assert row["error"]["the end"] <= environment_results.ROUNDINGS * row["amplified"]["the end"]
     assert row["disagreement"] < 1e-25
 
 
@@ -131,10 +143,10 @@ def test_one_second_of_every_environment(id):
 def test_every_step_of_whole_episodes(id, seed):
     """What README says of random actions; beside it stubborn ones, that spin a bar round and round."""
     (row,) = environments.ours(id, seed)
-    assert row["error"]["one step"] < environments.LARGEST_STEP
+    assert row["error"]["one step"] < environment_results.LARGEST_STEP
     env = gym.make(id, disable_env_checker=True)
     env.reset(seed=seed)
-    episode = environments.play(env, iter(actions(10_000, 1, seed=seed + 9)))
+    episode = play(env, iter(actions(10_000, 1, seed=seed + 9)))
     row = environments.against_exact(env.unwrapped.task, episode, seed)
     assert row["error"]["one step"] < 1e-14
 
@@ -143,10 +155,10 @@ def test_one_step_is_the_worst_of_all_steps():
     """A single wrong step late in the episode shows, in its own entry, and nowhere else."""
     env = gym.make("PivotedBarFree-v0", duration=1.0)
     env.reset(seed=0)
-    episode = environments.play(env, environments.random_actions(env, 0))
+    episode = play(env, random_actions(env, 0))
     task, late = env.unwrapped.task, len(episode.controls) - 3
     right = environments.against_exact(task, episode, 0)
-    assert right["error"]["one step"] < environments.LARGEST_STEP
+    assert right["error"]["one step"] < environment_results.LARGEST_STEP
     states = episode.states.copy()
     states[late:, 1] += 1e-10  # the step that ends there is off, those that follow start from it
     wrong = environments.against_exact(task, episode._replace(states=states), 0)
@@ -160,10 +172,8 @@ def test_one_step_is_the_worst_of_all_steps():
 def test_one_step_of_peers_is_the_worst_of_all_steps():
     """Explicit Euler's error of a step is h²/2 of the second derivative: larger once the pole falls."""
     env, peer, episode = short_episode("CartPole-v1")
-    row = environments.measure(env, peer, episode)
-    first = environments.measure(
-        env, peer, environments.Episode(episode.states[:2], episode.controls[:1], False)
-    )
+    row = gymnasium_peers.measure(env, peer, episode)
+    first = gymnasium_peers.measure(env, peer, Episode(episode.states[:2], episode.controls[:1], False))
     assert row["error"]["one step"] > first["error"]["one step"] > 1e-6
 
 
@@ -171,7 +181,7 @@ def test_kicks_are_part_of_the_exact_states(monkeypatch):
     """With this seed there is one before the bar has fallen."""
     (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
     assert row["error"]["the end"] < ONE_SECOND
-    monkeypatch.setattr(environments, "episode_key", lambda key, episode: 0)
+    monkeypatch.setattr(episodes, "episode_key", lambda key, episode: 0)
     (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
     assert row["error"]["the end"] > 0.01
 
@@ -208,12 +218,12 @@ def test_episodes_with_cut_speeds_are_passed_over(rows):
     """Pendulum-v1 cuts its speed at 8 rad/s with seed 1, so another one is taken."""
     row = next(row for row in rows if row["case"] == "Pendulum-v1")
     assert row["seed"] in (1, 1001)
-    _, episode, seed = environments.random_episode("Pendulum-v1", 1, 200, True)
+    _, episode, seed = gymnasium_peers.random_episode("Pendulum-v1", 1, 200, True)
     assert seed == 1001 and np.abs(episode.states[:, 1]).max() < 8.0
 
 
 def test_undriven_pendulum(rows):
-    angles = {row["case"]: environments._angle(row) for row in rows if row["seed"] is None}
+    angles = {row["case"]: environment_results._angle(row) for row in rows if row["seed"] is None}
     assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
     assert angles["PivotedBarFree-v0 with Pendulum-v1's equation, undriven"] < 2e-12
     assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
@@ -223,7 +233,7 @@ def test_a_worse_stepper_breaks_the_claims(rows):
     """RK4, once per control step, in place of ours."""
     env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
     env.reset(seed=0)
-    episode = environments.play(env, environments.random_actions(env, 0))
+    episode = play(env, random_actions(env, 0))
     scene = Stepped(env.scene, comparison("RK4", Stepped(env.scene).flow))
     worse = episode._replace(states=scene.simulate(episode.states[0], episode.controls, env.task.dt))
     row = environments.against_exact(env.task, worse, seed=0) | {"case": "RK4", "seed": 0}

@@ -5,16 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from series_systems import SYSTEMS as TYPED
-from series_systems import acceleration
-from test_series import FLOATS
 
-from lag_envs.report import general
-from lag_envs.report.exact import Motion, Unresolved, ends, motion_of
+from lag_envs.report import general, general_results
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
 from lag_envs.report.motions import Certified, SceneEquation, SceneProblems
+from lag_envs.report.oracle import oracle_of
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled
 from lag_envs.scenes import Scene, parameter
 
@@ -50,29 +48,16 @@ def problem(name):
     system = SYSTEMS[name]
     starts, controls = system.draw(COUNT)
     return SceneProblems(system.scene, starts, controls, system), ends(
-        system.scene, starts, controls, general.DT
+        system.scene, starts, controls, general_results.DT
     )
 
 
 def worst(rival, name, together=False):
     problems, truth = problem(name)
-    return general.errors(rival.build(problems, general.DT, 1, together).end(), truth)[0]
+    return general.errors(rival.build(problems, general_results.DT, 1, together).end(), truth)[0]
 
 
 # --- the reference ---
-
-
-@pytest.mark.parametrize("system", TYPED, ids=lambda system: system.name)
-def test_sympy_gives_the_equations_that_were_typed_in(system):
-    generator = np.random.default_rng(5)
-    motion = Motion(system.scene)
-    first = 2 * system.driven
-    for _ in range(10):
-        state, control = system.draw(generator)
-        q, v = state[first::2], state[first + 1 :: 2]
-        typed = acceleration(system, q, v, control, state[0], control[0] if system.driven else None, FLOATS)
-        found = motion.at(state, control)[1]
-        np.testing.assert_allclose(found, typed, rtol=1e-11, atol=1e-11 * np.abs(typed).max())
 
 
 @pytest.mark.parametrize("control", ["rate", "place", "acceleration"])
@@ -91,20 +76,6 @@ def test_what_moves_a_support(control):
         assert general.errors(rival.build(problems, 0.05, 1, False).end(), truth)[0] < 1e-13
 
 
-def test_a_motion_into_a_singular_point_is_unresolved():
-    class Fall(Scene):
-        coordinates = {"x": "m"}
-
-        def kinetic(self, q, v, xp):
-            return 0.5 * v.x**2
-
-        def potential(self, q, xp):
-            return -xp.log(q.x)
-
-    with pytest.raises(Unresolved):
-        motion_of(Fall()).end([1e-3, -10.0], [], 0.01)
-
-
 # --- the rivals ---
 
 
@@ -112,11 +83,11 @@ def test_a_motion_into_a_singular_point_is_unresolved():
 def test_equations_of_the_rivals_are_those_of_sympy(name):
     system = SYSTEMS[name]
     starts, controls = system.draw(20, seed=7)
-    problems, motion = SceneProblems(system.scene, starts, controls), motion_of(system.scene)
+    problems, oracle = SceneProblems(system.scene, starts, controls), oracle_of(system.scene)
     rates = SceneEquation(system.scene).rate(0.0, problems.y, problems.p, np)
     n = problems.equation.size // 2
     for j in range(20):
-        exact = motion.at(starts[j].tolist(), controls[j].tolist())[1]
+        exact = oracle.at(starts[j].tolist(), controls[j].tolist())[1]
         np.testing.assert_allclose(
             [r[j] for r in rates[n:]], exact, rtol=1e-10, atol=1e-11 * np.abs(exact).max()
         )
@@ -125,7 +96,7 @@ def test_equations_of_the_rivals_are_those_of_sympy(name):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_mujoco_has_the_same_models(name):
     pytest.importorskip("mujoco")
-    assert max(differences(SYSTEMS[name], "mujoco")) < general.EQUAL
+    assert max(differences(SYSTEMS[name], "mujoco")) < general_results.EQUAL
 
 
 @pytest.mark.slow
@@ -136,7 +107,7 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
     from lag_envs.report import reference
 
     monkeypatch.setattr(reference, "store", reference.store or tmp_path_factory.getbasetemp())
-    assert max(differences(SYSTEMS[name], "pinocchio")) < general.EQUAL
+    assert max(differences(SYSTEMS[name], "pinocchio")) < general_results.EQUAL
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -144,10 +115,12 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 def test_ours_is_what_simulate_does(name, together):
     """What is timed has the bits of `simulate`."""
     problems, _ = problem(name)
-    order = int(problems.scene._order(general.DT))
-    found = Certified(Certified.method_of(order), 1e-14).build(problems, general.DT, 1, together).end()
+    order = int(problems.scene._order(general_results.DT))
+    found = (
+        Certified(Certified.method_of(order), 1e-14).build(problems, general_results.DT, 1, together).end()
+    )
     paths = [
-        problems.scene.simulate(y, u[None], general.DT)[-1]
+        problems.scene.simulate(y, u[None], general_results.DT)[-1]
         for y, u in zip(problems.starts, problems.controls, strict=True)
     ]
     assert np.array_equal(found, paths)
@@ -187,7 +160,7 @@ ROWS = [
 
 
 def test_times_are_compared_at_equal_error_in_one_clock():
-    found = general.best(ROWS)
+    found = general_results.best(ROWS)
     assert found["cart-pole", "single", 1e-3]["lag_envs"].ns == 50.0
     assert found["cart-pole", "single", 1e-6]["lag_envs"].ns == 80.0
     assert found["cart-pole", "single", 1e-6]["heyoka"].ns == 80.0  # its job ran at half the speed
@@ -197,7 +170,7 @@ def test_times_are_compared_at_equal_error_in_one_clock():
 
 def test_a_defeat_is_told_like_a_win():
     rows = [*ROWS, point("compiled", "RK4", 1, 1e-4, 10.0)]
-    content = general.content(rows, [])
+    content = general_results.content(rows, [])
     alone = next(c for c in content.claims if "as ours is, alone" in c.text)
     assert alone.holds is False and "RK4, compiled by 5.00 (cart-pole, 0.001)" in alone.evidence
     assert any(
@@ -216,7 +189,7 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
         )
     )
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
-    assert "Not taken part: heyoka is not installed." in general.content(rows, []).text
+    assert "Not taken part: heyoka is not installed." in general_results.content(rows, []).text
 
 
 def test_certificates_of_a_scene():

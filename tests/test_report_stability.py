@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from lag_envs.report import bound, extremes, stability
+from lag_envs.report import bound, extremes, reference, stability, stability_maps, stability_results
 from lag_envs.report.cases import Case, ensemble, scales
+from lag_envs.report.oracle import Unresolved
 from lag_envs.report.runner import Result
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
@@ -45,20 +46,27 @@ def test_bound_is_never_broken():
     assert claim.evidence.startswith("1 of 60")
 
 
-def test_the_formulas_are_run_without_rounding():
-    """The recurrence for floats, constants as 1.0 / 3 included, against the series multiplied out by hand."""
-    alpha, gamma, theta, omega, h = 3.0, 0.7, 0.4, 1.1, 0.125
+def test_what_is_left_out_is_the_sum_of_the_rest():
+    """The exact end less the series multiplied out by hand, and less the recurrence that is compiled."""
+    alpha, gamma, theta, omega, h = 3.0, 0.75, 0.4, 1.1, 0.125
+    drive = Drive(alpha, 0.0, gamma, 0.0, 0.0)
+    scene, control = bound.driven(drive)
+    end = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
     with mp.workdps(60):
-        angle, speed = bound.series(theta, omega, Drive(alpha, 0.0, gamma, 0.0, 0.0), h, 3)
         cos, sin = mp.cos_sin(mpf(theta))
         a, g, w, t = mpf(alpha), mpf(gamma), mpf(omega), mpf(h)
         first = -a * sin - g * w
         second = -a * cos * w - g * first
         third = a * sin * w**2 - a * cos * first - g * second
-        exact = w + first * t + second * t**2 / 2 + third * t**3 / 6
-        assert abs(speed - exact) < mpf(10) ** -55
-        exact = theta + w * t + first * t**2 / 2 + second * t**3 / 6 + third * t**4 / 24
-        assert abs(angle - exact) < mpf(10) ** -55
+        by_hand = [
+            theta + w * t + first * t**2 / 2 + second * t**3 / 6 + third * t**4 / 24,
+            w + first * t + second * t**2 / 2 + third * t**3 / 6,
+        ]
+        for found, kept, exact in zip(bound.truncation(theta, omega, drive, h, 3), by_hand, end, strict=True):
+            assert found == pytest.approx(float(abs(exact - kept)), rel=1e-12)
+    W, _ = pendulum.taylor_coefficients(omega * h, float(cos), float(sin), pendulum.scaled(drive, h), 3)
+    kept = [theta + sum(x / (k + 1) for k, x in enumerate(W)), sum(W) / h]
+    assert kept == pytest.approx([float(x) for x in by_hand], rel=1e-15)
 
 
 def test_bound_is_that_of_the_product():
@@ -166,13 +174,13 @@ def test_heavy_damping():
     """At γ dt = 1e4 explicit Euler and RK4 diverge, ours and the exponential stepper do not."""
     (row,) = stability.cells("damping", "PivotedBar", 0.02, [1e4])
     errors = row["errors"]
-    assert errors["explicit Euler"] == errors["RK4, 16"] == stability.DIVERGED
+    assert errors["explicit Euler"] == errors["RK4, 16"] == stability_results.DIVERGED
     assert errors["ours"] < 1e-12
     assert errors["ours"] < errors["ETD4RK"] < 1e-10
-    assert errors["ours, float32"] == stability.TOO_LONG
+    assert errors["ours, float32"] == stability_results.TOO_LONG
 
 
-@pytest.mark.parametrize("name", stability.STARTS)
+@pytest.mark.parametrize("name", stability_maps.STARTS)
 def test_ordinary_cells(name):
     """In float64 ours is exact to rounding; in float32 every method is as exact as float32 can be."""
     rows = list(stability.cells("damping", name, 0.02, [1e-3, 1e-2]))
@@ -213,11 +221,11 @@ def test_formulas_on_arrays_are_the_compiled_ones():
 
 def test_a_cell_without_a_reference_says_so(monkeypatch):
     def unresolved(*args):
-        raise stability.reference.Unresolved("two precisions differ")
+        raise Unresolved("two precisions differ")
 
     monkeypatch.setattr(stability.reference, "remembered", unresolved)
     (row,) = stability.cells("damping", "PivotedBar", 0.02, [1.0])
-    assert set(row["errors"].values()) == {stability.NO_REFERENCE}
+    assert set(row["errors"].values()) == {stability_results.NO_REFERENCE}
     content = stability.content([row], [])
     assert "1 without a reference" in content.claims[0].evidence
     assert "two precisions differ" in content.tables[-1].rows[0][1]
@@ -228,7 +236,7 @@ def test_refused_and_amplified_cells():
     """A fast start is refused; 850,000 substeps in a shell that leaves no room are accurate to rounding."""
     (fast,) = stability.cells("speed", "PivotedBar", 1.0, [1e7])
     (tight,) = stability.cells("arm", "CylinderInCylinder, drag", 1.0, [1e-9])
-    assert fast["errors"]["ours"] == stability.REFUSED
+    assert fast["errors"]["ours"] == stability_results.REFUSED
     assert tight["errors"]["ours"] > 1e-12
     assert tight["roundings"] < extremes.ROUNDINGS
     content = stability.content([fast, tight], [])

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 from contract_scenes import Trolley
 from llvmlite import binding, ir
-from series_systems import SYSTEMS, System, acceleration
+from series_systems import SYSTEMS, System
 
+from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import Chain, StepRefused
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import compiling, driver, general, machine
@@ -58,34 +59,18 @@ def _tanh(x):
 
 #: Functions of series in 40 digits and more.
 EXACT = types.SimpleNamespace(
-    number=lambda x: flint.arb_series([flint.arb(x)]),
     tanh=_tanh,
     **{name: getattr(flint.arb_series, name) for name in ("sin", "cos", "sqrt", "exp", "log", "atan")},
 )
 
 
 def taylor(system, state, control, h, end):
-    """Return exact coefficients of places and velocities, time in steps of h, by Picard's iteration.
-
-    Each iteration makes one more coefficient exact: nothing is shared with the recurrences under test.
-    """
-    flint.ctx.prec = 160
-    first = 2 * system.driven
-    h, u = flint.arb(h), [flint.arb(x) for x in control]
-    q0, v0 = ([flint.arb(x) for x in state[first + i :: 2]] for i in (0, 1))
-    q, v = ([flint.arb_series([x]) for x in values] for values in (q0, v0))
-    for known in range(1, end + 1):
-        flint.ctx.cap = known
-        s = (
-            flint.arb_series([flint.arb(state[0]), h * flint.arb(state[1]), h * h * u[0] / 2])
-            if first
-            else None
-        )
-        rates = acceleration(system, q, v, u, s, u[0] if first else None, EXACT)
-        flint.ctx.cap = known + 1
-        q = [(x * h).integral() + c for x, c in zip(v, q0, strict=True)]
-        v = [(flint.arb_series(x) * h).integral() + c for x, c in zip(rates, v0, strict=True)]
-    return q, v
+    """Return exact coefficients of places and velocities, time in steps of h, by the oracle."""
+    flint.ctx.prec, flint.ctx.cap = 160, end + 1
+    found = oracle_of(system.scene).coefficients(state, control, h, end + 1, 45)
+    return [
+        [flint.arb_series([flint.arb(c) for c in of[n]]) for n in system.scene.coordinates] for of in found
+    ]
 
 
 def sums(series, first):
@@ -583,23 +568,8 @@ def test_threads_share_a_scene_and_run_side_by_side():
 
 
 def exact_step(system, state, control, dt):
-    """Return a control step in 40 digits, by series of parts so short that their tails do not count."""
-    first, parts = 2 * system.driven, 1
-    while True:
-        at, h = list(state), flint.arb(dt) / parts
-        for _ in range(parts):
-            q, v = taylor(system, at, control, h, 30)
-            if max(abs(float(x.coeffs()[-1])) / sum(abs(float(c)) for c in x.coeffs()) for x in v) > 1e-30:
-                break
-            ends = [sum(x.coeffs()) for pair in zip(q, v, strict=True) for x in pair]
-            moved = []
-            if first:
-                u = flint.arb(control[0])
-                moved = [at[0] + h * at[1] + h * h * u / 2, at[1] + h * u]
-            at = [*moved, *ends]
-        else:
-            return at
-        parts *= 2
+    """Return a control step in 40 digits."""
+    return [flint.arb(x) for x in oracle_of(system.scene).once(state, control, dt, 40)]
 
 
 def exact_slopes(system, state, control, dt):

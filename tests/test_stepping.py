@@ -23,8 +23,10 @@ from reference import (
 from scipy.integrate import solve_ivp
 
 from lag_envs import scenes
-from lag_envs.report.reference import Pendulum, elliptic, linear, slow_manifold, taylor
-from lag_envs.report.reference import pendulum as pendulum_reference
+from lag_envs.report import reference as exact_ends
+from lag_envs.report.bound import driven
+from lag_envs.report.closed_forms import elliptic, linear
+from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.pendulum import Drive
@@ -328,7 +330,8 @@ def pendulum_errors(theta, omega, drive, dt):
     c, s = math.cos(theta), math.sin(theta)
     x = pendulum.largest_x(dt)
     *end, substeps = any_pendulum()(theta, omega, c, s, *map(float, drive), dt, x)
-    exact = pendulum_reference(Pendulum(*map(mpf, drive)), mpf(theta), mpf(omega), mpf(dt), 40)
+    scene, control = driven(drive)
+    exact = exact_ends.once(oracle_of(scene), [0.0, 0.0, theta, omega], control, dt, 40)[2:]
     field = math.hypot(drive.alpha, drive.beta)
     size = (
         max(1.0, abs(theta), abs(omega) * dt, abs(end[0])),
@@ -423,18 +426,12 @@ def test_heavy_drag_in_a_turning_shell_with_gravity(spin, gravity):
 
 
 def test_heavy_drag_in_a_turning_shell_against_collocation():
-    """The same with gravity, rate and acceleration of the shell, by the reference's own slow manifold."""
+    """The same with gravity, rate and acceleration of the shell, by the oracle's collocation."""
     dt, spin, control = 0.02, 700.0, -2000.0
     shell = CylinderInCylinder(damping=0.24 * 1e6 / dt)
-    k = coefficients(shell)
     end = shell.simulate([0.3, 0.0, spin], [control], dt)[1]
-    drag = mpf(k["drag"])
-    drive = mpf(k["push"]) * mpf(control) + drag * mpf(spin)
-    p = Pendulum(mpf(k["weight"]), mpf(0), drag, drive, drag * mpf(control))
-    layer = mpf(90) / drag
-    leaving = taylor(p, mpf(0.3), mpf(0), layer, 30)
-    exact = slow_manifold(p, *leaving, layer, mpf(dt), 30)
-    for value, truth in zip(end, exact, strict=False):
+    exact = exact_ends.flow(shell, [0.3, 0.0, spin], control, dt)
+    for value, truth in zip(end, exact, strict=True):
         assert abs(value - truth) < 3e-15 * abs(truth)
 
 
@@ -662,9 +659,8 @@ def test_long_run():
     rows = bar.simulate([2.0, 0.0], np.zeros(steps), dt)
     energy = bar.energy(rows)["total"]
     assert np.ptp(energy) / bar.mass / bar.gravity / bar.com_distance < 2e-12
-    p = Pendulum(mpf(weight), mpf(0), mpf(0), mpf(0), mpf(0))
     for row, allowed in ((500, 1e-12), (steps, 2e-9)):
-        exact = elliptic(p, mpf(2.0), mpf(0), row * mpf(dt))
+        exact = elliptic(mpf(weight), mpf(0), mpf(2.0), mpf(0), row * mpf(dt))
         assert rows[row] == pytest.approx([float(v) for v in exact], abs=allowed)
 
     advance, numbers = advance_of(bar, dt)

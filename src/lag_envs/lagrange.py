@@ -22,15 +22,37 @@ from lag_envs.scenes.base import Scene, parameter
 t = sympy.Symbol("t", real=True)
 
 
-class Symbolic:
-    """The namespace ``xp`` of a formula on SymPy's expressions."""
+_FUNCTIONS = {
+    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
+}
 
-    pi = sympy.pi
-    sin, cos, tan, exp, log, sqrt, tanh = (
-        staticmethod(f)
-        for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.sqrt, sympy.tanh)
+
+def decimal(expression: Any) -> sympy.Expr:
+    """Return an expression with rational numbers in place of floats: 1/10 for 0.1."""
+    return sympy.nsimplify(sympy.sympify(expression), rational=True)
+
+
+def binary(expression: Any) -> sympy.Expr:
+    """Return an expression with the rational numbers that its floats are, to the last bit."""
+    expression = sympy.sympify(expression)
+    return expression.xreplace({number: sympy.Rational(number) for number in expression.atoms(sympy.Float)})
+
+
+def _functions(of: Callable[[Any], Any], rational: Callable[[Any], sympy.Expr]) -> types.SimpleNamespace:
+    """Return the namespace of a formula on SymPy's expressions; functions are taken of what `of` returns."""
+
+    def taken(function: Any) -> Callable[[Any], Any]:
+        return lambda x: function(of(x))
+
+    named = {name: taken(f) for f, name in _FUNCTIONS.items()}
+    return types.SimpleNamespace(
+        pi=sympy.pi, sqrt=taken(sympy.sqrt), arctan=taken(sympy.atan), rational=rational, **named
     )
-    atan = arctan = staticmethod(sympy.atan)
+
+
+#: The namespace ``xp`` of a formula on SymPy's expressions, which people read; and one where a float is the
+#: number that it is, and no function is taken of one.
+Symbolic, Exact = _functions(lambda x: x, decimal), _functions(binary, binary)
 
 
 # --- a scene as expressions --------------------------------------------------------------------------------
@@ -49,11 +71,9 @@ def symbolic(scene: Scene) -> Any:
 
 
 def motion(scene: Scene) -> tuple[Values, Values, Values]:
-    """Return places, velocities and controls as SymPy's functions of time; what rests is where it rests."""
-    layout, rests = scene._layout, symbolic(scene).rests()
+    """Return places, velocities and controls as SymPy's functions of time."""
+    layout = scene._layout
     q: dict[str, Any] = {name: sympy.Function(name, real=True)(t) for name in layout.names}
-    for p in layout.at("rest"):
-        q[p.name] = sympy.sympify(rests.get(p.name, 0))
     u = {name: sympy.Function(name, real=True)(t) for name in layout.controls}
     return (
         Values("coordinate", q),
@@ -62,27 +82,43 @@ def motion(scene: Scene) -> tuple[Values, Values, Values]:
     )
 
 
-def lagrangian(scene: Scene) -> sympy.Expr:
-    """Return T - V of the scene with symbols for its parameters."""
+def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
+    """Return an expression in which what rests is where it rests."""
+    values: dict[Any, Any] = {}
+    rests = symbolic(scene).rests()
+    for p in scene._layout.at("rest"):
+        place = sympy.Function(p.name, real=True)(t)
+        values |= {place: xp.rational(rests.get(p.name, 0)), place.diff(t): 0, place.diff(t, 2): 0}
+    return expression.xreplace({key: sympy.sympify(value) for key, value in values.items()})
+
+
+def _lagrangian(scene: Scene, xp: Any) -> sympy.Expr:
     copy, (q, v, _) = symbolic(scene), motion(scene)
-    return sympy.nsimplify(copy.kinetic(q, v, Symbolic) - copy.potential(q, Symbolic), rational=True)
+    return xp.rational(copy.kinetic(q, v, xp) - copy.potential(q, xp))
 
 
-def euler_lagrange(scene: Scene, coordinate: str) -> sympy.Expr:
-    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that moves it.
+def lagrangian(scene: Scene, xp: Any = Symbolic) -> sympy.Expr:
+    """Return T - V of the scene with symbols for its parameters."""
+    return _resting(scene, _lagrangian(scene, xp), xp)
+
+
+def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.Expr:
+    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that it takes.
 
     Parameters
     ----------
     scene : Scene
         The scene; its numbers do not matter.
     coordinate : str
-        A coordinate that is free or moves.
+        A coordinate that is free, moves, or rests.
+    xp : namespace, default `Symbolic`
+        Functions of SymPy's expressions; with `Exact` the formulas' floats are taken to the last bit.
     """
     copy, (q, v, u) = symbolic(scene), motion(scene)
-    of, rate, energy = q[coordinate], v[coordinate], lagrangian(scene)
-    loss = sympy.nsimplify(sympy.sympify(copy.dissipation(q, v, u, Symbolic)), rational=True)
-    force = sympy.nsimplify(sympy.sympify(copy.applied(q, v, u, Symbolic).get(coordinate, 0)), rational=True)
-    return energy.diff(rate).diff(t) - energy.diff(of) + loss.diff(rate) - force
+    of, rate, energy = q[coordinate], v[coordinate], _lagrangian(scene, xp)
+    loss = xp.rational(copy.dissipation(q, v, u, xp))
+    force = xp.rational(copy.applied(q, v, u, xp).get(coordinate, 0))
+    return _resting(scene, energy.diff(rate).diff(t) - energy.diff(of) + loss.diff(rate) - force, xp)
 
 
 def equations(scene: Scene) -> list[sympy.Eq]:
@@ -194,11 +230,6 @@ def _name(symbol: Any) -> str:
     if isinstance(symbol, sympy.Symbol):
         return symbol.name
     raise FormulaError(f"{symbol!r} is no SymPy symbol or function of time; it cannot be a name")
-
-
-_FUNCTIONS = {
-    f: f.__name__ for f in (sympy.sin, sympy.cos, sympy.tan, sympy.exp, sympy.log, sympy.atan, sympy.tanh)
-}
 
 
 def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:

@@ -1,22 +1,23 @@
 """The bound that is known before a step, against what the step really leaves out.
 
-Truncation is compared with truncation: the product's recurrence runs on numbers of 110 digits, so that
-nothing is rounded, and its sum is held against the reference.
+Truncation is compared with truncation: a step leaves out what the coefficients of the exact motion, by the
+oracle, sum up to beyond the series' order. Rounding plays no part.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from mpmath import mp, mpf
 
 from lag_envs.report import reference
 from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Job, Result, Row
+from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Drive
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 SECTION = "bound"
 ORDERS = (8, 12, 14, 16, 20)
 DIGITS = 100
+MORE = 80  # coefficients beyond the order, whose sum is what is left out
 MOST_SUBSTEPS = 100  # of the steps whose cost is looked at, which run as plain Python
 TOLERANCE = pendulum.TOLERANCE
 
@@ -52,67 +54,58 @@ def jobs(quick: bool) -> list[Job]:
 # --- measuring ---
 
 
-class Exact:
-    """An mpmath number that takes a float factor for the fraction it stands for, such as 1.0 / 3 for 1/3.
+class Driven(Scene):
+    """The driven pendulum of `pendulum.Drive`, with its coefficients as parameters."""
 
-    With it the recurrence that is compiled for floats has no rounding left, not even in its constants.
-    """
+    alpha: float = parameter(0.0, "rad/s²")
+    beta: float = parameter(0.0, "rad/s²")
+    gamma: float = parameter(0.0, "1/s", least=0.0)
+    delta: float = parameter(0.0, "rad/s²")
 
-    def __init__(self, value: mpf) -> None:
-        self.value = value
+    coordinates: ClassVar = {"theta": "rad"}
+    prescribed: ClassVar = {"turn": "rad"}  # its rate is the drive's part that grows
+    controls: ClassVar = {"turn_ddot": "rad/s²"}
 
-    def __add__(self, other: Any) -> Exact:
-        return Exact(self.value + _value(other))
+    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
+        """Return T."""
+        return 0.5 * v.theta**2
 
-    def __sub__(self, other: Any) -> Exact:
-        return Exact(self.value - _value(other))
+    def potential(self, q: Any, xp: Any) -> Any:
+        """Return V."""
+        return self.beta * xp.sin(q.theta) - self.alpha * xp.cos(q.theta)
 
-    def __rsub__(self, other: Any) -> Exact:
-        return Exact(_value(other) - self.value)
+    def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
+        """Return Rayleigh's function."""
+        return 0.5 * self.gamma * v.theta**2
 
-    def __mul__(self, other: Any) -> Exact:
-        return Exact(self.value * _value(other))
-
-    __radd__ = __add__
-    __rmul__ = __mul__
-
-
-def _value(other: Any) -> mpf:
-    if isinstance(other, Exact):
-        return other.value
-    fraction = Fraction(other).limit_denominator(1000)
-    return mpf(fraction.numerator) / fraction.denominator
+    def applied(self, q: Any, v: Any, u: Any, xp: Any) -> dict[str, Any]:
+        """Return the drive."""
+        return {"theta": self.delta + v.turn}
 
 
-def series(theta: float, omega: float, drive: Drive, h: float, order: int) -> tuple[mpf, mpf]:
-    """Return (θ, θ') after one step of the series in exact arithmetic, from floats taken as exact."""
-    step = mpf(h)
-    cos, sin = mp.cos_sin(mpf(theta))
-    scaled = Drive(*map(Exact, pendulum.scaled(Drive(*map(mpf, drive)), step)))
-    W, _ = pendulum.taylor_coefficients(Exact(omega * step), Exact(cos), Exact(sin), scaled, order)
-    w = [x.value for x in W]
-    return theta + mp.fsum(x / (k + 1) for k, x in enumerate(w)), mp.fsum(w) / step
-
-
-def truth(theta: float, omega: float, drive: Drive, h: float, digits: int) -> tuple[mpf, mpf]:
-    """Return (θ, θ') after the step, from the reference at two precisions, which have to agree."""
-    problem = reference.Pendulum(*map(mpf, drive))
-    rough, fine = (
-        reference.pendulum(problem, mpf(theta), mpf(omega), mpf(h), d) for d in (digits, digits + 9)
-    )
-    if max(abs(a - b) / max(1, abs(b)) for a, b in zip(rough, fine, strict=True)) > mpf(10) ** (10 - digits):
-        raise reference.Unresolved(f"two precisions differ at {digits} digits")
-    return fine
+def driven(drive: Drive) -> tuple[Scene, list[float]]:
+    """Return the scene of a drive, and its control."""
+    alpha, beta, gamma, delta, ramp = map(float, drive)
+    return Driven(alpha=alpha, beta=beta, gamma=gamma, delta=delta), [ramp]
 
 
 def truncation(
     theta: float, omega: float, drive: Drive, h: float, order: int, digits: int = DIGITS
 ) -> tuple[float, float]:
-    """Return what one step of the series leaves out of θ [rad] and of θ' [rad/s]."""
-    with mp.workdps(digits + 40):
-        ends = zip(series(theta, omega, drive, h, order), truth(theta, omega, drive, h, digits), strict=True)
-        angle, speed = (float(abs(a - b)) for a, b in ends)
-        return angle, speed
+    """Return what one step of the series leaves out of θ [rad] and of θ' [rad/s]; infinite if it diverges.
+
+    It is the sum of the oracle's coefficients beyond the order, of which `MORE` are taken.
+    """
+    scene, control = driven(drive)
+    state = [0.0, 0.0, theta, omega]
+    found = oracle_of(scene).coefficients(state, control, h, order + 2 + MORE, digits)
+    with mp.workdps(digits):
+        sums = []
+        for kept, series in zip((order + 2, order + 1), found, strict=True):
+            rest = series["theta"][kept:]
+            left = abs(mp.fsum(rest))
+            sums.append(float(left) if max(map(abs, rest[-4:])) <= mpf(10) ** -10 * left else math.inf)
+        return sums[0], sums[1]
 
 
 def random_problem(rng: np.random.Generator) -> tuple[float, float, Drive]:
@@ -162,10 +155,8 @@ def cost(n: int, seed: int) -> Iterator[Row]:
         h = step_at(omega, drive, float(0.1 * 40.0 ** rng.uniform()))
         while (chosen := pendulum.truncation_bound(omega, drive, h).substeps) > MOST_SUBSTEPS:
             h /= 2.0
-        with mp.workdps(60):
-            exact = reference.pendulum(
-                reference.Pendulum(*map(mpf, drive)), mpf(theta), mpf(omega), mpf(h), 30
-            )
+        scene, control = driven(drive)
+        exact = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
         field = math.sqrt(math.hypot(drive.alpha, drive.beta))
         limits = (
             TOLERANCE * max(1.0, abs(theta), abs(omega) * h),
@@ -300,8 +291,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
                 "bound-scatter",
                 "Proved bound against what a step really leaves out, for random drives and steps such that "
                 "x, the size that the bound follows from, lies between 0.02 and 0.5. Every point must lie "
-                f"left of the line. The truth is the reference with {DIGITS} digits; the series is summed "
-                "without rounding.",
+                f"left of the line. What is left out is summed with {DIGITS} digits.",
                 lambda: _draw_scatter(kinds["point"]),
             )
         )
@@ -319,9 +309,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         "A bound known before the step",
         [
             "Before a step is taken, a bound on what the Taylor series leaves out is known. Here it is "
-            "compared with what is left out. Both sides are truncation: the recurrence that is compiled for "
-            f"floats runs on numbers with {DIGITS + 40} digits, its constants included, and is held against "
-            "the reference solution. Rounding plays no part.",
+            "compared with what is left out: the sum of the exact motion's Taylor coefficients beyond the "
+            f"order, which the oracle computes with {DIGITS} digits. Rounding plays no part.",
             "The bound holds for every field, drag and drive of a given size, whatever the angle, so it is "
             "far above what most steps leave out. That costs little: a series of order N makes up for such a "
             "factor by a step that is shorter by the factor's (N + 1)th root.",

@@ -385,16 +385,16 @@ def differences(system: System, family: str, count: int = 50) -> tuple[float, fl
 
     Both are relative to the largest there is.
     """
-    from lag_envs.report.exact import motion_of
+    from lag_envs.report.oracle import oracle_of
 
     states, controls = system.draw(count, seed=1)
     problems = SceneProblems(system.scene, states, controls, system)
     n = problems.equation.size // 2
     q, v = system.turned(problems.y[:n]), system.turned(problems.y[n:])
     turn = system.turned(np.eye(n))
-    motion, found = motion_of(system.scene), []
+    oracle, found = oracle_of(system.scene), []
     for j in range(count):
-        mass, acceleration = motion.at(states[j].tolist(), controls[j].tolist())
+        mass, acceleration = oracle.at(states[j].tolist(), controls[j].tolist())
         other, joints = MOTIONS[family](system, q[:, j], v[:, j], float(controls[j, 0]))
         found.append((turn.T @ other @ turn, mass, system.back(joints), acceleration))
     m, mass, a, acceleration = (np.array(part) for part in zip(*found, strict=True))

@@ -14,7 +14,7 @@ from lag_envs.mechanics.algebra import Atom, Expr, evaluate, substitute
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.report.equations import Equation, Problems
-from lag_envs.report.exact import FLOATS, motion_of, solve
+from lag_envs.report.oracle import oracle_of, solve
 from lag_envs.report.rivals import Rival
 from lag_envs.report.timing import BLOCK, Sample
 from lag_envs.scenes.base import Scene
@@ -115,9 +115,8 @@ class SceneProblems(Problems):
         self.equation: SceneEquation = SceneEquation(scene)
         layout = scene._layout
         zero = np.zeros(len(starts))
-        given = dict(zip(scene.state_names, starts.T, strict=True))
         held = dict(zip(layout.controls, controls.T, strict=True))
-        self._q, self._v = motion_of(scene)._start(given, held, lambda x: zero + x)
+        self._q, self._v = oracle_of(scene).start(list(starts.T), list(controls.T), lambda x: zero + x)
         self._shift(-1.0)
         free, moving = layout.free, [m.name for m in layout.at("acceleration", "rate")]
         self.y = np.array([*(self._q[name] for name in free), *(self._v[name] for name in free)])
@@ -133,7 +132,7 @@ class SceneProblems(Problems):
         """Go from w to velocities, where a rate is held, or back."""
         scene = self.scene
         if scene._layout.at("rate"):
-            shift = motion_of(scene).shift(self._q, self._v, list(self.controls.T), FLOATS)
+            shift = oracle_of(scene).shift(self._q, self._v, list(self.controls.T))
             self._v |= {
                 name: self._v[name] + sign * x for name, x in zip(scene._layout.free, shift, strict=True)
             }

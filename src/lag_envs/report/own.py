@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from lag_envs import own_files
 from lag_envs.envs.single import LagrangianEnv
 from lag_envs.errors import UserError
-from lag_envs.report import general
+from lag_envs.report import general, general_results
 from lag_envs.report.content import Claim, Content, Picture, Table
-from lag_envs.report.exact import Unresolved, ends
 from lag_envs.report.motions import Array, Certified, SceneProblems
+from lag_envs.report.oracle import Unresolved
 from lag_envs.report.peers import Heyoka
 from lag_envs.report.radau import CompiledRadau
+from lag_envs.report.reference import ends
 from lag_envs.report.rivals import Compiled, Rival
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.scenes.base import Scene
@@ -139,7 +140,7 @@ def _of_scene(label: str, scene: Scene) -> Subject:
         for (_, half), unit in zip(boxes, scene.state_units, strict=True)
     ]
     return Subject(
-        label, scene, general.DT, [(0.0, w) for w in widths], [(-1.0, 1.0)] * len(scene.control_names)
+        label, scene, general_results.DT, [(0.0, w) for w in widths], [(-1.0, 1.0)] * len(scene.control_names)
     )
 
 
@@ -234,7 +235,7 @@ def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
     ours += [CompiledRadau(CompiledRadau.METHOD, n) for n in general.SUBSTEPS[CompiledRadau.METHOD][some]]
     others: list[Rival] = [Heyoka("Taylor", tolerance) for tolerance in general.HEYOKA[some]]
     clock = Certified(Certified.method_of(16), 1e-12)
-    for mode in general.MODES:
+    for mode in general_results.MODES:
         for rivals in (ours, others):
             yield from general.measured(
                 problems, truth, rivals, clock, mode, 3 if quick else 7, {"system": name}, s.dt
@@ -301,14 +302,14 @@ def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
 def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     """Return what is shown."""
     names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
-    found, factors = general.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
+    found, factors = general_results.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
     pictures = [
         Picture(
-            f"own-{general.slug(name)}",
+            f"own-{general_results.slug(name)}",
             f"Error against time, {name}. One control step from {MEMBERS} states at most, {FEW} in a quick "
             "report: worst error, and CPU time of a state's step; reference: Taylor series of SymPy's "
             "equations in balls.",
-            partial(general.draw, name, some),
+            partial(general_results.draw, name, some),
         )
         for name in names
         if (some := [r for r in rows if r["kind"] == "point" and r["system"] == name and "ns" in r])
@@ -329,7 +330,11 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
         ],
         [
             t
-            for t in (_steps(rows), *(_times(found, mode) for mode in general.MODES), _stability(rows))
+            for t in (
+                _steps(rows),
+                *(_times(found, mode) for mode in general_results.MODES),
+                _stability(rows),
+            )
             if t.rows
         ],
         pictures,
@@ -374,8 +379,8 @@ def _steps(rows: Sequence[Row]) -> Table:
     )
 
 
-def _times(found: Mapping[tuple, Mapping[str, general.Best]], mode: str) -> Table:
-    return dataclasses.replace(general._times(found, mode), name=f"own-times-{mode}")
+def _times(found: Mapping[tuple, Mapping[str, general_results.Best]], mode: str) -> Table:
+    return dataclasses.replace(general_results.times(found, mode), name=f"own-times-{mode}")
 
 
 def _stability(rows: Sequence[Row]) -> Table:
@@ -399,7 +404,7 @@ def _stability(rows: Sequence[Row]) -> Table:
 
 
 def _all(rows: Sequence[Row]) -> Table:
-    return dataclasses.replace(general._all(rows), name="own-points")
+    return dataclasses.replace(general_results.all_points(rows), name="own-points")
 
 
 def _claims(rows: Sequence[Row]) -> list[Claim]:

@@ -1,13 +1,22 @@
-"""The reference is held against closed forms, first principles and itself by other methods."""
+"""The oracle is held against closed forms, first principles and itself by other methods."""
 
 import numpy as np
 import pytest
+import sympy
 from mpmath import mp, mpf
-from reference import conditioning, flow, random_cases, scales
+from reference import conditioning, flow, moving_plane, random_cases, scales
+from series_systems import SYSTEMS, acceleration
+from test_series import FLOATS
 
 from lag_envs import scenes
-from lag_envs.report import reference
-from lag_envs.report.reference import Pendulum, elliptic, linear, pendulum, slow_manifold, taylor
+from lag_envs.report import formulas, reference
+from lag_envs.report import oracle as oracles
+from lag_envs.report.bound import driven
+from lag_envs.report.closed_forms import elliptic, linear
+from lag_envs.report.formulas import Formulas
+from lag_envs.report.oracle import Oracle, Unresolved, oracle_of
+from lag_envs.scenes import Scene, parameter
+from lag_envs.stepping.pendulum import Drive
 
 ZERO = mpf(0)
 KINDS = "task", "damped", "stiff", "extreme"
@@ -27,6 +36,15 @@ def arguments(case):
     return [case[k] for k in ("scene", "params", "state", "control", "dt")]
 
 
+def series(drive, theta, rate, dt, digits=50):
+    """Return the driven pendulum's end by the oracle, as one computation gives it."""
+    scene, control = driven(Drive(*drive))
+    return oracle_of(scene).once([0.0, 0.0, theta, rate], control, dt, digits)[2:]
+
+
+# --- closed forms -------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
     ("theta", "rate", "u", "dt"),
     [
@@ -40,46 +58,53 @@ def arguments(case):
         (0, 9.9, 0, 1),
     ],
 )
-def test_taylor_is_elliptic_without_damping(theta, rate, u, dt):
-    p = Pendulum(mpf(24.5), mpf(2.5) * u, ZERO, ZERO, ZERO)
-    start = mpf(theta), mpf(rate)
-    assert distance(taylor(p, *start, mpf(dt), 50), elliptic(p, *start, mpf(dt))) < 1e-40
+def test_series_is_elliptic_without_damping(theta, rate, u, dt):
+    exact = elliptic(mpf(24.5), mpf(2.5) * u, mpf(theta), mpf(rate), mpf(dt))
+    assert distance(series((24.5, 2.5 * u, 0, 0, 0), theta, rate, dt), exact) < 1e-40
 
 
 @pytest.mark.parametrize("excess", [0, 1e-15, -1e-15, 1e-30, -1e-30])
 def test_separatrix(excess):
-    p = Pendulum(mpf(4), ZERO, ZERO, ZERO, ZERO)
     start = ZERO, 4 * (1 + mpf(excess))
-    end = elliptic(p, *start, mpf(3))
-    assert distance(end, taylor(p, *start, mpf(3), 50)) < 1e-40
+    end = elliptic(mpf(4), ZERO, *start, mpf(3))
+    assert distance(end, series((4, 0, 0, 0, 0), *start, 3)) < 1e-40
     if excess == 0:
         assert distance(end, [2 * mp.atan(mp.sinh(6)), 4 / mp.cosh(6)]) < 1e-60
 
 
 def test_full_period():
     """A swing of amplitude 2 rad returns after 4 K(sin(1)^2) / omega."""
-    p = Pendulum(mpf(9), ZERO, ZERO, ZERO, ZERO)
     period = 4 * mp.ellipk(mp.sin(1) ** 2) / 3
-    assert distance(elliptic(p, mpf(2), ZERO, period), [2, 0]) < 1e-60
-    assert distance(taylor(p, mpf(2), ZERO, period, 50), [2, 0]) < 1e-45
+    assert distance(elliptic(mpf(9), ZERO, mpf(2), ZERO, period), [2, 0]) < 1e-60
+    assert distance(series((9, 0, 0, 0, 0), 2, 0, period), [2, 0]) < 1e-45
+
+
+@pytest.mark.parametrize("track", [1.5, None])
+def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
+    """The bar's own equation is recognised, undamped and only then, its support on the way or left out."""
+    bar, start = scenes.PivotedBar(track=track), [0.3, -0.2][: 2 if track else 0]
+    state = [*start, 2.0, 3.0]
+    exact = oracle_of(bar).flow(state, 4.0, 1.5)
+    monkeypatch.setattr(Oracle, "once", None)  # not called
+    assert distance(reference.flow(bar, state, 4.0, 1.5), exact) < 1e-29
+    with pytest.raises(TypeError):
+        reference.flow(scenes.PivotedBar(track=track, damping=1e-9), state, 4.0, 1.5)
 
 
 @pytest.mark.parametrize("decay", [1e-9, 1, 30, 2e3])
 def test_linear_limit_is_exponential(decay):
     """Without field theta' - v decays as exp(-gamma t), v the drift that the drive settles at."""
     dt, delta, start = mpf(0.02), mpf(3), (mpf(1), mpf(-7))
-    gamma = decay / dt
-    p = Pendulum(ZERO, ZERO, gamma, delta, ZERO)
+    gamma = mpf(decay / 0.02)
     drift = delta / gamma
     with mp.workdps(120):
         fall = 1 - mp.exp(-gamma * dt)
         closed = [start[0] + drift * dt + (start[1] - drift) * fall / gamma, 0]
         closed[1] = drift + (start[1] - drift) * (1 - fall)
     assert distance(linear(gamma, delta, ZERO, *start, dt), closed) < 1e-60
-    assert distance(pendulum(p, *start, dt, 50), closed) < 1e-45
-    assert distance(taylor(p, *start, dt, 50), closed) < 1e-45
-    ramp = p._replace(slope=mpf(400))
-    assert distance(taylor(ramp, *start, dt, 50), pendulum(ramp, *start, dt, 50)) < 1e-45
+    assert distance(series((0, 0, gamma, 3, 0), 1, -7, dt), closed) < 1e-45
+    ramp = linear(gamma, delta, mpf(400), *start, dt)
+    assert distance(series((0, 0, gamma, 3, 400), 1, -7, dt), ramp) < 1e-45
 
 
 @pytest.mark.parametrize(
@@ -91,21 +116,58 @@ def test_linear_limit_is_exponential(decay):
         (1e6, (2e7, 0), 0, 0),
     ],
 )
-def test_slow_manifold_is_taylor(gamma, field, delta, slope):
-    """gamma dt = 1e3 to 2e4; the strongest field moves up to .7 rad along the manifold."""
-    p = Pendulum(*map(mpf, (*field, gamma, delta, slope)))
-    start, dt, layer = (mpf(2), mpf(-7)), mpf(0.02), mpf(150) / gamma
-    plain = taylor(p, *start, dt, 55)
-    layered = slow_manifold(p, *taylor(p, *start, layer, 50), layer, dt, 50)
-    assert distance(layered, plain) < 1e-38
-    assert distance(pendulum(p, *start, dt, 50), plain) < 1e-38
+def test_collocation_is_the_series(gamma, field, delta, slope, monkeypatch):
+    """gamma dt = 400 to 2e4; the strongest field moves up to .7 rad along the slow manifold."""
+    case = (*field, gamma, delta, slope), 2, -7, 0.02
+    calls, collocated = [], Oracle._collocated
+
+    def count(*given):
+        calls.append(given)
+        return collocated(*given)
+
+    monkeypatch.setattr(Oracle, "_collocated", count)
+    layered = series(*case)
+    assert calls
+    monkeypatch.setattr(oracles, "STIFF", np.inf)
+    monkeypatch.setattr(Oracle, "_collocated", None)
+    assert distance(layered, series(*case, digits=55)) < 1e-38
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.5])
+def test_heavy_damping_of_one_joint_of_two(dt, monkeypatch):
+    """A slow joint beside a stiff one: collocation against the series."""
+
+    class Stiff(Scene):
+        stiff: float = parameter(2e4, "N m s", least=0.0)
+        coordinates = {"a": "rad", "b": "rad"}
+        controls = {"torque": "N m"}
+
+        def kinetic(self, q, v, xp):
+            return v.a**2 + 0.5 * v.b**2 + 0.3 * v.a * v.b * xp.cos(q.a - q.b)
+
+        def potential(self, q, xp):
+            return -9.81 * (xp.cos(q.a) + 0.5 * xp.cos(q.b))
+
+        def dissipation(self, q, v, u, xp):
+            return 0.5 * self.stiff * (v.b - v.a) ** 2
+
+        def applied(self, q, v, u, xp):
+            return {"a": u.torque}
+
+    case = [1.0, 2.0, -0.5, -3.0], [4.0], dt
+    end = oracle_of(Stiff()).once(*case, 45)
+    monkeypatch.setattr(oracles, "STIFF", np.inf)
+    if dt == 0.02:
+        assert distance(end, oracle_of(Stiff()).once(*case, 50)) < 1e-38
+    else:  # the relative rate has died out, up to what the field keeps
+        assert abs(end[1] - end[3]) < 1e-2
 
 
 def test_slow_manifold_to_leading_order():
     """At gamma dt = 1e6 a bar without drive creeps: tan(theta/2) ~ exp(-alpha t / gamma)."""
     gamma, alpha, dt = 1e7, 1e6, 0.1
     params = {"mass": 1.0, "com_distance": 1.0, "inertia": 0.0, "damping": gamma, "gravity": alpha}
-    theta, rate = flow("PivotedBar", params, (2.0, 0.0), 0.0, dt)
+    theta, rate = flow("PivotedBar", params | {"track": None}, (2.0, 0.0), 0.0, dt)
     expected = 2 * mp.atan(mp.tan(1) * mp.exp(-mpf(alpha) / mpf(gamma) * mpf(dt)))
     assert abs(theta - expected) < 10 * alpha / gamma**2
     assert abs(rate + alpha / gamma * mp.sin(theta)) < 10 * (alpha / gamma) ** 2 / gamma
@@ -142,6 +204,19 @@ def test_moving_plane_without_drag():
     end = [part[1] + dx * cosh + dv / turn * sinh, 0, phi + turn * dt]
     end[1] = slope[1] + dx * turn * sinh + dv * cosh + turn / 2
     assert distance(flow("Incline", params, (0.25, -0.5, 0.75), 2.0, 0.5), end) < 1e-38
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.7, 1e3, 1e6])
+def test_turning_plane_is_the_matrix_exponential(damping):
+    params = {"mass": 1.0, "radius": 0.5, "inertia": 0.125, "gravity": 8.0, "damping": damping}
+    given = mpf(2) / 3, mpf(damping) * 2 / 3, mpf(8), mpf(0.5), mpf(1.5)
+    case = (0.25, -0.5, 0.75), 1.5, 0.125
+    with mp.workdps(100):
+        exact = moving_plane(*given, list(map(mpf, case[0])), mpf(case[2]))
+    assert distance(flow("Incline", {**params, "control": "tilt_rate"}, *case), exact) < 1e-29
+
+
+# --- first principles ---------------------------------------------------------------------------------------
 
 
 def bar_lagrangian(q, v, t):
@@ -228,6 +303,116 @@ def test_euler_lagrange(scene, params, state, control, place, lagrangian, carrie
     assert abs((end[place] - start[place]) / h - v) < 1e-15
 
 
+@pytest.mark.parametrize("system", SYSTEMS, ids=lambda system: system.name)
+def test_sympy_gives_the_equations_that_were_typed_in(system):
+    generator = np.random.default_rng(5)
+    oracle, first = oracle_of(system.scene), 2 * system.driven
+    for _ in range(10):
+        state, control = system.draw(generator)
+        q, v = state[first::2], state[first + 1 :: 2]
+        typed = acceleration(system, q, v, control, state[0], control[0] if system.driven else None, FLOATS)
+        found = oracle.at(state, control)[1]
+        np.testing.assert_allclose(found, typed, rtol=1e-11, atol=1e-11 * np.abs(typed).max())
+
+
+def test_floats_are_taken_as_they_are():
+    """0.1 is not a tenth: neither as a parameter nor in a formula."""
+
+    class Slide(Scene):
+        push: float = parameter(0.1, "N")
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return -(self.push + 0.1) * q.x
+
+    x, v = oracle_of(Slide()).flow([0.0, 0.0], [], 1.0, 40)
+    assert abs(v - 2 * mpf(0.1)) < 1e-39 < abs(v - mpf(1) / 5) and abs(x - mpf(0.1)) < 1e-39
+
+
+def test_functions_of_a_formula():
+    """Each of them, by energy: the start's speed is what the place has left of it."""
+
+    class Hill(Scene):
+        kind: str = "tan"
+        coordinates = {"x": "m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2
+
+        def potential(self, q, xp):
+            return getattr(xp, self.kind)(0.5 + q.x**2)
+
+    for kind in ("tan", "tanh", "atan", "exp", "log", "sqrt", "sin", "cos"):
+        x, v = oracle_of(Hill(kind=kind)).flow([0.3, 0.2], [], 0.5, 40)
+        f = getattr(mp, kind)
+        energy = [w**2 / 2 + f(mpf(0.5) + y**2) for y, w in ((mpf(0.3), mpf(0.2)), (x, v))]
+        assert abs(energy[1] - energy[0]) < 1e-39, kind
+        assert abs(v - mpf(0.2)) > 1e-3
+
+
+class Wall(Scene):
+    """A potential without end at 0, which pulls or pushes."""
+
+    sign: float = parameter(1.0, "J")
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * v.x**2
+
+    def potential(self, q, xp):
+        return self.sign * xp.log(q.x)
+
+
+def test_a_motion_into_a_singular_point_is_unresolved():
+    with pytest.raises(Unresolved):
+        oracle_of(Wall()).flow([1e-3, -10.0], [], 0.01)
+
+
+def test_a_motion_to_the_edge_of_one_is_resolved():
+    """It comes as near as 1e-25, and flies off with the energy that it came with."""
+    x, v = oracle_of(Wall(sign=-1.0)).flow([1e-3, -10.0], [], 0.01)
+    assert v > 0 and abs(v**2 / 2 - mp.log(x) - 50 + mp.log(mpf(1e-3))) < 1e-27
+
+
+def test_a_power_that_it_does_not_know_is_named():
+    x = sympy.Symbol("x")
+    with pytest.raises(ValueError, match=r"the power x\*\*\(1/3\) is neither whole nor a half"):
+        Formulas([x ** sympy.Rational(1, 3)], [x], [])
+
+
+def test_a_state_of_another_length_is_refused():
+    oracle = oracle_of(scenes.PivotedBar(track=None))
+    with pytest.raises(ValueError, match="state must have 2 entries, got 4"):
+        oracle.flow([0.0, 0.0, 1.0, 2.0], 0.0, 0.02)
+    with pytest.raises(ValueError, match="controls must have 1 entries, got 2"):
+        oracle.flow([1.0, 2.0], [0.0, 0.0], 0.02)
+
+
+def test_it_shares_no_code_with_what_it_checks():
+    """Neither equations nor stepping: it imports SymPy's view of a scene and nothing else of ours."""
+    import ast
+    from pathlib import Path
+
+    imports = [
+        f"{node.module}.{name.name}"
+        for node in ast.walk(
+            ast.parse("".join(Path(m.__file__).read_text("utf-8") for m in (oracles, formulas)))
+        )
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    ]
+    assert {name for name in imports if name.startswith("lag_envs")} == {
+        "lag_envs.lagrange", "lag_envs.report.formulas.Formulas", "lag_envs.report.formulas.Series",
+        "lag_envs.scenes.base.Scene",
+    }  # fmt: skip
+
+
+# --- itself -------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_halves_make_a_step(kind):
     for case in random_cases(kind, 12, seed=7):
@@ -258,7 +443,7 @@ def test_conditioning():
         "control": "tilt",
     }
     assert conditioning("Incline", slope, (0.0, 3.0), 0.0, 1.0)[1] == pytest.approx(3 * np.exp(-2))
-    bar = {"mass": 1.0, "com_distance": 1.0, "inertia": 0.0, "gravity": 9.0}
+    bar = {"mass": 1.0, "com_distance": 1.0, "inertia": 0.0, "gravity": 9.0, "track": None}
     angle = np.pi - 1e-6
     theta, rate = conditioning("PivotedBar", bar, (angle, 0.0), 0.0, 2.0)
     assert theta == pytest.approx(angle * np.cosh(6) + np.sinh(6), rel=1e-3)
@@ -276,15 +461,6 @@ def test_random_cases(kind):
     for case in cases:
         assert len(scales(*arguments(case))) == len(case["state"])
         assert np.all(np.isfinite([*case["state"], case["control"], case["dt"]]))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_scenes_own_coefficients_are_the_typed_ones(kind):
-    """The report takes coefficients from the scene's formulas; here they are typed in again."""
-    for case in random_cases(kind, 12, seed=8):
-        scene = getattr(scenes, case["scene"])(**case["params"])
-        end = reference.flow(scene, case["state"], case["control"], case["dt"])
-        assert distance(end, flow(*arguments(case))) < 1e-29, case
 
 
 def test_remembered(tmp_path, monkeypatch):

@@ -1,0 +1,325 @@
+"""What the errors of whole episodes come to: tables, pictures, claims."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.episodes import DIGITS, TIMES
+from lag_envs.report.runner import Result, Row
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Every step of ours is to stay below the first; every episode below the second, and below so many times one
+#: rounding of its start, amplified.
+LARGEST_STEP, LARGEST_ERROR, ROUNDINGS = 1e-15, 1e-13, 100.0
+APART = 1e9  #: by this factor at least, Gymnasium's errors are to be larger than the largest of ours
+#: The undriven pendulum is let go at rest, this far from hanging [rad]; it is compared over the first, its
+#: energy over the second time [s].
+RELEASED, COMPARED, LONG = 2.5, 10.0, 100.0
+MARKS = ("one step", *(f"{t:g} s" for t in TIMES), "the end")
+BLUE, GREY = "#0072b2", "#666666"
+#: Colours of Okabe and Ito.
+COLOURS = {"Pendulum-v1": "#d55e00", "CartPole-v1": "#cc79a7", "Acrobot-v1": "#009e73"}
+
+
+def content(rows: list[Row], problems: list[Result]) -> Content:
+    """Return what the section shows."""
+    cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
+    episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
+    free = {case: group for case, group in cases.items() if group[0]["seed"] is None}
+    failed = {result.name: result.problem or "" for result in problems}
+    pictures = []
+    if episodes:
+        pictures = [
+            Picture(
+                "environment-errors",
+                "Error of whole episodes, relative to the size of the state, as the largest up to a time. "
+                "One line per episode, and for CartPole-v1 another for its update carried on past its end. "
+                "The exact states are computed to more than 30 digits. Dotted, in the same colours: what "
+                "one rounding of the start grows to, in exact arithmetic.",
+                lambda: _draw_all(episodes),
+            ),
+            Picture(
+                "environment-errors-each",
+                "The same, environment by environment. Solid: error of an episode. Dotted: one rounding of "
+                "its start, amplified by the system itself.",
+                lambda: _draw_each(episodes),
+            ),
+        ]
+    return Content(
+        "Environments over whole episodes",
+        _text(),
+        [_cases_table(episodes, failed), _entries_table(cases), *([_free_table(free)] if free else [])],
+        pictures,
+        _claims(rows),
+        _summary(episodes),
+        [_details(rows)] if rows else [],
+    )
+
+
+def _text() -> list[str]:
+    return [
+        "Episodes are recorded from gym.make under random actions: float64 states, and the controls that "
+        "were applied. The exact states have the same start and the same controls, and are not rounded in "
+        f"between. The oracle computes them with {DIGITS} digits, and those of ours once more with "
+        f"{DIGITS + 12} for the first seed. Where a task kicks, the kicks are made by its own formula from "
+        "the environment's own random numbers, without rounding.",
+        "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
+        "cut speeds: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 wraps "
+        "are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its actions "
+        "are; that counts as its error. CartPole-v1 falls within a second under random actions, so its "
+        "update is also carried on past that end, to 10 s.",
+        "An error is the largest over the entries of the state and over the time until then, each entry "
+        "relative to the largest that it gets in the episode, at least 1 in SI units. No method that starts "
+        "from float64 numbers can do better than about one rounding of the start, amplified by the system. "
+        "So that is shown beside it: every entry of the start is moved by 2^-53 of its size, and followed in "
+        "exact arithmetic. Where the system damps or does not amplify, roundings of later steps add to it.",
+        "The error of one step is the largest that any step of the episode makes by itself: each is taken "
+        "again from the state that was recorded before it, in exact arithmetic, and compared with the state "
+        "recorded after it. Ours carry cosine and sine beside the angle; where an angle has grown to many "
+        "turns, its rounding and theirs differ, and that counts as error too.",
+    ]
+
+
+def _column(mark: str) -> str:
+    return "largest error of one step" if mark == "one step" else f"error up to {mark}"
+
+
+def _largest(values: Sequence[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return max(there) if len(there) == len(values) and there else None
+
+
+def _ratio(row: Row) -> float:
+    return row["error"]["the end"] / row["amplified"]["the end"]
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low} to {high}"
+
+
+def _cases_table(episodes: dict[str, list[Row]], failed: dict[str, str]) -> Table:
+    lines: list[list[Any]] = []
+    for case, group in episodes.items():
+        ends = [r["error"]["the end"] for r in group]
+        lines.append(
+            [
+                case,
+                group[0]["integrator"],
+                group[0]["dt"],
+                len(group),
+                _span([r["seconds"] for r in group]),
+                *(_largest([r["error"][mark] for r in group]) for mark in MARKS[:-1]),
+                median(ends),
+                max(ends),
+                max(r["amplified"]["the end"] for r in group),
+                max(_ratio(r) for r in group),
+                "",
+            ]
+        )
+    columns = [
+        *("environment", "integrator", "dt [s]", "episodes", "length [s]"),
+        *map(_column, MARKS[:-1]),
+        *("whole episode, median", "whole episode, largest"),
+        *("amplified rounding", "error over amplified rounding", "problem"),
+    ]
+    empty = [None] * (len(columns) - 2)
+    lines += [[name, *empty, problem] for name, problem in failed.items()]
+    return Table(
+        "environment-errors",
+        "Errors relative to the size of the state. Largest over the episodes where not said otherwise; "
+        "empty where an episode was over before.",
+        columns,
+        lines,
+    )
+
+
+def _entries_table(cases: dict[str, list[Row]]) -> Table:
+    lines = []
+    for case, group in cases.items():
+        for i, entry in enumerate(group[0]["entries"]):
+            errors = [_largest([r["entries"][i][mark] for r in group]) for mark in MARKS]
+            size = max(r["entries"][i]["size"] for r in group)
+            lines.append([case, entry["name"], entry["unit"], size, *errors])
+    return Table(
+        "environment-entries",
+        "Errors of each entry of the state in its unit, the largest over the episodes. Size: the largest "
+        "that the entry gets, at least 1.",
+        ["environment", "entry", "unit", "size", *map(_column, MARKS)],
+        lines,
+    )
+
+
+def _free_table(free: dict[str, list[Row]]) -> Table:
+    lines = []
+    for case, row in ((case, row) for case, group in free.items() for row in group):
+        angle = next(e for e in row["entries"] if e["name"] == "theta")
+        steps = [case, row["integrator"], row["dt"], angle["one step"], angle["1 s"], angle["10 s"]]
+        lines.append([*steps, row["amplified"]["10 s"], _ratio(row), 100.0 * row["gain"]])
+    return Table(
+        "environment-undriven",
+        f"A pendulum without control, let go at rest {RELEASED} rad from hanging: error of its angle, and by "
+        f"how much its energy above rest grows in {LONG:g} s, where it should stay. Ours has the equation of "
+        "motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its series is laid out for, so "
+        "the error is truncation within the 1e-12 rad/s that a step may leave out; with 0.02 s only rounding "
+        "is left. CartPole-v1 is given no force.",
+        [
+            *("case", "integrator", "dt [s]", "angle, one step [rad]", "up to 1 s [rad]"),
+            *("up to 10 s [rad]", "amplified rounding", "error over amplified rounding"),
+            f"energy gained in {LONG:g} s [%]",
+        ],
+        lines,
+    )
+
+
+def _details(rows: list[Row]) -> Table:
+    lines = [
+        [r["case"], r["seed"], r["steps"], r["terminated"], e["name"], e["unit"], *(e[m] for m in MARKS)]
+        for r in rows
+        for e in r["entries"]
+    ]
+    columns = ["case", "seed", "steps", "terminated", "entry", "unit", *map(_column, MARKS)]
+    return Table(
+        "environment-episodes", "Errors of each episode, entry by entry, in its unit.", columns, lines
+    )
+
+
+def _summary(episodes: dict[str, list[Row]]) -> Table | None:
+    lines = [
+        [
+            case,
+            group[0]["integrator"],
+            _largest([r["error"]["one step"] for r in group]),
+            max(r["error"]["the end"] for r in group),
+            _span([r["seconds"] for r in group]),
+            max(_ratio(r) for r in group),
+        ]
+        for case, group in episodes.items()
+    ]
+    if not lines:
+        return None
+    return Table(
+        "environments",
+        "Error against the exact motion under the same controls, relative to the size of the state; the "
+        "largest over random episodes. One step: the largest over all of their steps. Last column: over what "
+        "one rounding of the start grows to by itself.",
+        ["environment", "integrator", "one step", "whole episode", "length [s]", "over rounding"],
+        lines,
+    )
+
+
+def _claims(rows: list[Row]) -> list[Claim]:
+    made = [r for r in rows if r["ours"] and r["seed"] is not None]
+    peers = [r for r in rows if not r["ours"] and r["seed"] is not None]
+    apart = [r["disagreement"] for r in made if "disagreement" in r]
+    free = [r for r in rows if r["seed"] is None]
+    same = {r["ours"]: r for r in free if "Pendulum-v1" in r["case"] and r["dt"] == 0.05}
+    worst = max(made, key=lambda r: r["error"]["the end"], default=None)
+    least = min(peers, key=lambda r: r["error"]["the end"], default=None)
+    above = max(made, key=_ratio, default=None)
+    step = max(made, key=lambda r: r["error"]["one step"], default=None)
+    claims = [
+        Claim(
+            f"No episode of ours is off by more than {LARGEST_ERROR:g} of the state's size.",
+            worst["error"]["the end"] <= LARGEST_ERROR if worst else None,
+            f"{worst['error']['the end']:.2g} in {worst['case']}, of {len(made)} episodes" if worst else "",
+        ),
+        Claim(
+            f"Every error of ours stays below {ROUNDINGS:g} times one rounding of the start, as the system "
+            "itself amplifies it.",
+            _ratio(above) <= ROUNDINGS if above else None,
+            f"{_ratio(above):.2g} times in {above['case']}" if above else "",
+        ),
+        Claim(
+            f"No step of ours is off by more than {LARGEST_STEP:g} of the state's size.",
+            step["error"]["one step"] <= LARGEST_STEP if step else None,
+            f"{step['error']['one step']:.2g} in {step['case']}, of {sum(r['steps'] for r in made):,} steps"
+            if step
+            else "",
+        ),
+        Claim(
+            f"Every episode of Gymnasium's is off by more than {APART:g} times the largest error of ours.",
+            least["error"]["the end"] > APART * worst["error"]["the end"] if worst and least else None,
+            f"{least['case']}: at least {least['error']['the end']:.2g}, "
+            f"{least['error']['the end'] / worst['error']['the end']:.1g} times"
+            if worst and least
+            else "",
+        ),
+        Claim(
+            "On the undriven pendulum with the same equation and step, Pendulum-v1 is off by more than "
+            f"{APART:g} times as much as ours, after 10 s.",
+            _angle(same[False]) > APART * _angle(same[True]) if len(same) == 2 else None,
+            "; ".join(f"{r['case']}, dt {r['dt']:g} s: {_angle(r):.3g} rad" for r in free),
+        ),
+        Claim(
+            "Two computations of the exact states with different digits agree to 1e-25.",
+            max(apart) <= 1e-25 if apart else None,
+            f"{max(apart):.1g} apart in {len(apart)} episodes" if apart else "",
+        ),
+    ]
+    return claims
+
+
+def _angle(row: Row) -> float:
+    """Return the largest error of an undriven pendulum's angle [rad]."""
+    return next(e["the end"] for e in row["entries"] if e["name"] == "theta")
+
+
+def _colour(row: Row) -> str:
+    return BLUE if row["ours"] else COLOURS[row["case"].partition(",")[0]]
+
+
+def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:
+    """Return times, errors and amplified roundings; what is exactly 0 is drawn at the picture's lower end."""
+    times, errors, amplified = zip(*row["curve"], strict=True)
+    return list(times), [max(e, 1e-19) for e in errors], list(amplified)
+
+
+def _draw_all(episodes: dict[str, list[Row]]) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    named: set[str] = set()
+    for row in sorted(itertools.chain(*episodes.values()), key=lambda r: r["ours"]):
+        name = "lag_envs, all environments" if row["ours"] else row["case"].partition(",")[0]
+        times, errors, amplified = _curve(row)
+        label = None if name in named else name
+        named.add(name)
+        axes.plot(times, errors, color=_colour(row), lw=1.8 if row["ours"] else 1.2, label=label)
+        axes.plot(times, amplified, color=_colour(row), lw=0.7, ls=":")
+    axes.plot([], [], color=GREY, lw=1, ls=":", label="one rounding of the start, amplified")
+    axes.set(xscale="log", yscale="log", xlabel="time in the episode [s]", ylim=(1e-18, 30))
+    axes.set_ylabel("error relative to the state's size")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.52), fontsize=9)
+    return figure
+
+
+def _draw_each(episodes: dict[str, list[Row]]) -> Figure:
+    from matplotlib.figure import Figure
+
+    columns = 3
+    lines = -(-len(episodes) // columns)
+    figure = Figure(figsize=(8, 0.6 + 1.75 * lines), layout="constrained")
+    grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    for axes in grid.flat[len(episodes) :]:
+        axes.set_axis_off()
+    for axes, (case, group) in zip(grid.flat, episodes.items(), strict=False):
+        for row in group:
+            times, errors, amplified = _curve(row)
+            axes.plot(times, errors, color=_colour(row), lw=1.6)
+            axes.plot(times, amplified, color=GREY, lw=1, ls=":")
+        axes.set(xscale="log", yscale="log", ylim=(1e-18, 30))
+        axes.set_title(case, fontsize=9)
+        axes.grid(alpha=0.3)
+        axes.tick_params(labelsize=8)
+    figure.supxlabel("time in the episode [s]", fontsize=9)
+    figure.supylabel("error relative to the state's size", fontsize=9)
+    return figure

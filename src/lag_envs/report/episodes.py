@@ -1,0 +1,176 @@
+"""Recorded episodes, and their errors against exact ones.
+
+From the same start, under the same controls, the exact states are computed to more than 30 digits by chaining
+control steps whose states are not rounded in between. For the error of one step, every step of the episode is
+taken again by itself, from the state that was recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from mpmath import mp, mpf
+from numpy.typing import NDArray
+
+from lag_envs.report import reference
+from lag_envs.report.oracle import oracle_of
+from lag_envs.report.runner import Row
+from lag_envs.stepping.primitives import episode_key, uniform
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+EPS = 2.0**-53
+DIGITS = 34
+#: Errors are told up to these times [s], and up to the end.
+TIMES = (1.0, 5.0, 10.0)
+POINTS = 120  #: of a curve in the picture
+
+
+class Episode(NamedTuple):
+    """What was recorded: ``controls[i]`` was held from ``states[i]`` to ``states[i + 1]``."""
+
+    states: Array
+    controls: list[float]
+    terminated: bool
+
+
+def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
+    """Record an episode of one of our environments, which has been reset."""
+    inner: Any = env.unwrapped
+    states, controls, terminated, truncated = [inner.state], [], False, False
+    while not (terminated or truncated):
+        _, _, terminated, truncated, _ = env.step(next(actions))
+        states.append(inner.state)
+        controls.append(inner.control)
+    return Episode(np.array(states), controls, terminated)
+
+
+def random_actions(env: gym.Env, seed: int) -> Iterator[Any]:
+    """Return an endless sequence of actions."""
+    env.action_space.seed(seed)
+    while True:
+        yield env.action_space.sample()
+
+
+def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int, float], list[mpf]]:
+    """Return what takes one exact step of our environment: from a state, with a number from 1 and a control.
+
+    Kicks are those of the first episode after a reset with that seed, made by the task's own formula from the
+    environment's own random numbers, which are a function of seed, episode and step. They are multiples of
+    2**-52, so they are exact.
+    """
+    k = SimpleNamespace(**task.formulas.constants())
+    choose = SimpleNamespace(where=lambda c, a, b: a if c else b)
+    oracle = oracle_of(task.scene)
+    key = np.uint64(episode_key(np.uint64(seed), np.uint64(1)))  # a plain integer would be taken as signed
+
+    def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
+        # One computation; whole episodes are vouched for by a second one with more digits.
+        state = oracle.once(state, control, task.dt, digits)
+        with mp.workdps(digits + 30):
+            draws = [float(uniform(key, np.uint64(number), np.uint64(i))) for i in range(task.draws)]
+            return list(task.formulas.kick(choose, draws, state, k))
+
+    return step
+
+
+def replay(
+    task: Task, seed: int, start: Sequence[Any], controls: Sequence[float], digits: int
+) -> list[list[mpf]]:
+    """Return the exact states of one of our episodes: the first one after a reset with that seed."""
+    step = stepping(task, seed, digits)
+    path = [[mpf(x) for x in start]]
+    for number, control in enumerate(controls, start=1):
+        path.append(step(path[-1], number, control))
+    return path
+
+
+# --- errors ---
+
+
+def sizes(states: Array) -> Array:
+    """Return the size of each state entry: the largest it gets in the episode, at least 1."""
+    return np.maximum(1.0, np.abs(states).max(axis=0))
+
+
+def moved(states: Array) -> list[mpf]:
+    """Return the start with every entry moved by one rounding of its size."""
+    with mp.workdps(60):
+        return [mpf(x) + EPS * mpf(size) for x, size in zip(states[0], sizes(states), strict=True)]
+
+
+def compare(
+    episode: Episode,
+    path: list[list[mpf]],
+    shifted: list[list[mpf]],
+    alone: list[list[mpf]],
+    dt: float,
+    wraps: Sequence[int] = (),
+) -> Row:
+    """Return errors and amplified rounding, each as the largest up to a time, relative to the states' sizes.
+
+    "one step" is the largest error that any step of the episode makes by itself.
+
+    Parameters
+    ----------
+    episode : Episode
+        What was recorded.
+    path, shifted : list of list of mpf
+        The exact states from the same start, and from the start that was moved by a rounding.
+    alone : list of list of mpf
+        For each step the exact state at its end, from the recorded state at its start.
+    dt : float
+        Control step [s].
+    wraps : sequence of int
+        Entries that the environment brings back into [-π, π].
+    """
+    states, scale = episode.states, sizes(episode.states)
+
+    def errors(states: Array, exact: list[list[mpf]]) -> Array:
+        each = np.array([reference.errors(a, b) for a, b in zip(states, exact, strict=True)])
+        for i in wraps:
+            each[:, i] = np.remainder(each[:, i] + math.pi, 2.0 * math.pi) - math.pi
+        return np.abs(each)
+
+    up_to = np.maximum.accumulate(errors(states, path))
+    one = errors(states[1:], alone).max(axis=0)
+    with mp.workdps(60):
+        growth = np.array(
+            [[float(a - b) for a, b in zip(x, y, strict=True)] for x, y in zip(shifted, path, strict=True)]
+        )
+    error = (up_to / scale).max(axis=1)
+    amplified = np.maximum.accumulate((np.abs(growth) / scale).max(axis=1))
+    steps = len(episode.controls)
+    marks = {**{f"{t:g} s": round(t / dt) for t in TIMES}, "the end": steps}
+
+    def pairs(values: Array) -> list[list[float]]:
+        return [[float(a), float(s)] for a, s in zip(values, scale, strict=True)]
+
+    points = np.unique(np.geomspace(1, steps, POINTS).round().astype(int))
+    return {
+        "dt": dt,
+        "steps": steps,
+        "seconds": steps * dt,
+        "terminated": episode.terminated,
+        "error": {"one step": float((one / scale).max())}
+        | {name: float(error[i]) if i <= steps else None for name, i in marks.items()},
+        "amplified": {name: float(amplified[i]) if i <= steps else None for name, i in marks.items()},
+        "curve": [[float(i * dt), float(error[i]), float(amplified[i])] for i in points],
+        "each": {"one step": pairs(one)}
+        | {name: pairs(up_to[i]) if i <= steps else None for name, i in marks.items()},
+    }
+
+
+def entries(each: dict[str, Any], names: Sequence[str], units: Sequence[str]) -> list[Row]:
+    """Return for each state entry its name, unit, size, and the error up to each mark in that unit."""
+    return [
+        {"name": name, "unit": unit, "size": each["the end"][i][1]}
+        | {mark: values and values[i][0] for mark, values in each.items()}
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+    ]

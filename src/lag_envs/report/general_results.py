@@ -1,0 +1,397 @@
+"""What errors and times of scenes of energies come to: tables, claims, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from statistics import median
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.linkages import SYSTEMS
+from lag_envs.report.motions import Certified
+from lag_envs.report.runner import Result, Row
+from lag_envs.stepping.general import usual_order
+from lag_envs.stepping.series import TOLERANCE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Length of the control step [s], and states that it is taken from.
+DT, MEMBERS = 0.02, 200
+#: Orders that the certificate is asked for.
+CERTIFIED_ORDERS = (12, 14, 16, 18, 20, 22)
+#: Errors at which times are compared.
+TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
+MODES = {"single": "alone", "batch": "in a batch"}
+LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "compiled": "compiled"}
+#: Models count as equal to this, relative; so much may be lost of energy.
+EQUAL, DRIFT = 1e-12, 1e-9
+
+
+class Best(NamedTuple):
+    """The quickest setting of a method that reaches an error."""
+
+    ns: float
+    label: str
+
+
+def label(row: Row) -> str:
+    """Return a setting in words."""
+    if row["family"] in ("ours", "heyoka"):
+        return f"{row['method'].removeprefix('lag_envs, ')}, {row['setting']:g}"
+    return f"{row['method']}, {row['setting']:g} substep{'s' if row['setting'] > 1 else ''}"
+
+
+def column(row: Row) -> str:
+    """Return whose column a point belongs to: compiled methods have one each."""
+    if row["family"] == "ours":
+        return "lag_envs"
+    if row["family"] == "compiled":
+        return f"{row['method']}, compiled"
+    return LABELS[row["family"]]
+
+
+#: Those that are compared with, and in which columns they are.
+OTHERS = (
+    ("other libraries", ("heyoka", "MuJoCo", "Pinocchio")),
+    (
+        "steps of one length without a bound, compiled as ours is",
+        ("RK4, compiled", "DOP853, compiled", "Radau IIA, compiled"),
+    ),
+)
+COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
+
+
+def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
+    """Return, by system, mode and error, the quickest setting of each column.
+
+    Times are in ours of one job, by the clock that every job has taken; what has no batch is in it as alone.
+    """
+    points = [r for r in rows if r["kind"] == "point" and "ns" in r and r["error"] is not None]
+    clocks: dict[tuple[str, str], float] = {}
+    for r in points:
+        if r["family"] == "ours":
+            clocks.setdefault((r["system"], r["mode"]), r["clock"])
+    found: dict[tuple[str, str, float], dict[str, Best]] = {}
+    for r in points:
+        ns = r["ns"] * clocks.get((r["system"], r["mode"]), r["clock"]) / r["clock"]
+        for mode in MODES:
+            if mode != r["mode"] and r["batched"]:
+                continue
+            for target in TARGETS:
+                here = found.setdefault((r["system"], mode, target), {})
+                if r["error"] <= target and not (column(r) in here and here[column(r)].ns <= ns):
+                    here[column(r)] = Best(ns, label(r))
+    return found
+
+
+def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
+    """Return what is shown: times at equal errors, equality of models, certificates, first steps, energy."""
+    found = best(rows)
+    missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
+    fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
+    claims = [_equal(rows), _accurate(rows), *fastest, _conserved(rows)]
+    pictures = [
+        Picture(
+            f"general-{slug(name)}",
+            f"Error against time, {name}. One control step of {DT:g} s from {MEMBERS} harsh states: worst "
+            "error, and CPU time of a state's step; reference: Lagrange's equations by SymPy, Taylor "
+            "series in python-flint's balls.",
+            partial(draw, name, [r for r in rows if r["kind"] == "point" and r["system"] == name]),
+        )
+        for name in SYSTEMS
+        if any(r["kind"] == "point" and r["system"] == name for r in rows)
+    ]
+    tables = [times(found, mode) for mode in MODES]
+    tables += [_models(rows), _shares(rows), _first(rows), _energy(rows)]
+    return Content(
+        "Any Lagrangian",
+        [
+            "Scenes that state nothing but their energies are stepped by the general series, with the "
+            f"certificate that comes with each step. Here they take one control step of {DT:g} s from "
+            f"{MEMBERS} harsh states, each joint turning at up to 6 to 12 rad/s at once. An error is that "
+            "of the worst entry of the worst state, relative to max(1, |entry|), against Taylor series of "
+            "Lagrange's equations by SymPy in python-flint's ball arithmetic.",
+            "All run in compiled loops, many states in one call, on one core; what a call costs counts for "
+            "everybody, compiling for nobody. Samples are taken in turn, and times are medians of the "
+            "processor's time. The errors are those of the calls that are timed, at the quickest setting "
+            "that reaches the error given.",
+            "Ours certifies each step, at a tolerance and an order. The others give no bound: which "
+            "setting reaches an error is known here from the exact ends. heyoka runs with fast_math, "
+            "without compact mode, its compiled step in a compiled loop, in a batch in blocks of two "
+            "widths. MuJoCo runs its own model in compiled rollouts, by Euler, implicitfast and RK4, "
+            "Pinocchio its articulated-body algorithm in RK4 steps in a C++ loop; a driven support is a "
+            "field in its frame for both. RK4, DOP853 and Radau IIA take steps of one length and are "
+            "compiled as ours is.",
+            *([f"Not taken part: {', '.join(missing)}."] if missing else []),
+            *(verdict(found, mode) for mode in MODES if found),
+        ],
+        [t for t in tables if t.rows],
+        pictures,
+        claims,
+        summary=_summary(found),
+        details=[all_points(rows)],
+    )
+
+
+def slug(name: str) -> str:
+    """Return a system's name as part of a file's."""
+    return name.replace(",", "").replace(" ", "-")
+
+
+def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
+    """Say of each column how it compares at equal error."""
+    parts = []
+    for name in COLUMNS:
+        ratios = [
+            here[name].ns / here["lag_envs"].ns
+            for (_, of, _), here in found.items()
+            if of == mode and name in here and "lag_envs" in here
+        ]
+        if not ratios:
+            continue
+        worst, wins = min(ratios), sum(r < 1.0 for r in ratios)
+        text = f"{name} takes {worst:.2g} to {max(ratios):.3g} times our time"
+        parts.append(text + (f", and is faster in {wins} of {len(ratios)} cases" if wins else ""))
+    return (
+        f"At equal error, {MODES[mode]}: {'; '.join(parts)}."
+        if parts
+        else f"Nothing to compare {MODES[mode]}."
+    )
+
+
+def _cell(here: Mapping[str, Best], name: str) -> float | None:
+    return round(here[name].ns, 1) if name in here else None
+
+
+def _others(here: Mapping[str, Best]) -> list[tuple[float, str]]:
+    return sorted((b.ns, name) for name, b in here.items() if name != "lag_envs")
+
+
+def times(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> Table:
+    """Return the quickest setting of each column, by system and error."""
+    rows = []
+    for (system, of, target), here in found.items():
+        if of != mode or "lag_envs" not in here:
+            continue
+        others, ours = _others(here), here["lag_envs"]
+        ratio = others[0][0] / ours.ns if others else None
+        rows.append((
+            system, f"{target:g}", round(ours.ns, 1), ours.label, *(_cell(here, name) for name in COLUMNS),
+            ratio, f"{others[0][1]}: {here[others[0][1]].label}" if others else None,
+        ))  # fmt: skip
+    return Table(
+        f"general-times-{mode}",
+        f"CPU time of a control step [ns] {MODES[mode]}, each at its quickest setting whose worst error is "
+        "below the one given; the ratio is that of the quickest other to ours, below 1 where the other is "
+        "faster",
+        (
+            "system",
+            "error",
+            "lag_envs",
+            "order, tolerance",
+            *COLUMNS,
+            "quickest other / ours",
+            "quickest other",
+        ),
+        rows,
+    )
+
+
+def _summary(found: Mapping[tuple, Mapping[str, Best]]) -> Table | None:
+    rows = []
+    for (system, mode, target), here in found.items():
+        if mode == "single" and target in (1e-6, 1e-12) and "lag_envs" in here:
+            together = found[system, "batch", target]
+            cells = [_cell(here, name) for name in COLUMNS[:5]]
+            rows.append((system, f"{target:g}", _cell(here, "lag_envs"), _cell(together, "lag_envs"), *cells,
+                         _cell(together, "heyoka")))  # fmt: skip
+    if not rows:
+        return None
+    return Table(
+        "general-summary",
+        f"Scenes that are only energies: CPU time of a control step of {DT:g} s [ns], each at its quickest "
+        f"setting whose worst error from {MEMBERS} harsh states is below the one given; ours is certified, "
+        "the others give no bound (`lag-envs report`)",
+        ("system", "error", "lag_envs", "in a batch", *COLUMNS[:5], "heyoka in a batch"),
+        rows,
+    )
+
+
+def _equal(rows: Sequence[Row]) -> Claim:
+    found = [r for r in rows if r["kind"] == "model" and "mass" in r]
+    worst = max((max(r["mass"], r["acceleration"]) for r in found), default=0.0)
+    return Claim(
+        f"Other engines have the same models: mass matrices and accelerations to {EQUAL:g}.",
+        worst <= EQUAL if found else None,
+        f"{worst:.1e} at most in {len(found)} models" if found else "",
+    )
+
+
+def _accurate(rows: Sequence[Row]) -> Claim:
+    shipped = TOLERANCE, Certified.method_of(usual_order(DT))
+    found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
+    worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
+    return Claim(
+        "At the tolerance and the order that are shipped, a step from a harsh state errs by less than 1e-12.",
+        worst < 1e-12 if found else None,
+        f"{worst:.1e} at most" if found else "",
+    )
+
+
+def _fastest(found: Mapping[tuple, Mapping[str, Best]], mode: str, who: str, names: Sequence[str]) -> Claim:
+    lost, cases = [], 0
+    for (system, of, target), here in found.items():
+        others = [(ns, name) for ns, name in _others(here) if name in names]
+        if of != mode or "lag_envs" not in here or not others:
+            continue
+        cases += 1
+        ns, name = others[0]
+        if ns < here["lag_envs"].ns:
+            lost.append(f"{name} by {here['lag_envs'].ns / ns:.2f} ({system}, {target:g})")
+    told = f"{cases - len(lost)} of {cases} cases" + (f"; faster: {', '.join(lost)}" if lost else "")
+    return Claim(
+        f"Ours reaches each error in less time than {who}, {MODES[mode]}.",
+        not lost if cases else None,
+        told if cases else "",
+    )
+
+
+def _conserved(rows: Sequence[Row]) -> Claim:
+    found = [r for r in rows if r["kind"] == "energy" and r["method"] == "lag_envs, as shipped"]
+    return Claim(
+        f"The energy of an undamped double pendulum stays within {DRIFT:g} of its range.",
+        all(r["drift"] <= DRIFT for r in found) if found else None,
+        f"{max(r['drift'] for r in found):.1e} over {found[0]['seconds']:,.0f} s" if found else "",
+    )
+
+
+def _models(rows: Sequence[Row]) -> Table:
+    return Table(
+        "general-models",
+        "Other engines' models against Lagrange's equations by SymPy, at 50 random states: largest "
+        "differences, relative",
+        ("system", "engine", "mass matrix", "acceleration"),
+        [
+            (r["system"], LABELS[r["engine"]], r.get("mass", r.get("problem")), r.get("acceleration"))
+            for r in rows
+            if r["kind"] == "model"
+        ],
+    )
+
+
+def _shares(rows: Sequence[Row]) -> Table:
+    found: dict[tuple[str, float], dict[int, Row]] = {}
+    for r in rows:
+        if r["kind"] == "certificate":
+            found.setdefault((r["system"], r["dt"]), {})[r["order"]] = r
+    return Table(
+        "general-certificate",
+        "Share of harsh states from which a step of a length is certified as a whole at the tolerance that "
+        f"is shipped, by order, and attempts a step at order {CERTIFIED_ORDERS[-1]}",
+        ("system", "step [s]", *(f"order {n}" for n in CERTIFIED_ORDERS), "attempts", "refused"),
+        [
+            (system, dt, *(f"{100.0 * here[n]['share']:.1f} %" for n in CERTIFIED_ORDERS),
+             here[CERTIFIED_ORDERS[-1]]["attempts"], sum(r["refused"] for r in here.values()))
+            for (system, dt), here in found.items()
+            if len(here) == len(CERTIFIED_ORDERS)
+        ],
+    )  # fmt: skip
+
+
+def _first(rows: Sequence[Row]) -> Table:
+    found: dict[str, dict[str, list[float]]] = {}
+    for r in rows:
+        if r["kind"] == "first" and "seconds" in r:
+            found.setdefault(r["system"], {}).setdefault(r["what"], []).append(r["seconds"])
+    kinds = ("cold", "cached", "heyoka, single", "heyoka, batch")
+    return Table(
+        "general-first",
+        "CPU seconds until the first step, imports apart: ours from energies to a step, with an empty and "
+        "a filled cache of compiled code; heyoka's compiling at tolerance 1e-15",
+        ("system", "lag_envs, cold", "lag_envs, cached", "heyoka", "heyoka, batch"),
+        [(name, *(median(of[k]) if k in of else None for k in kinds)) for name, of in found.items()],
+    )
+
+
+def _energy(rows: Sequence[Row]) -> Table:
+    return Table(
+        "general-energy",
+        "Energy of undamped double pendulums: how far from where it was at most, relative to its height "
+        "above the lowest; ours over the whole time, the others at its end",
+        ("method", "seconds", "drift"),
+        [
+            (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])
+            for r in rows
+            if r["kind"] == "energy"
+        ],
+    )
+
+
+def all_points(rows: Sequence[Row]) -> Table:
+    """Return every setting of every method."""
+    names = ("system", "mode", "family", "method", "setting", "error", "median", "ns", "clock", "problem")
+    return Table(
+        "general-points",
+        "All points",
+        names,
+        [[r.get(name) for name in names] for r in rows if r["kind"] == "point"],
+    )
+
+
+#: Colours after Okabe and Ito.
+STYLES = {
+    "lag_envs": ("#003B5C", "*"),
+    "heyoka": ("#000000", "X"),
+    "MuJoCo": ("#B8860B", "D"),
+    "Pinocchio": ("#7F3C8D", "o"),
+    "RK4, compiled": ("#E69F00", "D"),
+    "DOP853, compiled": ("#D55E00", "s"),
+    "Radau IIA, compiled": ("#CC79A7", "^"),
+}
+
+
+def draw(name: str, rows: Sequence[Row]) -> Figure:
+    """Draw worst errors against times: of each column the settings that none of its others beats."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    for ax, (mode, words) in zip(figure.subplots(1, 2, sharey=True), MODES.items(), strict=True):
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_ylim(1e-16, 1.0)
+        ax.grid(True, which="major", color="0.9", linewidth=0.6)
+        ax.set_title(f"{name}, {words}", fontsize=10)
+        ax.set_xlabel("time of a control step [ns]")
+        for title, (colour, marker) in STYLES.items():
+            some = [
+                (r["ns"], r["error"])
+                for r in rows
+                if column(r) == title
+                and (r["mode"] == mode or not r["batched"])
+                and r.get("error") is not None
+            ]
+            front = sorted(p for p in some if not any(o[0] < p[0] and o[1] <= p[1] for o in some))
+            if front:
+                x, y = zip(*front, strict=True)
+                ax.plot(
+                    x,
+                    np.maximum(y, 1e-16),
+                    color=colour,
+                    marker=marker,
+                    linewidth=1.0,
+                    markersize=4,
+                    label=title,
+                )
+    figure.axes[0].set_ylabel("worst error, relative")
+    handles = {
+        text: line for ax in figure.axes for line, text in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=8, frameon=False
+    )
+    return figure

@@ -1,0 +1,143 @@
+"""Gymnasium's environments of the same kind as ours: scenes with their equations, and their episodes.
+
+That the scenes have the equations of Gymnasium's source is tested on its own steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from mpmath import mpf
+
+from lag_envs.report.episodes import DIGITS, Episode, compare, entries, moved, random_actions
+from lag_envs.report.oracle import oracle_of
+from lag_envs.report.runner import Row
+from lag_envs.scenes import Acrobot, CartPole
+from lag_envs.scenes.base import Scene, parameter
+
+
+class Rod(Scene):
+    """Pendulum-v1: a uniform rod on a hinge, theta = 0 upright, driven by a torque."""
+
+    mass: float = parameter(1.0, "kg", above=0.0)
+    length: float = parameter(1.0, "m", above=0.0)
+    gravity: float = parameter(10.0, "m/s²", least=0.0)
+
+    coordinates: ClassVar = {"theta": "rad"}
+    controls: ClassVar = {"torque": "N m"}
+
+    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
+        """Return T."""
+        return self.mass * self.length**2 * v.theta**2 / 6
+
+    def potential(self, q: Any, xp: Any) -> Any:
+        """Return V."""
+        return self.mass * self.gravity * self.length * xp.cos(q.theta) / 2
+
+    def applied(self, q: Any, v: Any, u: Any, xp: Any) -> dict[str, Any]:
+        """Return the torque."""
+        return {"theta": u.torque}
+
+
+class Peer(NamedTuple):
+    """One of Gymnasium's environments: its equations, and what its actions mean."""
+
+    scene: Callable[[Any], Scene]  #: of an instance
+    order: Sequence[int]  #: of the scene's state entries among its own
+    integrator: str
+    step: Callable[[Any], float]  #: the control step [s] of an instance
+    control: Callable[[Any, Any], float]  #: from an instance and an action, as the environment's own code
+    wraps: Sequence[int] = ()
+    limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: speeds are cut here, the last entries
+
+    def described(self, env: Any) -> tuple[list[str], list[str]]:
+        """Return names and units of its state."""
+        scene, own = self.scene(env), np.argsort(self.order)
+        return [scene.state_names[i] for i in own], [scene.state_units[i] for i in own]
+
+
+PEERS = {
+    "Pendulum-v1": Peer(
+        lambda env: Rod(mass=env.m, length=env.l, gravity=env.g),
+        (0, 1),
+        "semi-implicit Euler",
+        lambda env: env.dt,
+        lambda env, action: float(np.clip(action, -env.max_torque, env.max_torque)[0]),
+        limits=lambda env: [env.max_speed],
+    ),
+    "CartPole-v1": Peer(
+        lambda env: CartPole(
+            cart_mass=env.masscart, pole_mass=env.masspole, half_length=env.length, gravity=env.gravity
+        ),
+        (0, 1, 2, 3),
+        "explicit Euler",
+        lambda env: env.tau,
+        lambda env, action: env.force_mag if action == 1 else -env.force_mag,
+    ),
+    "Acrobot-v1": Peer(
+        lambda env: Acrobot(
+            mass_1=env.LINK_MASS_1, mass_2=env.LINK_MASS_2, length_1=env.LINK_LENGTH_1,
+            length_2=env.LINK_LENGTH_2, com_distance_1=env.LINK_COM_POS_1, com_distance_2=env.LINK_COM_POS_2,
+            inertia_1=env.LINK_MOI, inertia_2=env.LINK_MOI, gravity=9.8,
+        ),
+        (0, 2, 1, 3),
+        "RK4",
+        lambda env: env.dt,
+        lambda env, action: float(env.AVAIL_TORQUE[action]),
+        wraps=(0, 1),
+        limits=lambda env: [env.MAX_VEL_1, env.MAX_VEL_2],
+    ),
+}  # fmt: skip
+
+
+def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: bool) -> Episode:
+    """Record up to so many steps of a peer that has been reset; to its termination, or past it."""
+    states, controls, terminated = [np.array(env.state, np.float64)], [], False
+    for action in itertools.islice(actions, steps):
+        controls.append(peer.control(env, action))
+        _, _, over, _, _ = env.step(action)
+        states.append(np.array(env.state, np.float64))
+        terminated = terminated or bool(over)
+        if terminated and to_the_end:
+            break
+    return Episode(np.array(states), controls, terminated)
+
+
+def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, Episode, int]:
+    """Return a peer, an episode of it, and its seed: a later one if with that asked for a speed is cut."""
+    peer = PEERS[id]
+    env: Any = gym.make(id, disable_env_checker=True).unwrapped
+    while True:
+        env.reset(seed=seed)
+        episode = watch(env, peer, random_actions(env, seed), steps, to_the_end)
+        limits = peer.limits(env)
+        if not limits or (np.abs(episode.states[:, -len(limits) :]) < limits).all():
+            return env, episode, seed
+        seed += 1000
+
+
+def measure(env: Any, peer: Peer, episode: Episode) -> Row:
+    """Return the row of a peer's episode against the exact one."""
+    dt = peer.step(env)
+    path = solve(env, peer, episode.states[0], episode.controls)
+    shifted = solve(env, peer, moved(episode.states), episode.controls)
+    alone = [solve(env, peer, y, [u])[-1] for y, u in zip(episode.states, episode.controls, strict=False)]
+    row = compare(episode, path, shifted, alone, dt, peer.wraps)
+    return row | {
+        "ours": False,
+        "integrator": peer.integrator,
+        "entries": entries(row.pop("each"), *peer.described(env)),
+    }
+
+
+def solve(env: Any, peer: Peer, start: Sequence[Any], controls: Sequence[float]) -> list[list[mpf]]:
+    """Return the exact states of a peer's equations of motion, each control held for one step."""
+    oracle, own = oracle_of(peer.scene(env)), np.argsort(peer.order)
+    path = [[x if isinstance(x, mpf) else mpf(float(x)) for x in (start[i] for i in peer.order)]]
+    for u in controls:
+        path.append(oracle.once(path[-1], u, peer.step(env), DIGITS))
+    return [[y[i] for i in own] for y in path]

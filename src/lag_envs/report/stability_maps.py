@@ -1,0 +1,72 @@
+"""What the maps of stability vary, and the cases of their cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.report.cases import VARIANTS, Case
+from lag_envs.report.stepped import Stepped
+from lag_envs.scenes.base import Scene
+from lag_envs.stepping import pendulum
+
+#: Start (entries that float32 holds exactly) and control of the maps.
+STARTS: dict[str, tuple[tuple[float, ...], float]] = {
+    "PivotedBar": ((2.0, 3.0), 3.0),
+    "Incline, drag": ((0.5, 2.0), 0.0),
+    "Incline, moving": ((0.25, 1.0, 0.125), 0.25),
+    "CylinderInCylinder, drag": ((1.0, 3.0), 0.0),
+    "CylinderInCylinder, tilt": ((1.0, 3.0, 1.0), 3.0),
+}
+
+
+class Map(NamedTuple):
+    """A quantity that is varied beside the step."""
+
+    label: str
+    scenes: Sequence[str]
+    exponents: tuple[int, int]  #: of 10, from and to
+    case: Callable[[str, float, float], Case]  #: of scene, value and dt
+
+
+def _damped(name: str, decay: float, dt: float) -> Case:
+    variant = VARIANTS[name]
+    per_drag = _drag(variant.scene(damping=1.0))
+    return Case(variant.scene(damping=decay / dt / per_drag), *STARTS[name])
+
+
+def _drag(scene: Scene) -> float:
+    """Return the rate at which drag alone would slow the motion down, without control [1/s]."""
+    stepped = Stepped(scene)
+    found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
+    return float(found.gamma if isinstance(found, pendulum.Drive) else found.drag)
+
+
+def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
+    """Return a case whose reference is in closed form, however far it goes: shells have no drive."""
+    state, u = STARTS[name]
+    if speed is not None:
+        state = (state[0], speed, *state[2:])
+    if control is None:
+        control = u if name == "PivotedBar" else 0.0
+    return Case(VARIANTS[name].scene(damping=0.0, **changes), state, control)
+
+
+_BAR, _SHELL = ["PivotedBar"], ["CylinderInCylinder, drag"]
+_SHELL_RADIUS = 0.5
+
+MAPS = {
+    "damping": Map("γ dt", list(VARIANTS), (-3, 6), _damped),
+    "speed": Map("θ' [rad/s]", _BAR + _SHELL, (-2, 7), lambda name, v, dt: _undamped(name, speed=v)),
+    "drive": Map("drive [m/s²]", _BAR, (0, 6), lambda name, u, dt: _undamped(name, control=u)),
+    "gravity": Map("gravity [m/s²]", _BAR, (-3, 3), lambda name, g, dt: _undamped(name, gravity=g)),
+    "length": Map("length [m]", _BAR, (-8, 0), lambda name, length, dt: _undamped(name, com_distance=length)),
+    "arm": Map(
+        "1 - r/R",
+        _SHELL,
+        (-9, -1),
+        lambda name, x, dt: _undamped(name, shell_radius=_SHELL_RADIUS, radius=_SHELL_RADIUS * (1.0 - x)),
+    ),
+}
