@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.envs.actions import Actions
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -19,24 +20,56 @@ class Constant:
 
     Parameters
     ----------
-    action : float
-        The action in [-1, 1].
+    action : float or sequence of float
+        The action: in [-1, 1], for each control, or the number of a choice.
     """
 
-    def __init__(self, action: float) -> None:
+    def __init__(self, action: Any) -> None:
         self.action = action
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], Any]:
+    ) -> tuple[NDArray, Any]:
         """Return the action, for each observation."""
-        return np.full((*np.shape(observation)[:-1], 1), self.action, np.float32), state
+        own: NDArray = np.atleast_1d(np.asarray(self.action, np.float32))
+        return np.tile(own, (*np.shape(observation)[:-1], 1)), state
 
 
-def do_nothing(of: gym.Env | Task) -> Constant:
+def constant(task: Task, *, action: float) -> Constant:
+    """Return the agent that always takes one action."""
+    return Constant(action)
+
+
+def do_nothing(of: gym.Env | Task) -> Constant | Choice:
     """Return the agent of zero control: where the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
-    return Constant(task.rest_action)
+    return Choice(task) if task.formulas.choices else Constant(task.rest_action)
+
+
+class Choice:
+    """In tasks whose actions are numbers of choices, always that of the least control.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    rng : Generator, optional
+        Choose at random, by these random numbers.
+    """
+
+    def __init__(self, task: Task, rng: np.random.Generator | None = None) -> None:
+        self.task, self.rng = task, rng
+        self.shape = Actions(task.formulas.actions, task.formulas.choices).shape
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the choice, for each observation."""
+        shape = (*np.shape(observation)[:-1], *self.shape)
+        if self.rng is None:
+            return np.broadcast_to(np.asarray(self.task.rest_action, np.int64), shape).copy(), state
+        choices = self.task.formulas.choices
+        return self.rng.integers(choices if self.shape else choices[0], size=shape), state
 
 
 class Random:
@@ -46,16 +79,26 @@ class Random:
     ----------
     seed : int
         Seed of the actions.
+    count : int
+        How many controls an action has.
     """
 
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
+    def __init__(self, seed: int, count: int = 1) -> None:
+        self.rng, self.count = np.random.default_rng(seed), count
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return an action for each observation."""
-        return self.rng.uniform(-1.0, 1.0, (*np.shape(observation)[:-1], 1)).astype(np.float32), state
+        shape = (*np.shape(observation)[:-1], self.count)
+        return self.rng.uniform(-1.0, 1.0, shape).astype(np.float32), state
+
+
+def at_random(task: Task) -> Random | Choice:
+    """Return the agent of random actions."""
+    if task.formulas.choices:
+        return Choice(task, np.random.default_rng(0))
+    return Random(0, task.formulas.actions)
 
 
 class Law:

@@ -303,8 +303,8 @@ def export(
     """
     known = [s.result for s in sources if s.result]
     env = env or _same("environment", [r.get("env") for r in known], "--env")
-    if env not in protocol.GOALS:
-        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.GOALS)}")
+    if env not in protocol.boards():
+        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
     if os.path.lexists(folder):
         raise ExportError(f"{folder} is there already; remove it, or choose another place")
     if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):
