@@ -11,9 +11,9 @@ import pytest
 import lag_envs
 from lag_envs import benchmark, cli
 from lag_envs.benchmark import Contestant, Settings
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
-ID = "PivotedBarFree-v0"
+ID = pivoted_bar.SwingUpFree.id
 
 
 def call(capsys, *arguments):
@@ -91,14 +91,14 @@ def test_info_certifies_the_substeps(capsys):
         (["info", "PivotdBar-v0"], "there is no environment 'PivotdBar-v0'; did you mean PivotedBar-v0"),
         (["info", "pivotedbar-v0"], "did you mean PivotedBar-v0"),
         (["info", "???"], "`lag-envs list` names all"),
-        (["bench", "InclineTild-v0"], "did you mean InclineTilt-v0"),
+        (["bench", "PivotedBra-v0"], "did you mean PivotedBar-v0"),
         (["bench", "--sizes", "1,x"], "a whole number of at least 1 is needed, got 'x'"),
         (["bench", "--rounds", "0"], "a whole number of at least 1 is needed, got '0'"),
         (["bench", "--seconds", "nan"], "a number above 0 is needed, got 'nan'"),
         (["bench", "--output", "."], "--output must name a file"),
         (["bench", "--output", "no/such/folder.json"], "there is no folder"),
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
-        (["bench", "--checkout", ".", "InclineTilt-v0"], "leave out IDs, --quick, --cold, --sizes"),
+        (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", "nowhere"], "nowhere/README.md is not there"),
         (["fly"], "invalid choice: 'fly'"),
     ],

@@ -9,6 +9,7 @@ from rollouts import IDS, actions, make
 
 from lag_envs.envs.model import Model
 from lag_envs.scenes import StepRefused
+from lag_envs.tasks import incline, pivoted_bar
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -35,14 +36,14 @@ def test_steps_as_the_environment_does(env_id):
 
 
 def test_far_from_ordinary_steps_are_taken_too():
-    task = make("PivotedBarFree-v0").task
+    task = make(pivoted_bar.SwingUpFree.id).task
     ends, _, _ = Model(task)([[0.3, 90.0]], [0.5])
     exact = task.scene.simulate([0.3, 90.0], [2.5], 0.02)[1]
     np.testing.assert_allclose(ends[0], exact, rtol=1e-14)
 
 
 def test_bad_input_is_named():
-    model = Model(make("InclineTilt-v0").task)
+    model = Model(make(incline.Tilt.id).task)
     state = np.zeros((2, 3))
     for arguments, message in (
         ((np.zeros((2, 2)), [0, 0], 0.1), r"states must have shape \(n, 3\)"),
@@ -56,11 +57,11 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="has no target"):
         Model(make("PivotedBar-v0").task)(np.zeros((1, 4)), [0.0], 0.1)
     with pytest.raises(StepRefused, match="row 1"):
-        Model(make("PivotedBarFree-v0", dt=1.0).task)([[0.0, 0.0], [0.0, 1e12]], [0.0, 0.0])
+        Model(make(pivoted_bar.SwingUpFree.id, dt=1.0).task)([[0.0, 0.0], [0.0, 1e12]], [0.0, 0.0])
 
 
 def test_a_fixed_target_is_taken():
-    model = Model(make("InclineTilt-v0", target=0.2).task)
+    model = Model(make(incline.Tilt.id, target=0.2).task)
     states = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
     _, rewards, _ = model(states, [0.0, 0.0])
     assert rewards[0] > 0.99 > 0.1 > rewards[1]

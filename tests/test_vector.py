@@ -17,46 +17,11 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from rollouts import ANY_BAR, IDS, actions, make
 
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 each_id = pytest.mark.parametrize("env_id", IDS)
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
-
-#: Parameters, one per environment, that need one substep, many, and the treatment of stiff damping.
-MIXED = {
-    "PivotedBar-v0": {
-        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
-        "gravity": [9.81, 0.0, 1e3, 9.81, 9.81, 50.0, 1.6],
-    },
-    "PivotedBarFree-v0": {
-        "com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0],
-        "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0],
-    },
-    "PivotedBarBalance-v0": {
-        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
-        "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5],
-    },
-    "InclineTilt-v0": {
-        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
-        "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3],
-    },
-    "InclineBrake-v0": {
-        "tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5],
-        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderTilt-v0": {
-        "radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2],
-        "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderPump-v0": {
-        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
-        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderDamping-v0": {
-        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
-        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-}
 
 
 def pair(env_id, n, mode="NextStep", **options):
@@ -72,13 +37,15 @@ def mixed_pair(env_id, mode="NextStep", **options):
     """Return the native environment with different parameters, and Gymnasium's of seven single ones."""
 
     def one(i):
-        own = {name: values[i] for name, values in MIXED[env_id].items()}
+        own = {name: values[i] for name, values in TASKS[env_id].examples.batch.items()}
         return lambda: gym.make(env_id, disable_env_checker=True, **own, **options)
 
     sync = SyncVectorEnv(
         [one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different"
     )
-    return gym.make_vec(env_id, num_envs=7, autoreset_mode=mode, **MIXED[env_id], **options), sync
+    return gym.make_vec(
+        env_id, num_envs=7, autoreset_mode=mode, **TASKS[env_id].examples.batch, **options
+    ), sync
 
 
 def assert_same(a, b):
@@ -294,7 +261,7 @@ def test_the_mask_is_read_only():
 
 
 def test_masked_rows_are_not_looked_at():
-    envs = gym.make_vec("InclineTilt-v0", num_envs=3)
+    envs = gym.make_vec(incline.Tilt.id, num_envs=3)
     first, _ = envs.reset(seed=1)
     kept = envs.state
     mask = np.array([False, True, False])
@@ -408,7 +375,7 @@ def test_observations_stay_in_the_space(env_id):
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
 def test_copies_go_on_alike(env_id, clone):
-    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **MIXED[env_id])
+    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **TASKS[env_id].examples.batch)
     envs.reset(seed=2)
     for action in actions(37, 7, 1):
         envs.step(action)
@@ -424,7 +391,9 @@ def test_copies_go_on_alike(env_id, clone):
 
 @each_id
 def test_spec_survives_json(env_id):
-    envs = gym.make_vec(env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **MIXED[env_id])
+    envs = gym.make_vec(
+        env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **TASKS[env_id].examples.batch
+    )
     spec = EnvSpec.from_json(envs.spec.to_json())
     assert spec == envs.spec
     twin = gym.make_vec(spec)
@@ -453,7 +422,7 @@ def test_autoreset_mode_stands_where_gymnasiums_own_have_it(mode):
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_record_episode_statistics(mode):
     envs = RecordEpisodeStatistics(
-        gym.make_vec("InclineBrake-v0", num_envs=4, autoreset_mode=mode, duration=1.0)
+        gym.make_vec(incline.Brake.id, num_envs=4, autoreset_mode=mode, duration=1.0)
     )
     envs.reset(seed=1)
     returns, recorded = np.zeros(4), 0
@@ -583,9 +552,9 @@ def test_bad_number_of_environments(n):
         ("PivotedBar-v0", {"duration": [1.0, 2.0, 3.0]}, "duration must be the same"),
         ("PivotedBar-v0", {"track": [None, 0.5, 0.5]}, "track"),
         ("PivotedBar-v0", {"track": [0.5, math.inf, 0.5]}, "track"),
-        ("InclineTilt-v0", {"control": ["tilt", "tilt", "tilt_rate"]}, "control must be the same"),
-        ("InclineTilt-v0", {"target": [0.1, 0.2, 0.7]}, "target"),
-        ("InclineTilt-v0", {"target": [0.1, 0.2, None]}, "target"),
+        (incline.Tilt.id, {"control": ["tilt", "tilt", "tilt_rate"]}, "control must be the same"),
+        (incline.Tilt.id, {"target": [0.1, 0.2, 0.7]}, "target"),
+        (incline.Tilt.id, {"target": [0.1, 0.2, None]}, "target"),
         ("PivotedBar-v0", {"max_episode_steps": 0}, "max_episode_steps"),
         ("PivotedBar-v0", {"max_episode_steps": True}, "max_episode_steps"),
     ],
@@ -610,8 +579,8 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
         "damping": 0.0,
     }
     mild = {"com_distance": [0.3, 0.4], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme, **ANY_BAR)
-    twin = gym.make_vec("PivotedBarFree-v0", num_envs=2, autoreset_mode=mode, **mild)
+    envs = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=3, autoreset_mode=mode, **extreme, **ANY_BAR)
+    twin = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=2, autoreset_mode=mode, **mild)
     envs.reset(seed=[1, 2, 3])
     twin.reset(seed=[1, 3])
     stuck = envs.state[1]
@@ -632,7 +601,7 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
 
 @each_mode
 def test_a_fixed_target_returns_after_one_given_by_hand(mode):
-    native, sync = pair("InclineTilt-v0", 3, mode, target=0.2, duration=0.3)
+    native, sync = pair(incline.Tilt.id, 3, mode, target=0.2, duration=0.3)
     given = {"target": np.array([0.1, 0.1, 0.1])}
     native.reset(seed=1, options=given)
     assert native.target.tolist() == [0.1] * 3
@@ -642,7 +611,7 @@ def test_a_fixed_target_returns_after_one_given_by_hand(mode):
 
 
 def test_a_restarting_environment_ignores_its_action():
-    envs = gym.make_vec("InclineTilt-v0", num_envs=2, duration=0.1)
+    envs = gym.make_vec(incline.Tilt.id, num_envs=2, duration=0.1)
     envs.reset(seed=1)
     for _ in range(2):
         _, _, _, truncations, _ = envs.step(np.zeros((2, 1), np.float32))
@@ -655,7 +624,7 @@ def test_a_restarting_environment_ignores_its_action():
 
 def test_a_refusal_carries_what_the_others_did():
     lengths = {"com_distance": [0.3, 1e-30], "damping": 0.0}
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=2, **lengths, **ANY_BAR)
+    envs = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=2, **lengths, **ANY_BAR)
     envs.reset(seed=1)
     with pytest.raises(StepRefused) as error:
         envs.step(np.zeros((2, 1), np.float32))

@@ -245,6 +245,7 @@ class Tilt(_Shell):
             {"target": 1.2},
         ],
         ending=([1.049, 1.0, 0.0], 0.0),
+        reach=6.0,
         rest=[0.3, 0.0, 16.35 * math.sin(0.3)],
         batch={
             "radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2],
@@ -446,6 +447,7 @@ class Pump(_Shell):
         start={"state": [0.3, -0.2, 1.0]},
         refused=[{"state": state} for state in ([1.4, 0, 0], [0, 0, -3.1])],
         ending=([1.299, 2.0, 0.0], 0.0),
+        reach=6.0,
         rest=[0.0, 0.0, 0.0],
         batch={
             "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
@@ -642,6 +644,7 @@ class Damping(Task):
         moving=[3.0, 7.0],  # soon loses contact
         refused=[{"state": state} for state in ([3.0, 0.0], [2e3, 20.0])],
         ending=([2.0, 3.4], 1.0),
+        reach=8.0,
         rest=[0.0, 0.0],
         batch={
             "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],

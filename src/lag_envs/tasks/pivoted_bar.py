@@ -192,6 +192,7 @@ class SwingUp(_Bar):
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},
         refused=[{"state": state} for state in ([0.6, 0, 0, 0], [0.3, 1.5, 0, 0], [-0.3, -1.5, 0, 0])],
+        reach=12.6,
         rest=[0.0, 0.0, math.pi, 0.0],
         batch={
             "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
@@ -317,6 +318,7 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
     examples = Examples(
         start={"state": [2.0, 3.0]},
         moving=[2.0, 30.0],
+        reach=12.6,
         rest=[math.pi, 0.0],
         batch={
             "com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0],
@@ -475,6 +477,7 @@ class Balance(_Bar):
         start={"state": [0.1, -0.2, 3.0, 0.5]},
         refused=[{"state": state} for state in ([0, 0, 0, 0], [0.51, 0, math.pi, 0], [0, 0, -math.pi, 0])],
         ending=([0.0, 0.0, math.pi + 0.34, 3.0], 0.0),
+        reach=7.0,
         rest=[0.0, 0.0, math.pi, 0.0],
         batch={
             "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],

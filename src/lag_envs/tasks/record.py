@@ -163,6 +163,8 @@ class Examples:
         Options of resets that the task must refuse.
     ending : tuple, optional
         A state and an action that soon terminate the episode.
+    reach : float
+        Rate of the angle that episodes come to [rad/s].
     rest : sequence of float, optional
         A state of rest, with the action 0.
     batch : mapping
@@ -177,6 +179,7 @@ class Examples:
     moving: Sequence[float] | None = None
     refused: Sequence[Mapping[str, Any]] = ()
     ending: tuple[Sequence[float], float] | None = None
+    reach: float = 0.0
     rest: Sequence[float] | None = None
     batch: Mapping[str, Sequence[float]] = field(default_factory=dict)
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
