@@ -146,7 +146,8 @@ def report(run: Run, video: bool) -> None:
         tail = "" if part is None else f"{part:8.3f}"
         print(f"{name:22}{r.mean():9.2f}{r.min():9.2f}{r.max():9.2f}{tail}")
     if known := known_returns(run.env):
-        print(f"The score is 0 for the random policy ({known.random:g}), 1 for the best ({known.best:g}).")
+        ends = f"0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g})"
+        print(f"The score is {ends}.")
     print(
         f"\n{result['trained']:,} steps in {result['wall_seconds']:.1f} s of training, "
         f"{seconds:.1f} s of evaluation."

@@ -37,6 +37,8 @@ Array = NDArray[np.float64]
 
 #: Seeds of nobody else, and those of the references' own means; episodes that are played together.
 FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
+#: Episodes of policies that take long: that plan, that look ahead by value iteration.
+PLANNED, OPTIMAL = 1_000, 4_096
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,7 +96,7 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
     kept, task = dict(kept or {}), TASKS[env_id]()
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
     known = controllers(task)
-    slow = {name: 1_000 for name, found in known.items() if found.plans} | {"optimal": 4_096}
+    slow = {name: PLANNED for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
     names = ["random", "zero", *([scale["policy"]] if scale else [*task.controllers])]
     if not scale and env_id in played():
         names.append("optimal")

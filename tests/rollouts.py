@@ -8,13 +8,13 @@ import gymnasium as gym
 import numpy as np
 
 from lag_envs.tasks import TASKS
-from lag_envs.tasks.pivoted_bar import SwingUp
+from lag_envs.tasks.pivoted_bar import SwingUpFree
 
 IDS = list(TASKS)
 RENDERS = find_spec("pygame") is not None and find_spec("lag_envs.envs.rendering") is not None
 
 
-class AnyBar(SwingUp):
+class AnyBar(SwingUpFree):
     """A bar of whatever parameters its scene accepts, so that steps can be refused."""
 
     def check_usable(self):

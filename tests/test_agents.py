@@ -223,18 +223,20 @@ def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     file = tmp_path / "scale.json"
     assert scale.main([incline.Brake.id, "--batches", "2", "--output", str(file)]) == 0
     found = json.loads(file.read_text())["envs"][incline.Brake.id]
-    assert list(found) == ["random", "switching line", "reference", "optimum"]
+    assert found["scale"] == {k: v for k, v in known_returns(incline.Brake.id)._asdict().items()}
+    found = found["measured"]
+    assert list(found) == ["random", "zero", "switching line", "reference", "optimum"]
     assert {row["episodes"] for row in found.values()} == {1000}
     # The same starts: so little is lost by acting at intervals.
     assert 0.0 < found["optimum"]["mean"] - found["switching line"]["mean"] < 4e-4
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines] == [incline.Brake.id] * 4
-    for line in lines:
+    assert [line.split("  ")[0] for line in lines] == [incline.Brake.id] * 5
+    for line in [line for line in lines if " zero " not in line]:
         mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
         assert abs(mean - used) < 5.0 * error
     assert scale.main([cylinder_in_cylinder.Pump.id, "--quick"]) == 0
     assert "optimal" not in capsys.readouterr().out
-    monkeypatch.setitem(scale.SLOW, "iLQR", 20)
+    monkeypatch.setattr(scale, "PLANNED", 20)
     assert scale.main([cylinder_in_cylinder.Tilt.id, "--batches", "1", "--output", str(file)]) == 0
     assert list(json.loads(file.read_text())["envs"]) == [incline.Brake.id, cylinder_in_cylinder.Tilt.id]
     (line,) = (line for line in capsys.readouterr().out.splitlines() if " iLQR " in line)

@@ -130,7 +130,7 @@ def test_episode_length(env_id):
     assert f"after {task.steps} steps ({task.duration:g} s)" in plain(page(make(env_id))["Episode End"])
 
 
-@pytest.mark.parametrize("kind", {task.__doc__: task for task in TASKS.values()}.values())
+@pytest.mark.parametrize("kind", {t.__doc__: t for t in reversed([*TASKS.values()])}.values())
 def test_argument_table(kind):
     """Every parameter that the task leaves free is there, with its default and its range."""
     task = kind()

@@ -37,8 +37,6 @@ def parameters(env_id):
     """Return the names of an id's numbers, and of all its keywords."""
     task = TASKS[env_id]()
     numbers = [name for name in task.usable_ranges() if getattr(task.scene, name) is not None]
-    if "phi_dot" in task.action:  # its tilt is controlled
-        numbers.remove("tilt")
     return numbers, [*numbers, "dt", "duration", *(["target"] if task.target_range else [])]
 
 

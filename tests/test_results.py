@@ -26,7 +26,7 @@ from agents.analysis import (
 )
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
-from lag_envs.controllers import Constant, controllers, do_nothing, make_controller
+from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
 from lag_envs.report.docs import replaced
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
@@ -229,17 +229,16 @@ def test_agents_with_a_clock_are_told_its_pace():
     class Clock:
         pace = 1.0
 
-    class ILQR:
-        pass
-
     entrant = Entrant(ENV, "clock", "classical", Clock, "")
     usual, often = (Job(entrant, c, 1) for c in conditions(ENV)[:2])
     assert often.steps == 10 * usual.steps
     clock = Clock()
     assert measure.set_pace(clock, often) and clock.pace == pytest.approx(0.1)
     assert measure.set_pace(clock, usual) and clock.pace == 1.0
-    assert measure.set_pace(ILQR(), usual) and not measure.set_pace(ILQR(), often)
     assert measure.set_pace(Constant(0.0), often)
+    plan = Entrant("PivotedBar-v0", "iLQR", "classical", Clock, "")
+    usual, often = (Job(plan, c, 1) for c in conditions("PivotedBar-v0")[:2])
+    assert measure.set_pace(Constant(0.0), usual) and not measure.set_pace(Constant(0.0), often)
 
 
 # --- the command ---
@@ -271,7 +270,7 @@ def command(monkeypatch, capsys, tmp_path):
     ]
     for module in (measure, results):
         monkeypatch.setattr(module, "conditions", lambda env_id: few)
-    monkeypatch.setattr(measure, "classical", lambda env_id: {"zero": do_nothing})
+    monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
     monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))

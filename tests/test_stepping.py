@@ -236,7 +236,7 @@ def corners(task):
     """Return the fastest states and strongest controls of a task."""
     form, reach = task.scene._form, task.examples.reach
     (low,), (high,) = task.control_range
-    angle = None if form is None else form.angle
+    angle = None if task.certified_speed() is None else form.angle
     for edge, speed, control in product(task.edges, (-reach, reach), (low, high)):
         for place in (0.0, 1.5, math.pi) if angle is not None else (0.0,):
             state = list(edge)

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
 from lag_envs.tasks.base import Task
@@ -38,6 +38,29 @@ class Constant:
 def constant(task: Task, *, action: float) -> Constant:
     """Return the agent that always takes one action."""
     return Constant(action)
+
+
+class Feedback:
+    """Actions that are linear in the observation, clipped.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    gain : array_like, shape (n_actions, n_observation)
+        What each entry of the observation is multiplied by.
+    """
+
+    def __init__(self, task: Task, *, gain: ArrayLike) -> None:
+        self.gain = np.atleast_2d(np.asarray(gain, np.float64))
+        if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
+            raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Return the action, for each observation."""
+        return np.clip(observation @ self.gain.T, -1.0, 1.0).astype(np.float32), state
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
@@ -94,11 +117,11 @@ class Random:
         return self.rng.uniform(-1.0, 1.0, shape).astype(np.float32), state
 
 
-def at_random(task: Task) -> Random | Choice:
+def at_random(task: Task, seed: int = 0) -> Random | Choice:
     """Return the agent of random actions."""
     if task.formulas.choices:
-        return Choice(task, np.random.default_rng(0))
-    return Random(0, task.formulas.actions)
+        return Choice(task, np.random.default_rng(seed))
+    return Random(seed, task.formulas.actions)
 
 
 class Law:
