@@ -12,6 +12,7 @@ import os
 import pickle
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -188,8 +189,10 @@ def own_env(name: str) -> str:
         return own_files.registered(name)[0]
     if ":" not in name:
         return check_env(name)
+    module, _, env_id = name.partition(":")
     try:
-        return gym.spec(name).id
+        import_module(module)
+        return gym.spec(env_id).id
     except (gym.error.Error, ImportError) as error:
         raise UserError(f"there is no environment {name!r}: {error}") from error
 

@@ -153,7 +153,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     board.open()
     for name in ("ppo", "springs", "random"):
         board.add(load(tmp_path / name))
-    board.publish("nonce")
+    board.publish("nonce", "https://example.org/pulse/1")
     finish(board)
     assert {entry.state for entry in board.read().entries.values()} == {"verified"}
     shown = next(env for env in board_data(board)["environments"] if env["id"] == ID)

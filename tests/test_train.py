@@ -381,3 +381,58 @@ def test_the_zoo_trains_shows_and_films(algo, tmp_path):
     assert "Episode Reward" in zoo(["rl_zoo3.enjoy"], *packages, "-n", "600")
     zoo(["lag_envs.zoo", "record_video"], *packages, "-n", "20")
     assert list(tmp_path.glob(f"logs/{algo}/{ENV}_1/videos/*.mp4"))
+
+
+# --- environments of one's own ---
+
+BALL, SEVERAL = ROOT / "examples" / "ball_on_beam.py", ROOT / "tests" / "own_tasks.py"
+
+
+@pytest.fixture
+def beside_the_example(monkeypatch):
+    """Have the example's folder on the path, here and in the workers, and forget what it registers."""
+    monkeypatch.syspath_prepend(str(BALL.parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BALL.parent), *filter(None, sys.path)]))
+    yield
+    for name in ("ball_on_beam", "own_ball_on_beam", "own_own_tasks"):
+        sys.modules.pop(name, None)
+    for env_id in ("BallOnBeam-v0", "OwnSwitched-v0", "OwnCrane-v0"):
+        gym.registry.pop(env_id, None)
+
+
+@pytest.mark.parametrize(
+    ("given", "env_id"),
+    [
+        (str(BALL), "BallOnBeam-v0"),
+        ("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0"),
+        (f"{SEVERAL}:Switched", "OwnSwitched-v0"),  # chooses among three actions
+        (f"{SEVERAL}:Deliver", "OwnCrane-v0"),  # two controls, two targets
+    ],
+)
+def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_example, tmp_path):
+    arguments = [given, "--steps", "4096", "--output", str(tmp_path)]
+    assert train.main(arguments) == 0
+    result = json.loads((tmp_path / env_id / "ppo" / "seed0" / "result.json").read_text())
+    assert result["env"] == env_id and result["trained"] == 4096 and result["score"] is None
+    assert ("use_sde" in result["hyperparameters"]) == (env_id != "OwnSwitched-v0")
+    policy = load_policy(tmp_path / env_id / "ppo" / "seed0")
+    returns = evaluate_batch(env_id, policy, run.FIRST_FRESH_SEED, 100)
+    np.testing.assert_allclose(returns.mean(), result["mean_return"], rtol=1e-6)
+    assert train.main(arguments) == 0  # finished before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([str(SEVERAL)], "has several tasks: name one"),
+        (["nowhere.py"], "there is no file nowhere.py"),
+        (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
+        (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
+        ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
+        ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
+        ([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn numbers the actions of one control"),
+    ],
+)
+def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
+    status = train.main([*arguments, "--steps", "100", "--output", str(tmp_path)])
+    assert status in (1, 2) and message in "".join(capsys.readouterr())
