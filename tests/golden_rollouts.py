@@ -8,6 +8,7 @@ environments was settled. Only what a user can call is used here, so a rewrite n
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -168,10 +169,10 @@ def stack(seen: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def record() -> dict[str, np.ndarray]:
-    """Return all runs as arrays, by "run/array"."""
+def record(chosen: dict[str, Run]) -> dict[str, np.ndarray]:
+    """Return runs as arrays, by "run/array"."""
     out = {"version": np.array(lag_envs.__version__)}
-    for number, (name, run) in enumerate(runs().items()):
+    for number, (name, run) in enumerate(chosen.items()):
         rng = np.random.default_rng(number)
         # Held for some steps, so that they move something.
         given = rng.integers(-120, 121, (400, run.lanes)).repeat(rng.choice([1, 4]), axis=0).astype(np.int8)
@@ -183,10 +184,17 @@ def record() -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    GOLDEN.parent.mkdir(exist_ok=True)
-    RUNS.write_text(json.dumps({name: run._asdict() for name, run in planned().items()}, indent=1) + "\n")
-    recorded = record()
+    # With ids, those beside the others that are kept.
+    chosen = {
+        name: run for name, run in planned().items() if name.partition("/")[0] in (sys.argv[1:] or TASKS)
+    }
+    kept_runs = {name: run for name, run in runs().items() if sys.argv[1:] and name not in chosen}
+    with np.load(GOLDEN) as file:
+        kept = {key: file[key] for key in file if key.rpartition("/")[0] in kept_runs}
+    recorded = kept | record(chosen)
+    everything = {name: run._asdict() for name, run in (kept_runs | chosen).items()}
+    RUNS.write_text(json.dumps(everything, indent=1) + "\n")
     np.savez_compressed(GOLDEN, **recorded)  # type: ignore[arg-type]
     ends = sum(np.count_nonzero(v) for k, v in recorded.items() if k.endswith("/over"))
     calls = sum(v.size for k, v in recorded.items() if k.endswith("/over"))
-    print(f"{GOLDEN}: {len(runs())} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")
+    print(f"{GOLDEN}: {len(everything)} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")

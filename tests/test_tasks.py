@@ -8,12 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from mpmath import mp, mpf
-from rollouts import IDS, actions, make
+from rollouts import actions, make
 
 from lag_envs import scenes
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 
-each_id = pytest.mark.parametrize("env_id", IDS)
 PI = math.pi
 
 
@@ -184,6 +183,7 @@ ROWS = {
         CylinderInCylinderDamping,
     )
 }
+each_id = pytest.mark.parametrize("env_id", ROWS)
 
 
 def nearest_safe(s, s_dot, wanted, top, track, dt):
@@ -358,7 +358,7 @@ def test_kicks(env_id, dt):
         assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
 
 
-@pytest.mark.parametrize("env_id", [i for i in IDS if i != incline.Brake.id])
+@pytest.mark.parametrize("env_id", [i for i in ROWS if i != incline.Brake.id])
 def test_running_rewards_with_another_interval(env_id):
     env, row = make(env_id, dt=0.03), ROWS[env_id]
     env.reset(seed=3)

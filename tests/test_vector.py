@@ -14,12 +14,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from rollouts import ANY_BAR, IDS, actions, make
+from rollouts import ANY_BAR, IDS, SINGLE, actions, make
 
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 each_id = pytest.mark.parametrize("env_id", IDS)
+each_single = pytest.mark.parametrize("env_id", SINGLE)
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
 
@@ -77,7 +78,7 @@ def assert_alike(native, sync, steps, seed=0):
     n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     stray = 0.5 / native.task.limit
     rng = np.random.default_rng(seed)
-    given = actions(steps, n, 1, seed=seed)
+    given = actions(steps, *native.action_space.shape, seed=seed)
     ends = 0
     for action in given:
         mine, theirs = native.step(action), sync.step(action)
@@ -133,8 +134,8 @@ def test_same_bits_where_parameters_differ(env_id, mode):
     assert assert_alike(native, sync, 600) > 0
     for i, env in enumerate(sync.envs):
         assert env.unwrapped.state.tobytes() == native.state[i].tobytes()
-        assert native.control[i] == env.unwrapped.control
-        assert native.target is None or native.target[i] == env.unwrapped.target
+        assert np.array_equal(native.control[i], env.unwrapped.control)
+        assert native.target is None or np.array_equal(native.target[i], env.unwrapped.target)
         space = native.single_observation_space
         assert (space.high >= env.observation_space.high).all() and (
             space.low <= env.observation_space.low
@@ -170,7 +171,7 @@ def test_a_sub_environment_is_the_single_one(env_id):
     native.reset(seed=40)
     env = make(env_id)
     env.reset(seed=43)
-    for action in actions(30, 5, 1):
+    for action in actions(30, *native.action_space.shape):
         mine = native.step(action)
         theirs = env.step(action[3])
         assert mine[0][3].tobytes() == theirs[0].tobytes() and mine[1][3] == theirs[1]
@@ -178,7 +179,7 @@ def test_a_sub_environment_is_the_single_one(env_id):
             break
 
 
-@each_id
+@each_single
 def test_states_and_targets_by_hand(env_id):
     single = make(env_id)
     starts = []
@@ -191,7 +192,7 @@ def test_states_and_targets_by_hand(env_id):
     native = gym.make_vec(env_id, num_envs=6)
     observations, _ = native.reset(seed=0, options=options)
     assert native.state.tobytes() == options["state"].tobytes()
-    given = actions(1, 6, 1)[0]
+    given = actions(1, *native.action_space.shape)[0]
     stepped = native.step(given)[0]
     for i in range(6):
         own = {name: values[i] for name, values in options.items()}
@@ -320,7 +321,7 @@ def test_nothing_is_shared(env_id, mode):
     kept = []
     for _ in range(2):
         arrays = [envs.reset(seed=1)[0]]
-        for action in actions(40, 3, 1):
+        for action in actions(40, *envs.action_space.shape):
             *out, info = envs.step(action)
             over = out[2] | out[3]
             arrays += [
@@ -360,7 +361,7 @@ def test_spaces_and_types(env_id):
 def test_observations_stay_in_the_space(env_id):
     envs = gym.make_vec(env_id, num_envs=100, autoreset_mode="SameStep")
     observations, _ = envs.reset(seed=1)
-    for action in actions(400, 100, 1, seed=5):
+    for action in actions(400, *envs.action_space.shape, seed=5):
         assert observations in envs.observation_space
         observations, *_, infos = envs.step(action)
         for last in infos.get("final_obs", ()):
@@ -377,11 +378,11 @@ def test_observations_stay_in_the_space(env_id):
 def test_copies_go_on_alike(env_id, clone):
     envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **TASKS[env_id].examples.batch)
     envs.reset(seed=2)
-    for action in actions(37, 7, 1):
+    for action in actions(37, *envs.action_space.shape):
         envs.step(action)
     twin = clone(envs)
     before = twin.state
-    for action in actions(60, 7, 1, seed=1):
+    for action in actions(60, *envs.action_space.shape, seed=1):
         mine = envs.step(action)
         assert (twin.state == before).all()  # nothing in common
         assert_same(mine, twin.step(action))
@@ -399,7 +400,7 @@ def test_spec_survives_json(env_id):
     twin = gym.make_vec(spec)
     assert twin.num_envs == 7 and twin.metadata == envs.metadata
     assert_same(envs.reset(seed=1), twin.reset(seed=1))
-    for action in actions(40, 7, 1):
+    for action in actions(40, *envs.action_space.shape):
         assert_same(envs.step(action), twin.step(action))
 
 
@@ -532,7 +533,7 @@ def test_bad_options_reset_nothing(options, error, match):
     with pytest.raises(error, match=match):
         envs.reset(seed=5, options=options)
     assert (envs.state == twin.state).all()
-    for action in actions(20, 3, 1):
+    for action in actions(20, *envs.action_space.shape):
         assert_same(envs.step(action), twin.step(action))
 
 

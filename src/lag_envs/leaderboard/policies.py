@@ -223,8 +223,8 @@ class _Network(Agent):
 class Linear(Architecture):
     """Action = gain · observation + offset, clipped to [-1, 1].
 
-    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), each with an axis for the numbers of an action where
-    these are several. `lag-envs info ID` lists the observation.
+    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), or (n_observation, n_actions)
+    and (n_actions,) where an action has several numbers. `lag-envs info ID` lists the observation.
     """
 
     def __init__(self, env_id: str, table: Fields) -> None:

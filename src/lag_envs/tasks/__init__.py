@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from lag_envs.tasks.measured import known
+
 
 class Tasks(UserDict[str, Any]):
     """Task classes by id; given as "module:Class", one is imported when it is asked for."""
@@ -55,14 +57,15 @@ def find(folder: Path, package: str) -> dict[str, str]:
     """
     lines = re.compile(r'^class (\w+)|^    id = "([\w-]+)"', re.MULTILINE)
     places = {}
-    # The bar comes first: it is the example everywhere.
-    for file in sorted(folder.glob("*.py"), reverse=True):
+    for file in sorted(folder.glob("*.py")):
         kind = ""
         for name, env_id in lines.findall(file.read_text(encoding="utf-8")):
             kind = name or kind
             if env_id:
                 places[env_id] = f"{package}{file.stem}:{kind}"
-    return places
+    # Those that were measured first come first.
+    order = {env_id: i for i, env_id in enumerate(known())}
+    return dict(sorted(places.items(), key=lambda item: order.get(item[0], len(order))))
 
 
 #: The package's tasks.

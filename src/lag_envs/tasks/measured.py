@@ -16,6 +16,11 @@ def measured(env_id: str) -> dict[str, Any]:
     return _envs(FILE).get(env_id, {})
 
 
+def known() -> list[str]:
+    """Return the ids that were measured, in the order in which they came."""
+    return list(_envs(FILE))
+
+
 @cache
 def _envs(file: Path) -> dict[str, Any]:
     return json.loads(file.read_text(encoding="utf-8"))["envs"]
