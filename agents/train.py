@@ -70,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
     )
-    p.add_argument("--steps", type=int, help="environment steps per seed, in place of the file's n_timesteps")
+    p.add_argument("--steps", type=int, help="environment steps per seed, in place of n_timesteps")
     p.add_argument(
         "--jobs", type=int, metavar="N", help="seeds trained at once (default: the number of cores)"
     )

@@ -169,6 +169,8 @@ class Reader:
 
     def __init__(self, task: Task) -> None:
         formulas, form = task.formulas, task.scene._form
+        if formulas.targets > 1:
+            raise ValueError(f"{type(task).__name__} has {formulas.targets} targets; one at most can be read")
         k, angle = SimpleNamespace(**formulas.constants()), form.angle if form else None
         self.task, self._n = task, len(task.scene.state_names)
         self._width = form.width if form else self._n

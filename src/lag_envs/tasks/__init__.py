@@ -55,7 +55,7 @@ def find(folder: Path, package: str) -> dict[str, str]:
 
     The files are read and not imported: that would add half to the time of ``import lag_envs``.
     """
-    lines = re.compile(r'^class (\w+)|^    id = "([\w-]+)"', re.MULTILINE)
+    lines = re.compile(r'\nclass (\w+)|\n    id = "([\w-]+)"')
     places = {}
     for file in sorted(folder.glob("*.py")):
         kind = ""
