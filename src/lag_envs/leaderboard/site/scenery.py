@@ -40,7 +40,6 @@ def describe(env_id: str) -> dict[str, Any]:
     if env_id not in TASKS:
         return {}
     task = TASKS[env_id]()
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     return {
         "title": (inspect.getdoc(type(task)) or env_id).partition("\n")[0],
         "scene": type(task.scene).__name__,
@@ -49,16 +48,17 @@ def describe(env_id: str) -> dict[str, Any]:
         "state_units": list(task.scene.state_units),
         "start": [float(x) for x in task.centre],
         "dt": task.dt,
-        "control": None
-        if len(task.formulas.acting) != 1
-        else {
-            "name": task.formulas.acting[0].control,
-            "unit": units[task.formulas.acting[0].control],
-            "low": task.formulas.acting[0].low,
-            "high": task.formulas.acting[0].high,
-            "limit": task.limit_control,
-        },
+        "control": _control(task),
     }
+
+
+def _control(task: Task) -> dict[str, Any] | None:
+    if len(task.formulas.acting) != 1:
+        return None
+    (acting,) = task.formulas.acting
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    ends = {"low": acting.low, "high": acting.high, "limit": task.limit_control}
+    return {"name": acting.control, "unit": units[acting.control], **ends}
 
 
 def geometry(task: Task) -> dict[str, Any] | None:
