@@ -23,7 +23,7 @@ from agents.report import page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
 from lag_envs.controllers.basic import Reader
-from lag_envs.leaderboard import docs, export, protocol, submission
+from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
 from lag_envs.leaderboard.board import Board, board_data, finish
 from lag_envs.leaderboard.site.build import build
@@ -144,11 +144,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     assert found["there after [s]"] < 1.5 and found["episodes without"] < 10
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
-    for module in (protocol, submission, export):
-        if hasattr(module, "LEARNED_POLICIES"):
-            monkeypatch.setattr(module, "LEARNED_POLICIES", 2)
-    monkeypatch.setattr(protocol, "EPISODES", 20)
-    monkeypatch.setattr(protocol, "DISTURBED_EPISODES", 5)
+    monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
     submit.learned(ID, runs / ID / "ppo", tmp_path / "ppo")
     for name in controllers(task):
         submit.controller(ID, name, tmp_path / name)
