@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,18 +23,14 @@ from agents.results import ROOT, to_json
 from agents.run import FIRST_FRESH_SEED, UserError, check_env, write
 from agents.submit import AUTHORS
 from lag_envs import TASKS
-from lag_envs.controllers import CONTROLLERS
-from lag_envs.leaderboard.protocol import GOALS, make_task
+from lag_envs.controllers import build
 from lag_envs.leaderboard.submission import load
-from lag_envs.stepping.slope import crossing_time
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
 SUBMISSIONS, OUTPUT = ROOT / "leaderboard" / "submissions", ROOT / "agents" / "results" / "behaviour.json"
 EPISODES = 1_000
-#: Controllers that are not shown: they take long, or there is nothing to see.
-LEFT_OUT = ("iLQR", "zero", "random", "full damping", "best constant")
 
 
 @dataclass(frozen=True)
@@ -43,15 +39,13 @@ class Played:
 
     Parameters
     ----------
-    env : str
-        Id of their environment.
     task : Task
         Its task.
     states : ndarray, shape (steps + 1, episodes, n_state)
         Where each step begins, and the last one ends; after an episode's end what its last step left.
-    actions : ndarray, shape (steps, episodes)
+    actions : ndarray, shape (steps, episodes), or (steps, episodes, n_actions) where there are several
         The actions.
-    targets : ndarray, shape (episodes,)
+    targets : ndarray, shape (episodes,), or (episodes, n_targets) where there are several
         Targets; 0 where the task has none.
     steps : ndarray of int, shape (episodes,)
         Steps that each episode took.
@@ -59,7 +53,6 @@ class Played:
         Rewards; 0 after an episode's end.
     """
 
-    env: str
     task: Task
     states: Array
     actions: Array
@@ -69,8 +62,7 @@ class Played:
 
     def settled(self) -> Array:
         """Return after how many seconds the board's goal holds for good; inf where it does not at the end."""
-        goal = GOALS[self.env].inside
-        inside = np.stack([goal(self.task, states, self.targets) for states in self.states])
+        inside = np.stack([self.task.goal_holds(states, self.targets) for states in self.states])
         outside = ~inside & (np.arange(len(inside))[:, None] <= self.steps)
         last = np.where(outside.any(axis=0), len(outside) - np.argmax(outside[::-1], axis=0), 0)
         return np.where(last > self.steps, np.inf, last * self.task.dt)
@@ -102,13 +94,14 @@ def play(env_id: str, agent: Any, episodes: int = EPISODES) -> Played:
         observation, reward, terminated, truncated, _ = envs.step(action)
         rewards.append(np.where(running, reward, 0.0))
         steps += running
-        actions.append(np.clip(action[:, 0], -1.0, 1.0))
+        taken = np.clip(action, -1.0, 1.0)
+        actions.append(taken[:, 0] if taken.shape[1:] == (1,) else taken)
         states.append(np.where(running[:, None], bare.state, states[-1]))
         running &= ~(terminated | truncated)
         start = np.zeros(episodes, np.bool_)
     envs.close()
     return Played(
-        env_id, bare.task, np.array(states), np.array(actions, np.float64), targets, steps, np.array(rewards)
+        bare.task, np.array(states), np.array(actions, np.float64), targets, steps, np.array(rewards)
     )
 
 
@@ -133,79 +126,19 @@ def arrival(what: str, played: Played) -> dict[str, float]:
     }
 
 
-def upright(played: Played) -> dict[str, float]:
-    """Measure how soon the bar is up."""
-    return arrival("upright", played)
-
-
-def kept_up(played: Played) -> dict[str, float]:
-    """Measure how often the bar is balanced to the end."""
-    return {"episodes that last 10 s [%]": 100.0 * float((played.steps == played.task.limit).mean())}
-
-
-def parked(unit: str, size: float) -> Callable[[Played], dict[str, float]]:
-    """Return what measures how soon a place is reached for good, and how far off an episode ends."""
-
-    def measure(played: Played) -> dict[str, float]:
-        off = size * np.abs(played.states[-1][:, 0] - played.targets)
-        return arrival("there", played) | {f"off at the end [{unit}], median": float(np.median(off))}
-
-    return measure
-
-
-def crossed(played: Played) -> dict[str, float]:
-    """Measure when and how fast the line is crossed."""
-    task: Any = played.task
-    each = np.arange(len(played.steps))
-    x, v = played.states[played.steps - 1, each].T
-    control = task.limit_control * (0.5 + 0.5 * played.actions[played.steps - 1, each])
-    force = task.coefficients([x, v], [control], np)
-    with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches that are not taken
-        time = crossing_time(x, v, force, task.dt, np)
-    speed = v + force.pull * time + force.drag * x
-    low, middle, high = np.quantile(speed, [0.05, 0.5, 0.95])
-    return {
-        "across after [s]": float(np.mean((played.steps - 1) * task.dt + time)),
-        "speed there, lowest twentieth [m/s]": float(low),
-        "median [m/s]": float(middle),
-        "highest twentieth [m/s]": float(high),
-        "price of the speed": task.price * float(np.maximum(speed - task.gentle, 0.0).mean()),
-    }
-
-
-def pumped(played: Played) -> dict[str, float]:
-    """Measure how soon the wanted energy is reached."""
-    return arrival("within 20 % of the energy", played)
-
-
-def calmed(played: Played) -> dict[str, float]:
-    """Measure how much of the time the cylinder is near rest, and nearer."""
-    task: Any = played.task
-    theta, rate = played.states[1:, :, 0], played.states[1:, :, 1]
-    distance = np.hypot(theta, rate / np.sqrt(task.weight()))
-    going_on = np.arange(len(theta))[:, None] < played.steps
-    shares = {size: 100.0 * float((distance[going_on] <= size).mean()) for size in (0.1, 0.01)}
-    return {f"time within {size:g} of rest [%]": share for size, share in shares.items()}
-
-
-MEASURES: dict[str, Callable[[Played], dict[str, float]]] = {
-    "PivotedBar-v0": upright,
-    "PivotedBarFree-v0": upright,
-    "PivotedBarBalance-v0": kept_up,
-    "InclineTilt-v0": parked("mm", 1e3),
-    "InclineBrake-v0": crossed,
-    "CylinderInCylinderTilt-v0": parked("mrad", 1e3),
-    "CylinderInCylinderPump-v0": pumped,
-    "CylinderInCylinderDamping-v0": calmed,
-}
+def measures(played: Played) -> dict[str, float]:
+    """Return what is told of episodes: the arrival at the goal, and what the task itself adds."""
+    task: Task = played.task
+    found = arrival(task.goal.arrival, played) if task.goal and task.goal.arrival else {}
+    return found | dict(task.behaviour(played))
 
 
 def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, list[Any]]]:
     """Yield our quick agents of an environment: name, and policies, one for each training seed."""
-    task = make_task(env_id)
-    for name, make in CONTROLLERS[env_id].items():
-        if name not in LEFT_OUT:
-            yield name, [make(task)]
+    task = TASKS[env_id]()
+    for name, found in task.controllers.items():
+        if not found.plans and not found.place.endswith(":constant"):  # that takes long, or shows nothing
+            yield name, [build(task, name)]
     for folder in sorted(submissions.glob(f"{env_id}-*")):
         found = load(folder)
         if found.kind == "learned" and list(found.authors) == AUTHORS:
@@ -216,7 +149,7 @@ def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[
     """Return what is measured of an environment's agents: by agent and measure a number for each policy."""
     found: dict[str, dict[str, list[float]]] = {}
     for name, policies in agents(env_id):
-        rows = [MEASURES[env_id](play(env_id, policy, episodes)) for policy in policies]
+        rows = [measures(play(env_id, policy, episodes)) for policy in policies]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}
     return found
 
@@ -227,7 +160,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("env", nargs="*", metavar="ID", help="print those of some environments, and write nothing")
     args = p.parse_args(arguments)
     try:
-        envs = [check_env(name) for name in args.env] or list(TASKS)
+        envs = [check_env(name) for name in args.env] or [
+            env_id for env_id, task in TASKS.items() if task.goal
+        ]
     except UserError as error:
         print(f"agents.behaviour: error: {error}", file=sys.stderr)
         return 2

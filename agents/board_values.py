@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.optimum import DEFAULT_FOLDER, PROBLEMS, RELAXATIONS, Solution
+from agents.optimum import DEFAULT_FOLDER, Solution, solvable
 from agents.run import UserError, check_env, write
 from lag_envs import TASKS
 
@@ -39,8 +39,11 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
         rows of n numbers, by the first axis. Where most is lost the value is the same everywhere, so that
         the other places can be told apart.
     """
-    problem = PROBLEMS[RELAXATIONS.get(env_id, (env_id, ()))[0]]
-    solution = Solution(problem, problem.levels[0], folder, quiet=True)
+    own = TASKS[env_id].value_iteration
+    assert own is not None
+    source = own.relaxed or env_id
+    problem = solvable()[source]
+    solution = Solution(source, problem.levels[0], folder, quiet=True)
     names = solution.task.scene.state_names
     axes = [
         {"label": names[solution.keep[i]], "low": axis.low, "high": axis.high, "n": POINTS}
@@ -63,7 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
     args = parser.parse_args(arguments)
     try:
-        envs = [check_env(name) for name in args.env] or list(TASKS)
+        envs = [check_env(name) for name in args.env] or [
+            id for id, task in TASKS.items() if task.value_iteration
+        ]
     except UserError as error:
         print(f"agents.board_values: error: {error}", file=sys.stderr)
         return 2

@@ -20,14 +20,12 @@ import numpy as np
 
 from agents.evaluate import evaluate
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
-from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_env, check_name, write
+from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env, write
 from agents.train import command, follow, processes
-from lag_envs.scores import KNOWN_RETURNS, score
+from lag_envs.scores import known_returns, score
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
-#: Controllers that plan for seconds before each episode are left out here; docs/agents.md has them.
-SLOW = ("iLQR",)
 EPILOG = """what is left in the output folder:
   model.zip            the policy: stable_baselines3's load reads it
   learning_curve.png   returns while training, beside the controllers and the random policy
@@ -41,7 +39,7 @@ The same command goes on where it was broken off; a run that is finished is eval
 examples:
   python -m agents.demo                                  train on PivotedBar-v0, in about a minute
   python -m agents.demo --new --seed 7                   anew, with other random numbers
-  python -m agents.demo --env InclineTilt-v0 --output runs/incline"""
+  python -m agents.demo --env ball_on_beam.py --output runs/ball"""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -52,7 +50,10 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--env", default="PivotedBar-v0", metavar="ID", help="environment (default %(default)s)")
+    p.add_argument(
+        "--env", default="PivotedBar-v0", metavar="ENV",
+        help="id, module:ID or FILE, whose code is run (default %(default)s)",
+    )  # fmt: skip
     p.add_argument("--algo", default="ppo", help=f"{', '.join(ALGORITHMS)} (default %(default)s)")
     p.add_argument("--seed", type=int, default=0, help="seed of training (default %(default)s)")
     p.add_argument("--steps", type=int, help="environment steps to train for, in all")
@@ -90,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def open_run(args: argparse.Namespace) -> Run:
     """Return the run that the arguments ask for, or raise a UserError."""
-    check_env(args.env)
+    env = own_env(args.env)
     check_name("algorithm", args.algo, ALGORITHMS)
     if not 0 <= args.seed < 2**31:
         raise UserError(f"--seed must lie between 0 and 2147483647, got {args.seed}")
@@ -98,8 +99,9 @@ def open_run(args: argparse.Namespace) -> Run:
         raise UserError(f"--steps must be at least 1, got {args.steps}")
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
-    hyper = hyperparameters(args.algo, args.env)
-    run = Run(args.output, args.env, args.algo, args.seed, args.steps or int(hyper["n_timesteps"]), hyper)
+    hyper = hyperparameters(args.algo, env)
+    steps = args.steps or int(hyper["n_timesteps"])
+    run = Run(args.output, env, args.algo, args.seed, steps, hyper, "" if env == args.env else args.env)
     if args.new:
         run.remove()
     elif run.load_result() is None and run.load_checkpoint() is None and run.foreign():
@@ -111,7 +113,7 @@ def open_run(args: argparse.Namespace) -> Run:
 
 def report(run: Run, video: bool) -> None:
     """Compare the policy with other agents; write results, picture and video, print a table."""
-    from lag_envs.controllers import CONTROLLERS
+    from lag_envs.controllers import build, controllers
 
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())
@@ -119,8 +121,9 @@ def report(run: Run, video: bool) -> None:
     seeds = range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + EPISODES)
     started = time.perf_counter()
     with gym.make(run.env) as env:
-        makers = {name: make for name, make in CONTROLLERS[run.env].items() if name not in SLOW}
-        agents = {learner: policy} | {name: make(env.unwrapped.task) for name, make in makers.items()}
+        task = env.unwrapped.task
+        quick = [name for name, found in controllers(task).items() if not found.plans]
+        agents = {learner: policy} | {name: build(task, name) for name in quick}
         returns = {name: evaluate(env, agent, seeds) for name, agent in agents.items()}
     seconds = time.perf_counter() - started
     draw_curve(run, learner, result, returns)
@@ -139,9 +142,12 @@ def report(run: Run, video: bool) -> None:
     print(f"\nReturns over {EPISODES} fresh episodes of {run.env}")
     print(f"{'':22}{'mean':>9}{'lowest':>9}{'highest':>9}{'score':>8}")
     for name, r in sorted(returns.items(), key=lambda item: -item[1].mean()):
-        print(f"{name:22}{r.mean():9.2f}{r.min():9.2f}{r.max():9.2f}{score(run.env, r.mean()):8.3f}")
-    known = KNOWN_RETURNS[run.env]
-    print(f"The score is 0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g}).")
+        part = score(run.env, r.mean())
+        tail = "" if part is None else f"{part:8.3f}"
+        print(f"{name:22}{r.mean():9.2f}{r.min():9.2f}{r.max():9.2f}{tail}")
+    if known := known_returns(run.env):
+        ends = f"0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g})"
+        print(f"The score is {ends}.")
     print(
         f"\n{result['trained']:,} steps in {result['wall_seconds']:.1f} s of training, "
         f"{seconds:.1f} s of evaluation."
@@ -162,8 +168,9 @@ def draw_curve(run: Run, learner: str, result: dict[str, Any], returns: dict[str
     others = sorted((r.mean(), name) for name, r in returns.items() if name != learner)
     for number, (mean, name) in enumerate(reversed(others)):
         axes.axhline(mean, color=f"C{number + 1}", linestyle=":", label=f"{name} ({mean:.1f})")
-    best = KNOWN_RETURNS[run.env].best
-    axes.axhline(best, color="black", linestyle="--", linewidth=1.0, label=f"best known ({best:g})")
+    if known := known_returns(run.env):
+        label = f"best known ({known.best:g})"
+        axes.axhline(known.best, color="black", linestyle="--", linewidth=1.0, label=label)
     axes.set(xlabel="environment steps", ylabel="return of an episode", xlim=(0, trained), title=run.env)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     pace = result["wall_seconds"] / trained

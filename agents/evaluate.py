@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.controllers.basic import at_random
+
 
 def evaluate(env: gym.Env, agent: Any, seeds: Iterable[int]) -> NDArray[np.float64]:
     """Return an agent's return in one episode for each seed.
@@ -121,12 +123,12 @@ def observation_spread(env_id: str, seed: int, episodes: int = 100) -> NDArray[n
         Number of episodes; their first ones count, to their end.
     """
     envs = gym.make_vec(env_id, episodes, autoreset_mode="SameStep")
-    rng = np.random.default_rng(seed)
+    agent = at_random(envs.unwrapped.task, seed)  # type: ignore[attr-defined]
     observation, _ = envs.reset(seed=seed)
     running, seen = np.ones(episodes, np.bool_), []
     while running.any():
         seen.append(observation[running])
-        action = rng.uniform(-1.0, 1.0, (episodes, 1)).astype(np.float32)
+        action, _ = agent.predict(observation)
         observation, _, terminated, truncated, _ = envs.step(action)
         running &= ~(terminated | truncated)
     envs.close()

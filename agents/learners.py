@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import pickle
 import platform
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import lag_envs.hyperparams
 from agents.evaluate import evaluate_batch
 from agents.run import (
     CHECKPOINT,
@@ -32,10 +34,10 @@ from agents.run import (
     read_result,
     write,
 )
-from lag_envs import TASKS, __version__
-from lag_envs.hyperparams import HYPERPARAMS
-from lag_envs.scores import KNOWN_RETURNS, score
-from lag_envs.tasks import load_task
+from lag_envs import __version__
+from lag_envs.hyperparams import DISCRETISE
+from lag_envs.scores import known_returns, score
+from lag_envs.tasks.registration import make_task
 
 #: Where each learner's class is.
 ALGORITHMS = {
@@ -49,7 +51,7 @@ ALGORITHMS = {
 TEST_EPISODES, EPISODES = 20, 100
 #: Tests, and so points of the learning curve and checkpoints, of one run.
 TESTS = 16
-TIME_LIMIT, DISCRETISE = "gymnasium.wrappers.TimeLimit", "gymnasium.wrappers.DiscretizeAction"
+TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 SCALE = "lag_envs.sb3.ScaledReward"
 #: Libraries whose versions a result tells.
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
@@ -71,17 +73,18 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
     algo, env_id : str
         Name of the algorithm and id of the environment.
     file : Path, optional
-        A YAML file in the Zoo's form in place of our own.
+        A YAML file in the Zoo's form in place of the task's own.
 
     Raises
     ------
     UserError
         For an unknown algorithm, or a file without readable entry for the environment.
     """
+    check_name("algorithm", algo, ALGORITHMS)
+    if file is None:
+        return lag_envs.hyperparams.hyperparameters(algo, make_task(env_id))
     import yaml
 
-    check_name("algorithm", algo, ALGORITHMS)
-    file = file or HYPERPARAMS / f"{algo}.yml"
     try:
         entries = yaml.safe_load(file.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -105,8 +108,8 @@ def make_envs(run: Run) -> Any:
 
     hyper = run.hyperparameters
     options = dict(hyper.get("env_kwargs", {}))
-    place, fixed = TASKS[run.env]
-    steps = load_task(place)(**(fixed | options)).limit
+    task = make_task(run.env, **options)
+    steps = task.limit
     bins = factor = None
     for wrapper in [*hyper.get("env_wrapper", []), *hyper.get("vec_env_wrapper", [])]:
         name, arguments = next(iter(wrapper.items())) if isinstance(wrapper, dict) else (wrapper, {})
@@ -121,6 +124,10 @@ def make_envs(run: Run) -> Any:
             factor = arguments["factor"]
         else:
             raise UserError(f"wrapper {name} is not known here; {TIME_LIMIT}, {DISCRETISE} and {SCALE} are")
+    if steps == math.inf:
+        raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
+    if bins and (task.formulas.choices or task.formulas.actions > 1):
+        raise UserError(f"{run.algo} numbers the actions of one control, {run.env} has others; try ppo")
     envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
     envs = envs if factor is None else ScaledReward(envs, factor)
@@ -294,7 +301,7 @@ def train(
         def keep(self) -> None:
             """Test the policy as it is, and save all."""
             content = freeze(self.model)
-            mean = evaluate_batch(run.env, Policy(self.model), FIRST_TEST_SEED, TEST_EPISODES).mean()
+            mean = evaluate_batch(run.env, policy_of(run, self.model), FIRST_TEST_SEED, TEST_EPISODES).mean()
             run.trained = self.last = self.num_timesteps
             run.seconds = before + time.perf_counter() - started
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
@@ -324,8 +331,8 @@ def finish(run: Run, model: Any) -> None:
     if normalise is not None and normalise.norm_obs:
         write(run.path(NORMALISATION), pickle.dumps(normalise))
     started = time.perf_counter()
-    returns = evaluate_batch(run.env, Policy(model), FIRST_FRESH_SEED, EPISODES)
-    known = KNOWN_RETURNS.get(run.env)
+    returns = evaluate_batch(run.env, policy_of(run, model), FIRST_FRESH_SEED, EPISODES)
+    known = known_returns(run.env)
     result = {
         **run.settings,
         "trained": run.trained,
@@ -356,13 +363,16 @@ class Policy:
         A learner; where its environments normalise observations, so does the policy.
     normalise : VecNormalize, optional
         The normalisation, for a learner that was loaded without environments.
+    bins : bool
+        Whether actions that are numbers stand for parts of [-1, 1], and are not the environment's own.
     """
 
-    def __init__(self, model: Any, normalise: Any = None) -> None:
+    def __init__(self, model: Any, normalise: Any = None, bins: bool = True) -> None:
         self.model = model
         if normalise is None and model.get_env() is not None:
             normalise = model.get_vec_normalize_env()
         self.normalise = normalise if normalise is not None and normalise.norm_obs else None
+        self.bins = bins
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -372,11 +382,21 @@ class Policy:
             observation = self.normalise.normalize_obs(observation)
         action, state = self.model.predict(observation, state, episode_start, deterministic)
         bins = getattr(self.model.action_space, "n", None)
-        if bins is not None:
+        if self.bins and bins is not None:
             from lag_envs.leaderboard.policies import bin_centres
 
             action = bin_centres(int(bins)).astype(np.float32)[np.asarray(action)][..., None]
         return action, state
+
+
+def numbered(hyper: dict[str, Any]) -> bool:
+    """Tell whether a wrapper numbers the actions."""
+    return any(DISCRETISE in wrapper for wrapper in hyper.get("env_wrapper", []))
+
+
+def policy_of(run: Run, model: Any) -> Policy:
+    """Return the policy of a run's learner."""
+    return Policy(model, bins=numbered(run.hyperparameters))
 
 
 def load_policy(folder: Path) -> Policy:
@@ -395,4 +415,4 @@ def load_policy(folder: Path) -> Policy:
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"the policy in {folder} cannot be read ({reason}); train it anew") from error
-    return Policy(model, normalise)
+    return Policy(model, normalise, numbered(result["hyperparameters"]))

@@ -20,14 +20,10 @@ from agents.evaluate import Sensor, evaluate_batch
 from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
 from lag_envs import TASKS, __version__, controllers
 from lag_envs.leaderboard import protocol
-from lag_envs.tasks import load_task
-from lag_envs.tasks.base import Task
 
 AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
 CONTROLLERS = Path(controllers.__file__).parent
-#: Agents that act by a clock; unless they have a `pace`, they cannot act more often.
-COUNTS_STEPS = ("Optimal", "ILQR")
 
 # --- who is measured ----------------------------------------------------------------------------------------
 
@@ -79,10 +75,10 @@ class Field:
 def gather(env_id: str, runs: Path) -> Field:
     """Return the classical controllers, the optimal policy and the learners' runs of an environment."""
     found = Field(env_id)
-    place, fixed = TASKS[env_id]
-    task = load_task(place)(**fixed)
-    for name, make in classical(env_id).items():
-        found.entrants.append(Entrant(env_id, name, "classical", partial(make, task), digest(CONTROLLERS)))
+    task = TASKS[env_id]()
+    for name in controllers.controllers(task):
+        make = partial(controllers.build, task, name)
+        found.entrants.append(Entrant(env_id, name, "classical", make, digest(CONTROLLERS)))
     if reason := no_optimum(env_id):
         found.absent.append(f"optimal: {reason}")
     else:
@@ -104,19 +100,13 @@ def gather(env_id: str, runs: Path) -> Field:
     return found
 
 
-def classical(env_id: str) -> dict[str, Callable[[Task], Any]]:
-    """Return what makes an environment's classical controllers from its task, by name."""
-    return dict(controllers.CONTROLLERS[env_id])
-
-
 def no_optimum(env_id: str) -> str:
     """Return why there is no optimal policy; nothing where there is one."""
     try:
-        from agents.optimum import PROBLEMS
+        from agents.optimum import played
     except ImportError:
         return "agents.optimum is not there"
-    problem = PROBLEMS.get(env_id)
-    if problem is None or problem.observed is None:
+    if env_id not in played():
         return "value iteration gives no policy here"
     if not (OPTIMA / f"{env_id}.json").exists():
         return "not computed; `python -m agents.optimum` does"
@@ -265,8 +255,13 @@ class Job:
     @property
     def steps(self) -> int:
         """Steps that it takes at most."""
-        place, fixed = TASKS[self.entrant.env]
-        return int(load_task(place)(**(fixed | self.condition.options)).limit)
+        return int(TASKS[self.entrant.env](**self.condition.options).limit)
+
+
+def plans(entrant: Entrant) -> bool:
+    """Tell whether an agent plans before each episode: that takes long, and is for one control interval."""
+    found = controllers.controllers(TASKS[entrant.env]).get(entrant.name)
+    return entrant.kind == "classical" and found is not None and found.plans
 
 
 def set_pace(agent: Any, job: Job) -> bool:
@@ -274,12 +269,12 @@ def set_pace(agent: Any, job: Job) -> bool:
 
     Such an agent has an attribute `pace`: what its clock advances by at each `predict`.
     """
-    interval = load_task(TASKS[job.entrant.env][0]).interval
+    interval = TASKS[job.entrant.env].interval
     pace = job.condition.options.get("dt", interval) / interval
     if hasattr(agent, "pace"):
         agent.pace = pace
         return True
-    return pace == 1.0 or type(agent).__name__ not in COUNTS_STEPS
+    return pace == 1.0 or not plans(job.entrant)
 
 
 def measure(job: Job, agent: Any, spread: NDArray, tick: Callable[[], Any]) -> NDArray[np.float64]:

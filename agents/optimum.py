@@ -12,8 +12,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,17 +27,18 @@ from agents.value_iteration import (
     CacheError,
     Grid,
     Kick,
-    ValueIteration,
     carried,
     interpolate_rows,
     stretched,
 )
+from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
-from lag_envs.controllers.incline import optimal_return
+from lag_envs.controllers.basic import Reader
 from lag_envs.envs.model import Model
-from lag_envs.tasks import load_task
+from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Axis, ValueIteration
 
 Array = NDArray[np.float64]
 
@@ -66,186 +66,46 @@ how to read the numbers:
   estimate      grid values extrapolated to cells without width, by the order of convergence that the last
                 three show; its error bar is what the last halving of the cells changed. An ESTIMATE, no
                 bound. There is none where its own greedy policy gets more.
-  bound         what no policy can exceed, proved; crude but for InclineBrake-v0, where it is the optimum.
-PivotedBar-v0 and PivotedBarBalance-v0 have a state of 4 dimensions. Solved is the task without a track, which
-is easier: its value is from above; lower is what the best agent gets, see the agents' results.
+  bound         what no policy can exceed, proved; crude but where the optimum is known.
+Of a state of 4 dimensions an easier task is solved, such as the one without a track: its value is from above;
+lower is what the best agent gets, see the agents' results.
 
 It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): the same command goes on from there.
 
 examples:
-  python -m agents.optimum InclineBrake-v0 --quick    one id on coarse grids, in seconds; writes to FOLDER
+  python -m agents.optimum PivotedBar-v0 --quick      one id on coarse grids, in seconds; writes to FOLDER
   python -m agents.optimum                            all ids, tens of minutes on one core
-  python -m agents.optimum CylinderInCylinderPump-v0 --new    anew, forgetting what was computed"""
+  python -m agents.optimum PivotedBar-v0 --new        anew, forgetting what was computed"""
 
 
 # --- what is solved -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Axis:
-    """One axis of the grid: its range, and where its nodes lie densely.
-
-    Parameters
-    ----------
-    label : str
-        Name with unit, for figures.
-    low, high : float
-        The range. States outside are taken to be as good as the nearest one on the edge.
-    cells : int
-        Cells at level 1, even; twice as many at level 2.
-    scale : float, optional
-        Within this distance of the centre the nodes lie evenly, farther out ever wider; None: all evenly.
-    centre : float or "target"
-        The dense place.
-    periodic : bool
-        Whether the range is one period.
-    """
-
-    label: str
-    low: float
-    high: float
-    cells: int
-    scale: float | None = None
-    centre: float | str = 0.0
-    periodic: bool = False
-
-    def nodes(self, level: float, target: float | None) -> Array:
-        """Return the nodes."""
-        cells = 2 * round(0.5 * level * self.cells)
-        if self.scale is None:
-            return np.linspace(self.low, self.high, cells + 1)
-        centre = target if self.centre == "target" else self.centre
-        assert isinstance(centre, float)
-        return stretched(self.low, centre, self.high, cells, self.scale)
+def nodes(axis: Axis, level: float, target: float | None) -> Array:
+    """Return an axis's nodes."""
+    cells = 2 * round(0.5 * level * axis.cells)
+    if axis.scale is None:
+        return np.linspace(axis.low, axis.high, cells + 1)
+    centre = target if axis.centre == "target" else axis.centre
+    assert isinstance(centre, float)
+    return stretched(axis.low, centre, axis.high, cells, axis.scale)
 
 
-@dataclass(frozen=True)
-class Problem:
-    """What is solved for an environment.
-
-    Parameters
-    ----------
-    env_id : str
-        The environment whose task is solved.
-    axes : tuple of Axis
-        The grid.
-    observed : callable
-        From observations (n, n_observation) to the states on the grid, (n, d).
-    options : dict
-        Parameters of the task that differ from the environment's: those of a relaxation.
-    keep : tuple of int
-        Which entries of the scene's state are on the grid; the others are 0 there.
-    targets : tuple of float
-        Targets, from 0 on, to solve for; others are interpolated, negative ones mirrored. Empty: none.
-    pushes : int
-        Sizes of a kick that its expectation takes: midpoints of as many parts of its random number.
-    actions : int
-        Number of actions, evenly from -1 to 1.
-    levels : tuple of float
-        How fine the grids are, each twice as fine as the one before.
-    lost : float
-        Share of the grid in which so much is lost that figures need not tell one place from another.
-    """
-
-    env_id: str
-    axes: tuple[Axis, ...]
-    observed: Callable[[Array], Array] | None = None
-    options: dict[str, Any] = field(default_factory=dict)
-    keep: tuple[int, ...] = ()
-    targets: tuple[float, ...] = ()
-    pushes: int = 0
-    actions: int = 11
-    levels: tuple[float, ...] = (2, 4, 8)
-    lost: float = 0.0
-
-    def task(self) -> Task:
-        """Return the task that is solved."""
-        place, fixed = TASKS[self.env_id]
-        return load_task(place)(**(fixed | self.options))
-
-    def grid(self, level: float, target: float | None = None) -> Grid:
-        """Return the grid of a level."""
-        axes = tuple(axis.nodes(level, target) for axis in self.axes)
-        return Grid(axes, tuple(a.high - a.low if a.periodic else None for a in self.axes))
+def grid(problem: ValueIteration, level: float, target: float | None = None) -> Grid:
+    """Return the grid of a level."""
+    axes = tuple(nodes(axis, level, target) for axis in problem.axes)
+    return Grid(axes, tuple(a.high - a.low if a.periodic else None for a in problem.axes))
 
 
-TURN = 2.0 * math.pi
-PROBLEMS = {
-    problem.env_id: problem
-    for problem in (
-        Problem(
-            "PivotedBarFree-v0",
-            (
-                Axis("θ [rad]", 0.0, TURN, 80, periodic=True),
-                Axis("θ' [rad/s]", -12.0, 12.0, 80),
-            ),
-            observed=lambda o: np.stack([np.arctan2(o[:, 1], o[:, 0]), 8.0 * o[:, 2]], axis=1),
-        ),
-        Problem(
-            "InclineBrake-v0",
-            # At rest on the line the time to the crossing is 0/0: the grid ends a hair before it.
-            (
-                Axis("x [m]", -3.0, -1e-6, 80, scale=0.3, centre=-1e-6),
-                Axis("x' [m/s]", 0.0, 3.4, 80, scale=0.5, centre=0.5),
-            ),
-            observed=lambda o: np.stack([-o[:, 0], o[:, 1]], axis=1),
-            lost=0.1,
-        ),
-        Problem(
-            "CylinderInCylinderDamping-v0",
-            (Axis("θ [rad]", -2.5, 2.5, 80, scale=0.03), Axis("θ' [rad/s]", -9.0, 9.0, 80, scale=0.1)),
-            observed=lambda o: o,
-            pushes=4,
-            lost=0.1,
-        ),
-        Problem(
-            "PivotedBarBalance-v0",
-            (Axis("θ [rad]", math.pi - 0.35, math.pi + 0.35, 80), Axis("θ' [rad/s]", -3.5, 3.5, 80)),
-            # On a track so long, neither its ends nor the cost of s are ever felt.
-            options={"track": 1e9},
-            keep=(2, 3),
-            pushes=16,
-            lost=0.6,
-        ),
-        Problem(
-            "CylinderInCylinderPump-v0",
-            (
-                Axis("θ [rad]", -1.3, 1.3, 56),
-                Axis("θ' [rad/s]", -4.4, 4.4, 56),
-                Axis("ψ' [rad/s]", -3.0, 3.0, 6),
-            ),
-            observed=lambda o: o,
-            levels=(1, 2, 4),
-            lost=0.1,
-        ),
-        Problem(
-            "InclineTilt-v0",
-            (
-                Axis("x [m]", -0.5, 0.5, 36, scale=0.1, centre="target"),
-                Axis("w [m/s]", -1.0, 1.0, 36, scale=0.1),
-                Axis("φ [rad]", -0.1, 0.1, 12),
-            ),
-            observed=lambda o: o[:, :3],
-            targets=(0.0, 0.1, 0.2, 0.3),
-            levels=(1, 2, 4),
-            lost=0.3,
-        ),
-        Problem(
-            "CylinderInCylinderTilt-v0",
-            (
-                Axis("θ [rad]", -1.05, 1.05, 30, scale=0.05, centre="target"),
-                Axis("θ' [rad/s]", -4.0, 4.0, 30, scale=1.0),
-                Axis("ψ' [rad/s]", -6.0, 6.0, 16),
-            ),
-            observed=lambda o: o[:, :3],
-            targets=(0.0, 0.15, 0.3),
-            levels=(1, 2, 4),
-            lost=0.3,
-        ),
-    )
-}
-#: Whose value function bounds from above what is not solved itself, and which entries of the state it takes.
-RELAXATIONS = {"PivotedBar-v0": ("PivotedBarFree-v0", (2, 3))}
+def solvable() -> dict[str, ValueIteration]:
+    """Return what is solved on a grid of its own, by id."""
+    found = {env_id: task.value_iteration for env_id, task in TASKS.items()}
+    return {env_id: problem for env_id, problem in found.items() if problem and problem.axes}
+
+
+def played() -> list[str]:
+    """Return the ids for which value iteration gives a policy: those that are solved themselves."""
+    return [env_id for env_id, problem in solvable().items() if not problem.options]
 
 
 class Solution:
@@ -253,8 +113,8 @@ class Solution:
 
     Parameters
     ----------
-    problem : Problem
-        What is solved.
+    env_id : str
+        The environment that is solved.
     level : float
         How fine.
     folder : Path, optional
@@ -263,18 +123,23 @@ class Solution:
         Whether to forget what is cached.
     quiet : bool
         Whether to show no progress.
+    problem : ValueIteration, optional
+        What is solved, where it is not what the task says.
     """
 
     def __init__(
         self,
-        problem: Problem,
+        env_id: str,
         level: float,
         folder: Path | None = DEFAULT_FOLDER,
         *,
         new: bool = False,
         quiet: bool = False,
+        problem: ValueIteration | None = None,
     ) -> None:
-        self.problem, self.level, self.task = problem, level, problem.task()
+        problem = problem or solvable()[env_id]
+        self.env_id, self.problem, self.level = env_id, problem, level
+        self.task: Task = TASKS[env_id](**problem.options)
         self.model = Model(self.task)
         self.n_state = len(self.task.scene.state_names)
         self.keep = list(problem.keep or range(self.n_state))
@@ -286,26 +151,26 @@ class Solution:
         self.programs, self.values, self.seconds = [], [], 0.0
         for target in problem.targets or (None,):
             program = self.program(target)
-            label = f"{problem.env_id}, {' x '.join(map(str, program.grid.shape))} nodes" + (
+            label = f"{env_id}, {' x '.join(map(str, program.grid.shape))} nodes" + (
                 "" if target is None else f", target {target:g}"
             )
-            where = None if folder is None else folder / problem.env_id
+            where = None if folder is None else folder / env_id
             self.values.append(program.solve(where, new=new, label=label, quiet=quiet))
             self.programs.append(program)
             self.seconds += program.seconds
 
-    def program(self, target: float | None) -> ValueIteration:
+    def program(self, target: float | None) -> Programme:
         """Return the dynamic programme for a target."""
         problem = self.problem
         # Not in the fingerprint: what happens between the places where the step is tried.
         parameters = {
-            "schema": CACHED, "env": problem.env_id, "options": problem.options, "target": target,
+            "schema": CACHED, "env": self.env_id, "options": dict(problem.options), "target": target,
             "level": self.level, "pushes": problem.pushes, "constants": self.task.formulas.constants(),
         }  # fmt: skip
         actions = np.linspace(-1.0, 1.0, problem.actions)
-        grid = problem.grid(self.level, target)
         step = functools.partial(self.step, target=target)
-        return ValueIteration(grid, actions, step, self.steps, self.kick, parameters)
+        places = grid(problem, self.level, target)
+        return Programme(places, actions, step, self.steps, self.kick, parameters)
 
     def states(self, points: Array) -> Array:
         """Return the scene's states for points on the grid."""
@@ -378,7 +243,7 @@ class Solution:
         different, rows = np.unique(targets, return_inverse=True)
         if not np.array_equal(different, self._asked):
             axis = self.problem.axes[self._moving]
-            self._own = np.array([axis.nodes(self.level, float(target)) for target in different])
+            self._own = np.array([nodes(axis, self.level, float(target)) for target in different])
             self._asked = different
         return rows
 
@@ -411,8 +276,9 @@ class Optimal:
     Examples
     --------
     >>> import gymnasium as gym
-    >>> agent = Optimal("InclineBrake-v0", level=0.5, folder=None)
-    >>> observation, _ = gym.make("InclineBrake-v0").reset(seed=0)
+    >>> from lag_envs.tasks.incline import Brake
+    >>> agent = Optimal(Brake.id, level=0.5, folder=None)
+    >>> observation, _ = gym.make(Brake.id).reset(seed=0)
     >>> action, taken = agent.predict(observation)
     >>> action, taken
     (array([-1.], dtype=float32), array([1.]))
@@ -425,12 +291,12 @@ class Optimal:
         folder: Path | None = DEFAULT_FOLDER,
         solution: Solution | None = None,
     ) -> None:
-        problem = PROBLEMS.get(env_id)
-        if problem is None or problem.observed is None:
-            able = ", ".join(id for id, p in PROBLEMS.items() if p.observed)
-            raise ValueError(f"value iteration gives no policy for {env_id!r}, only for {able}")
-        self.problem = problem
-        self.solution = solution or Solution(problem, level or problem.levels[-1], folder)
+        if env_id not in played():
+            raise ValueError(
+                f"value iteration gives no policy for {env_id!r}, only for {', '.join(played())}"
+            )
+        self.solution = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
+        self.read = Reader(self.solution.task)
         #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
         self.pace = 1.0
 
@@ -448,9 +314,8 @@ class Optimal:
         taken = np.zeros(n) if state is None else np.broadcast_to(np.asarray(state, np.float64), n)
         if episode_start is not None:
             taken = np.where(np.broadcast_to(episode_start, n), 0.0, taken)
-        targets = batch[:, -1].copy() if self.problem.targets else None
-        assert self.problem.observed is not None
-        points = self.problem.observed(batch)
+        points, goals = self.read(batch)
+        targets = goals if self.solution.problem.targets else None
         # The margin is for a clock that has gone tenths of a step.
         after = np.minimum((taken + 1e-6).astype(np.int64) + 1, self.solution.steps)
         coarse = self.solution.programs[0].actions
@@ -503,34 +368,12 @@ def mean_and_interval(returns: Array) -> dict[str, Any]:
 
 def proved_bound(env_id: str) -> tuple[float, str]:
     """Return what no policy exceeds in the mean over the starts, and why."""
-    place, fixed = TASKS[env_id]
-    task: Any = load_task(place)(**fixed)
-    if env_id != "InclineBrake-v0":
+    task: Task = TASKS[env_id]()
+    if task.optimum is None:
         return task.limit, "steps of an episode; no step pays more than 1"
     states, _ = starts(env_id)
-    why = (
-        "with a brake that is off, then full, from the best moment on (`lag_envs.controllers.optimal_return`)"
-    )
-    return float(optimal_return(task, *states.T).mean()), why
-
-
-def seconds_to_upright(states: Array, dt: float) -> float:
-    """Return when a bar (θ in column 0) comes within 0.2 rad of upright to stay there [s]."""
-    off = np.abs(np.mod(states[:, 0], TURN) - math.pi) > 0.2
-    return float(dt * (np.flatnonzero(off)[-1] + 1)) if off.any() else 0.0
-
-
-def known_answers(env_id: str, agent: Optimal) -> dict[str, Any]:
-    """Return what is known of the optimum from elsewhere, as computed."""
-    if env_id == "PivotedBarFree-v0":
-        states = trajectory(env_id, agent)
-        return {"seconds_to_upright": round(seconds_to_upright(states, agent.solution.task.dt), 3)}
-    if env_id == "CylinderInCylinderDamping-v0":
-        from lag_envs.controllers import Constant
-
-        full = evaluate_batch(env_id, Constant(1.0), FIRST_FRESH_SEED, EPISODES)
-        return {"full_damping": mean_and_interval(full)}
-    return {}
+    place, text = task.optimum.place, task.optimum.text
+    return float(resolve(place)(task, *states.T).mean()), f"{text} (`{place.replace(':', '.')}`)"
 
 
 def extrapolated(values: Sequence[float]) -> tuple[float, float, float]:
@@ -568,14 +411,17 @@ def parameters(task: Task) -> dict[str, float]:
 
 def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False) -> dict[str, Any]:
     """Solve what an environment needs, and return its numbers."""
-    source, entries = RELAXATIONS.get(env_id, (env_id, None))
-    problem = PROBLEMS[source]
+    own = TASKS[env_id].value_iteration
+    if own is None:
+        raise UserError(f"{env_id} has no grid to be solved on; its task may have a value_iteration")
+    source = own.relaxed or env_id
+    problem = solvable()[source]
     levels = [problem.levels[0] / 2, problem.levels[0]] if quick else list(problem.levels)
     states, targets = starts(env_id)
     grids = []
     for level in levels:
-        solution = Solution(problem, level, folder, new=new and source == env_id)
-        keep = solution.keep if entries is None else list(entries)
+        solution = Solution(source, level, folder, new=new and source == env_id)
+        keep = list(own.keep) if own.relaxed else solution.keep
         value = float(solution.value(0, states[:, keep], targets).mean())
         grids.append(
             {
@@ -586,11 +432,10 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         )  # fmt: skip
         print(f"{env_id}: {' x '.join(map(str, grids[-1]['nodes']))} nodes, value {value:.3f}", flush=True)
     relaxed = env_id != source or bool(problem.options)
-    lower, answers, started = None, {}, time.process_time()
+    lower, started = None, time.process_time()
     if not relaxed:
         agent = Optimal(env_id, solution=solution)
         lower = mean_and_interval(evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES))
-        answers = known_answers(env_id, agent)
     limit, error, order = extrapolated([grid["value"] for grid in grids])
     bound, why = proved_bound(env_id)
     broken = lower is not None and lower["mean"] > limit + error
@@ -601,7 +446,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "solved": source + (" with " + ", ".join(f"{k}={v:g}" for k, v in problem.options.items())
                             if problem.options else ""),
         "how": explanation(env_id, source, problem, grids),
-        "parameters": parameters(problem.task()),
+        "parameters": parameters(TASKS[source](**problem.options)),
         "axes": [
             {"label": a.label, "low": a.low, "high": a.high, "cells_at_level_1": a.cells,
              "even_within": a.scale, "centre": a.centre, "periodic": a.periodic}
@@ -615,15 +460,14 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
         "lower": lower,
         "estimate": estimate,
         "order": round(order, 2),
-        "bound": {"value": round(bound, 4), "why": why, "exact": env_id == "InclineBrake-v0"},
-        "known": answers,
+        "bound": {"value": round(bound, 4), "why": why, "exact": TASKS[env_id].optimum is not None},
         "cpu_seconds": round(sum(g["cpu_seconds"] for g in grids) + time.process_time() - started, 1),
         "machine": machine(),
         "versions": {"lag-envs": __version__} | {n: version(n) for n in ("numpy", "numba", "gymnasium")},
     }  # fmt: skip
 
 
-def explanation(env_id: str, source: str, problem: Problem, grids: Sequence[dict[str, Any]]) -> str:
+def explanation(env_id: str, source: str, problem: ValueIteration, grids: Sequence[dict[str, Any]]) -> str:
     """Return in words how the numbers came about."""
     sizes = ", ".join(" x ".join(map(str, grid["nodes"])) for grid in grids)
     text = (
@@ -669,8 +513,8 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    problem = PROBLEMS[env_id]
-    solution = Solution(problem, level, folder)
+    problem = solvable()[env_id]
+    solution = Solution(env_id, level, folder)
     k = len(problem.targets) - 1 if problem.targets else 0
     target = problem.targets[k] if problem.targets else None
     program, values = solution.programs[k], solution.values[k]
@@ -693,7 +537,7 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
                 name, unit = problem.axes[2].label.split()
                 plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
         plots[0].set_ylabel(problem.axes[1].label)
-        if problem.observed is not None and len(axes) == 2:
+        if not problem.options and len(axes) == 2:
             states = trajectory(env_id, Optimal(env_id, solution=solution))[:, solution.keep]
             if problem.axes[0].periodic:
                 states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)
@@ -744,7 +588,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before = signal.signal(signal.SIGTERM, _interrupt)
     try:
         # What others are relaxed to comes first, so that it is there.
-        ids = [check_env(name) for name in args.env] or sorted(TASKS, key=lambda i: i in RELAXATIONS)
+        known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
+        ids = [check_env(name) for name in args.env] or sorted(
+            (env_id for env_id, problem in known.items() if problem),
+            key=lambda env_id: bool(known[env_id].relaxed),
+        )
         for env_id in dict.fromkeys(ids):
             work(env_id, args)
     except (UserError, CacheError, OSError) as error:
@@ -767,8 +615,8 @@ def work(env_id: str, args: argparse.Namespace) -> None:
     results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
     result = compute(env_id, args.folder, quick=args.quick, new=args.new)
     write(results / f"{env_id}.json", json.dumps(result, indent=2, ensure_ascii=False) + "\n")
-    if env_id in PROBLEMS:
-        levels = PROBLEMS[env_id].levels
+    if env_id in solvable():
+        levels = solvable()[env_id].levels
         draw(env_id, args.folder, images / f"value-{env_id}.png", levels[0] if args.quick else levels[1])
     lower = result["lower"]
     low = "see the agents' results" if lower is None else f"{lower['mean']:.3f} {lower['interval']}"

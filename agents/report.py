@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,14 @@ import numpy as np
 
 from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
 from lag_envs.benchmark import quartiles, short
-from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.scores import known_returns
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.measured import measured
 
 IMAGES = "images"
-NOTES = Path(__file__).with_name("notes.toml")
 ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 OPTIMA = Path(__file__).with_name("results") / "optimum"
 BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
-SCALE = Path(__file__).with_name("results") / "scale.json"
 DOCS = Path(__file__).parents[1] / "docs"
 
 # --- figures -----------------------------------------------------------------------------------------------
@@ -232,9 +231,9 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     data : dict
         What ``agents/results/summary.json`` holds.
     notes : mapping of str to str, optional
-        A text for each environment, by default those in ``agents/notes.toml``.
+        A text for each environment, by default its task's `note`.
     """
-    notes = load_notes() if notes is None else notes
+    notes = {id: task.note for id, task in TASKS.items()} if notes is None else notes
     envs = data["envs"]
     parts = [
         "# Agents: what they reach",
@@ -292,13 +291,6 @@ def summary(data: Data) -> str:
     return table(head, rows)
 
 
-def load_notes() -> dict[str, str]:
-    """Return the texts about the environments."""
-    if not NOTES.exists():
-        return {}
-    return tomllib.loads(NOTES.read_text(encoding="utf-8"))
-
-
 def _reading(data: Data) -> str:
     return (
         "A score is (return - random) / (best known - random): 0 for random actions, 1 for the best policy"
@@ -320,18 +312,18 @@ def _range(env_id: str, env: Data) -> str:
         return "No range is set for scores; the numbers are mean returns."
     random, best = env["known"]
     text = f"Score 0 is a mean return of {random:g}, score 1 one of {best:g}."
-    found = json.loads(SCALE.read_text(encoding="utf-8"))["envs"].get(env_id) if SCALE.exists() else None
-    if not found or env_id not in KNOWN_RETURNS:
+    found, known = measured(env_id).get("measured"), known_returns(env_id)
+    if not found or not known or known.policy not in found:
         return text
-    policy = KNOWN_RETURNS[env_id].policy
-    measured = [
+    policy = known.policy
+    told = [
         f"{what} {plus_minus(row['mean'], row['error'])} in {row['episodes']:,} episodes"
         for what, row in (
             ("random actions", found["random"]),
             (f"{policy}, the best policy known,", found[policy]),
         )
     ]
-    return f"{text} Measured (`python -m agents.scale`): {'; '.join(measured)}."
+    return f"{text} Measured (`python -m agents.scale`): {'; '.join(told)}."
 
 
 def _env_table(env: Data, episodes: int) -> str:
@@ -558,7 +550,7 @@ def _optimum(env_id: str) -> list[str]:
     if lower is not None:
         low, high = lower["interval"]
         parts.append(f"Its greedy policy gets {lower['mean']:.6g} (95 % interval {low:.6g} to {high:.6g}).")
-    known = KNOWN_RETURNS.get(env_id)
+    known = known_returns(env_id)
     if known is not None and estimate is not None:
         upper = min(bound["value"], estimate["value"] + estimate["error"])
         if known.best - known.random < 0.95 * (upper - known.random):

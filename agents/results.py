@@ -23,17 +23,16 @@ from numpy.typing import NDArray
 
 from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
 from agents.evaluate import observation_spread
-from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather
+from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, write
 from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
-from lag_envs.scores import KNOWN_RETURNS
-from lag_envs.tasks import load_task
+from lag_envs.scores import known_returns
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
 #: Episodes under each condition; those of agents that take long, where something is changed; with --quick.
-EPISODES, SLOW, QUICK = 1000, {"iLQR": 200}, 20
+EPISODES, PLANNED, QUICK = 1000, 200, 20
 #: Seed of the random actions from which the noise's size is taken.
 SPREAD_SEED = 3_000_000_000
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
@@ -143,7 +142,7 @@ def measure_all(
         for env_id, found in fields.items()
         for entrant in found.entrants
         if names is None or entrant.name in names
-        for few in [SLOW.get(entrant.name, episodes)]
+        for few in [PLANNED if plans(entrant) else episodes]
         for condition in conditions(env_id)
     ]
     todo = [job for job in jobs if job.key not in stores[job.entrant.env].returns]
@@ -204,7 +203,8 @@ def summarise(
             if before is not None:
                 envs[env_id] = before
             continue
-        known = (KNOWN_RETURNS[env_id].random, KNOWN_RETURNS[env_id].best)
+        scale = known_returns(env_id)
+        known = (scale.random, scale.best) if scale else None
         found = rounded(summarise_env(measured[env_id].values(), known))
         if before is not None and before["known"] == found["known"]:
             found["agents"] = ranked(before["agents"] | found["agents"])
@@ -218,8 +218,7 @@ def summarise(
         absent = [text for text in fields[env_id].absent if text.split(":")[0] not in found["agents"]]
         if any(agent["kind"] == "learned" for agent in found["agents"].values()):
             absent = [text for text in absent if not text.startswith("learners")]
-        place, fixed = TASKS[env_id]
-        names = load_task(place)(**fixed).observation
+        names = TASKS[env_id]().observation
         found["spread"] = rounded(dict(zip(names, spreads[env_id].tolist(), strict=True)))
         found["problems"] = absent
         envs[env_id] = found

@@ -12,6 +12,7 @@ import os
 import pickle
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ class Run:
     env, algo, seed, steps : str, str, int, int
         Id of the environment, name of the learner, seed, steps to train for.
     hyperparameters : dict
-        As in the files of `lag_envs/hyperparams`.
+        As `lag_envs.hyperparams` has them.
     """
 
     folder: Path
@@ -46,6 +47,8 @@ class Run:
     seed: int
     steps: int
     hyperparameters: dict[str, Any]
+    #: The file or module of the user's own environment, as it was given; empty for one of the package.
+    source: str = ""
     trained: int = 0
     seconds: float = 0.0
     #: Steps so far, seconds so far, mean return of the policy then.
@@ -163,8 +166,35 @@ def write(file: Path, data: bytes | str) -> None:
 
 
 def check_env(env_id: str) -> str:
-    """Return the id of an environment, or raise a UserError that knows what was meant."""
+    """Return the id of an environment of the package, or raise a UserError that knows what was meant."""
     return check_name("environment", env_id, TASKS)
+
+
+def own_env(name: str) -> str:
+    """Return the id that a name means: one of the package's, ``module:Id``, ``FILE`` or ``FILE:Class``.
+
+    A file or module of one's own is run, and what it defines registered.
+
+    Raises
+    ------
+    UserError
+        Where there is none, or several.
+    """
+    import gymnasium as gym
+
+    from lag_envs import own_files
+
+    if own_files.is_file(name):
+        own_files.one(name)
+        return own_files.registered(name)[0]
+    if ":" not in name:
+        return check_env(name)
+    module, _, env_id = name.partition(":")
+    try:
+        import_module(module)
+        return gym.spec(env_id).id
+    except (gym.error.Error, ImportError) as error:
+        raise UserError(f"there is no environment {name!r}: {error}") from error
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> str:

@@ -1,10 +1,11 @@
-"""Measure the mean returns that `lag_envs.scores` and the leaderboard's `REFERENCES` are set to.
+"""Measure the mean returns that scores and the leaderboard's references are set to.
 
-``python -m agents.scale`` plays, for each environment, random actions, the best policy known and the board's
-reference, and prints means and standard errors beside the numbers in use. A policy that takes long plays the
-first of the episodes only, and the luck in them is taken out by what the reference gets there and in all (a
-control variate); what the reference is set to comes from other episodes, independent of all that.
-``agents/results/scale.json`` keeps the numbers (``--output``), and README shows them.
+``python -m agents.scale`` plays, for each environment, random actions, no control, the best policy known and
+the board's reference, and prints means and standard errors beside the numbers in use. A policy that takes
+long plays the first of the episodes only, and the luck in them is taken out by what the reference gets there
+and in all (a control variate); what the reference is set to comes from other episodes, independent of all
+that. ``--output src/lag_envs/tasks/measured.json`` keeps the numbers, and README shows them: what is in use
+stays, an environment without gets its own, the best of its controllers being the best known.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluate import evaluate_batch
-from agents.optimum import Optimal
+from agents.optimum import Optimal, played
 from agents.results import to_json
 from agents.run import UserError, check_env, write
 from lag_envs import TASKS
 from lag_envs.benchmark import machine
-from lag_envs.controllers import make_controller, optimal_return
-from lag_envs.leaderboard.protocol import REFERENCES
-from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.controllers import build, controllers, make_controller
+from lag_envs.tasks import resolve
+from lag_envs.tasks.measured import measured as of_package
 
 Array = NDArray[np.float64]
 
-#: Seeds of nobody else, and those of the references' own means; episodes that are played together; how many
-#: policies play that take long.
+#: Seeds of nobody else, and those of the references' own means; episodes that are played together.
 FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
-SLOW = {"iLQR": 1_000, "optimal": 4_096}
+#: Episodes of policies that take long: that plan, that look ahead by value iteration.
+PLANNED, OPTIMAL = 1_000, 4_096
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,47 +62,74 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-        kept[env_id] = measured(env_id, args.batches, args.quick)
+        kept[env_id] = measured(env_id, args.batches, args.quick, kept.get(env_id, of_package(env_id)))
         if args.output:
-            about = {"date": datetime.date.today().isoformat(), "machine": machine()}
+            about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
+            about["machine"] = machine()
             seeds = {"first_seed": FIRST_SEED, "first_seed_of_references": REFERENCE_SEED}
             in_order = {name: kept[name] for name in TASKS if name in kept}
             write(args.output, to_json(about | seeds | {"envs": in_order}))
     return 0
 
 
-def measured(env_id: str, batches: int, quick: bool) -> dict[str, Any]:
+def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None = None) -> dict[str, Any]:
     """Measure an environment's policies, and print a line for each.
+
+    Parameters
+    ----------
+    env_id : str
+        The environment.
+    batches : int
+        Of `BATCH` episodes.
+    quick : bool
+        Whether to leave out policies that take long.
+    kept : dict, optional
+        What `lag_envs.tasks.measured` has of it.
 
     Returns
     -------
     dict
-        By policy ``mean``, standard ``error`` and the ``episodes`` that it played; ``reference`` is the
-        board's, and ``optimum``, for ``InclineBrake-v0``, what is known of it.
+        The same anew: ``scale`` and ``reference`` as they are, or from this measurement where they are
+        missing; ``measured`` by policy ``mean``, standard ``error`` and the ``episodes`` that it played;
+        "reference" is the board's, and "optimum", where it is known, what no policy exceeds.
     """
-    known, reference = KNOWN_RETURNS[env_id], REFERENCES.get(env_id)
+    kept, task = dict(kept or {}), TASKS[env_id]()
+    scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
+    known = controllers(task)
+    slow = {name: PLANNED for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
+    names = ["random", "zero", *([scale["policy"]] if scale else [*task.controllers])]
+    if not scale and env_id in played():
+        names.append("optimal")
     found: dict[str, Any] = {}
 
-    def show(name: str, mean: float, error: float, episodes: int, used: float | None) -> None:
+    def show(name: str, mean: float, error: float, episodes: int, used: float | None = None) -> None:
         found[name] = {"mean": round(mean, 6), "error": round(error, 6), "episodes": episodes}
-        print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}   in use: {used}", flush=True)
+        tail = "" if used is None else f"   in use: {used}"
+        print(f"{env_id:28} {name:20} {mean:10.4f} ± {error:.4f}{tail}", flush=True)
 
-    for name, value in (("random", known.random), (known.policy, known.best)):
-        if name not in SLOW:
+    in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
+    for name in dict.fromkeys(names):
+        if name not in slow:
             returns = many(env_id, name, batches)
-            show(name, *mean_and_error(returns), len(returns), value)
-    if known.policy in SLOW and not quick:
-        agent = Optimal(env_id) if known.policy == "optimal" else make_controller(env_id, known.policy)
-        returns = evaluate_batch(env_id, agent, FIRST_SEED, SLOW[known.policy])
-        same = None if reference is None else many(env_id, reference[0], batches)
-        show(known.policy, *without_luck(returns, same), len(returns), known.best)
-    if reference is not None:
-        returns = many(env_id, reference[0], batches, REFERENCE_SEED)
-        show("reference", *mean_and_error(returns), len(returns), reference[1])
-    if env_id == "InclineBrake-v0":
-        best = np.concatenate([optima(FIRST_SEED + k * BATCH) for k in range(batches)])
-        show("optimum", *mean_and_error(best), len(best), known.optimum)
-    return found
+            show(name, *mean_and_error(returns), len(returns), in_use.get(name))
+        elif not quick:
+            agent = Optimal(env_id) if name == "optimal" else build(task, name)
+            returns = evaluate_batch(env_id, agent, FIRST_SEED, slow[name])
+            same = many(env_id, task.reference, batches) if task.reference else None
+            show(name, *without_luck(returns, same), len(returns), in_use.get(name))
+    if task.reference:
+        returns = many(env_id, task.reference, batches, REFERENCE_SEED)
+        show("reference", *mean_and_error(returns), len(returns), used)
+        kept.setdefault("reference", found["reference"])
+    if task.optimum:
+        best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH) for k in range(batches)])
+        show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
+    if not scale:
+        first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
+        scale = {"random": found["random"]["mean"], "best": found[first]["mean"]}
+        scale |= {"error": found[first]["error"], "policy": first}
+        scale |= {"optimum": found["optimum"]["mean"]} if task.optimum else {}
+    return {"scale": scale} | kept | {"measured": found}
 
 
 def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array:
@@ -111,12 +139,12 @@ def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array
     return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
 
 
-def optima(first: int) -> Array:
-    """Return the largest returns of a batch of the braking task."""
-    envs = gym.make_vec("InclineBrake-v0", BATCH)
+def optima(env_id: str, first: int) -> Array:
+    """Return the largest returns of a batch of episodes."""
+    envs = gym.make_vec(env_id, BATCH)
     envs.reset(seed=first)
     bare: Any = envs.unwrapped
-    best = optimal_return(bare.task, *bare.state.T)
+    best = resolve(bare.task.optimum.place)(bare.task, *bare.state.T)
     envs.close()
     return best
 

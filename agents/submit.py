@@ -10,7 +10,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.optimum import DEFAULT_FOLDER, PROBLEMS, Solution
+from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.run import MODEL, UserError, check_env
 from agents.value_iteration import CacheError
 from lag_envs import TASKS
-from lag_envs.controllers import CONTROLLERS
+from lag_envs.controllers import controllers
 from lag_envs.leaderboard.export import ALGORITHMS, ExportError, export, find
-from lag_envs.leaderboard.protocol import LEARNED_POLICIES
+from lag_envs.leaderboard.protocol import LEARNED_POLICIES, boards
 from lag_envs.leaderboard.submission import Refused, Submission, load, write
 
 Array = NDArray[np.float64]
@@ -41,88 +41,43 @@ A folder that is there is kept, so that the same command goes on; --new makes it
 # --- optimal ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Coarse:
-    """How a value function is coarsened to a table.
-
-    Parameters
-    ----------
-    axes : tuple of str
-        What the grid's axes are in the submission; behind them come the target and the time where there are.
-    levels : tuple of float
-        For each axis the level of the grid (`agents.optimum.Axis.nodes`) whose nodes it takes.
-    times : tuple of float
-        Shares of the episode at which values are kept; one alone for a table without time.
-    targets : tuple of float
-        Targets, from 0 on, at which values are kept.
-    mirror : str
-        On whose sign to mirror; empty: not.
-    """
-
-    axes: tuple[str, ...]
-    levels: tuple[float, ...]
-    times: tuple[float, ...] = (0.0,)
-    targets: tuple[float, ...] = ()
-    mirror: str = ""
-
-
-COARSE = {
-    "PivotedBarFree-v0": Coarse(("theta", "theta_dot"), (4, 4), mirror="theta"),
-    "InclineBrake-v0": Coarse(("x", "x_dot"), (4, 4)),
-    "CylinderInCylinderDamping-v0": Coarse(("theta", "theta_dot"), (4, 4), mirror="theta"),
-    "CylinderInCylinderPump-v0": Coarse(("theta", "theta_dot", "psi_dot"), (2, 2, 2), mirror="theta"),
-    "InclineTilt-v0": Coarse(
-        ("x - target", "w", "phi"), (2, 1, 1), targets=(0.0, 0.1, 0.2, 0.3), mirror="target"
-    ),
-    "CylinderInCylinderTilt-v0": Coarse(
-        ("theta - target", "theta_dot", "psi_dot"), (1, 1, 1), targets=(0.0, 0.15, 0.3), mirror="target"
-    ),
-}
-
-
-def tabulate(solution: Solution, coarse: Coarse) -> tuple[dict[str, Any], dict[str, Array]]:
+def tabulate(solution: Solution) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return a solution as the table ``[policy]`` of a submission and its arrays.
 
-    The values are those after a step and before the random kick that may follow, whose mean is taken.
+    The values are those after the first step and before the random kick that may follow, whose mean is taken;
+    each axis has the nodes of its own `level`.
 
     Parameters
     ----------
     solution : Solution
         The value functions.
-    coarse : Coarse
-        Where to take them.
     """
-    problem = solution.problem
-    nodes = []
-    for axis, level, name in zip(problem.axes, coarse.levels, coarse.axes, strict=True):
-        if name.endswith(" - target"):  # so far the target's mirror image may be away
-            axis = replace(axis, low=axis.low - max(coarse.targets), centre=0.0)
-        found = axis.nodes(level, None)
+    problem, states = solution.problem, solution.task.scene.state_names
+    axes, names = [], []
+    for axis, name in zip(problem.axes, states, strict=True):
+        if axis.centre == "target":  # so far the target's mirror image may be away
+            axis = replace(axis, low=axis.low - max(problem.targets), centre=0.0)
+            name += " - target"
+        found = nodes(axis, axis.level, None)
         if axis.periodic:  # an angle that is observed by cosine and sine lies within half a turn
             found = found - 0.5 * (found[0] + found[-1])
-        nodes.append(found[found >= -1e-12] if name == coarse.mirror else found)
-    axes, names = [*nodes], [*coarse.axes]
-    if coarse.targets:
-        axes.append(np.array(coarse.targets))
+        axes.append(found[found >= -1e-12] if name == problem.mirror else found)
+        names.append(name)
+    if problem.targets:
+        axes.append(np.array(problem.targets))
         names.append("target")
-    times = np.unique(np.rint(np.array(coarse.times) * solution.steps).astype(np.int64))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-    targets = points[:, -1] if coarse.targets else None
-    states = points[:, : len(nodes)].copy()
-    for j, name in enumerate(coarse.axes):
+    targets = points[:, -1] if problem.targets else None
+    at = points[:, : len(states)].copy()
+    for j, name in enumerate(names):
         if name.endswith(" - target"):
-            states[:, j] += points[:, -1]
+            at[:, j] += points[:, -1]
     # At the start of an episode there is no value after a step.
-    values = np.stack([solution.expected(max(int(t), 1), states, targets) for t in times], axis=-1)
-    shape = tuple(len(axis) for axis in axes)
-    if len(times) > 1:
-        axes.append(times * solution.task.dt)
-        names.append("time")
-        shape += (len(times),)
+    values = solution.expected(1, at, targets).reshape([len(axis) for axis in axes])
     policy: dict[str, Any] = {"architecture": "table", "kind": "value", "axes": names}
-    policy |= {"actions": problem.actions} | ({"mirror": coarse.mirror} if coarse.mirror else {})
+    policy |= {"actions": problem.actions} | ({"mirror": problem.mirror} if problem.mirror else {})
     arrays = {f"axis_{j}": axis for j, axis in enumerate(axes)}
-    return policy, arrays | {"table": values.reshape(shape).astype(np.float32)}
+    return policy, arrays | {"table": values.astype(np.float32)}
 
 
 def optimal(
@@ -133,7 +88,7 @@ def optimal(
     Parameters
     ----------
     env_id : str
-        One of `COARSE`.
+        One for which value iteration gives a policy.
     folder : Path
         Where to; must not exist.
     cache : Path, optional
@@ -141,9 +96,8 @@ def optimal(
     solution : Solution, optional
         One at hand, instead.
     """
-    problem = PROBLEMS[env_id]
-    solution = solution or Solution(problem, problem.levels[-1], cache)
-    policy, arrays = tabulate(solution, COARSE[env_id])
+    solution = solution or Solution(env_id, solvable()[env_id].levels[-1], cache)
+    policy, arrays = tabulate(solution)
     sizes = " x ".join(map(str, solution.programs[0].grid.shape))
     return write(
         folder, env=env_id, name="optimal", authors=AUTHORS, license=LICENSE, policy=policy,
@@ -177,9 +131,9 @@ def controller(env_id: str, name: str, folder: Path) -> Submission:
 
 def entrants(env_id: str, runs: Path, cache: Path) -> Iterator[tuple[str, Callable[[Path], Submission]]]:
     """Yield for all agents of an environment the name, and what writes its submission to a folder."""
-    for name in CONTROLLERS[env_id]:
+    for name in controllers(TASKS[env_id]):
         yield name, partial(controller, env_id, name)
-    if env_id in COARSE and (cache / env_id).is_dir():
+    if env_id in played() and (cache / env_id).is_dir():
         yield "optimal", partial(optimal, env_id, cache=cache)
     for folder in sorted(f for f in (runs / env_id).glob("*") if f.is_dir()):
         finished = len(list(folder.glob(f"seed*/{MODEL}")))
@@ -217,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     failed = 0
     try:
-        envs = [check_env(name) for name in args.envs] if args.envs else list(TASKS)
+        envs = [check_env(name) for name in args.envs] if args.envs else boards()
         for env_id in dict.fromkeys(envs):
             for name, make in entrants(env_id, args.runs, args.optimum):
                 folder = args.out / f"{env_id}-{slug(name)}"

@@ -24,9 +24,10 @@ from pathlib import Path
 from typing import Any
 
 from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
-from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_env, check_name, write
+from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_name, own_env, write
 from lag_envs import TASKS
 from lag_envs.leaderboard.spread import SpreadError, check_address
+from lag_envs.own_files import is_file
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -43,7 +44,8 @@ Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
 examples:
   python -m agents.train PivotedBar-v0                          one seed of PPO, in less than a minute
   python -m agents.train PivotedBar-v0 --seeds 10               ten seeds, as many at once as there are cores
-  python -m agents.train InclineTilt-v0 --algo sac td3 --seeds 5
+  python -m agents.train PivotedBar-v0 --algo sac td3 --seeds 5
+  python -m agents.train examples/ball_on_beam.py               a task of your own; this runs the file
   python -m agents.train all --seeds 5                          what docs/agents.md is made from
   python -m agents.train PivotedBar-v0 --seeds 100 --ray auto   the same, spread over a Ray cluster
 """
@@ -57,7 +59,10 @@ def parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("env", nargs="+", metavar="ENV", help="ids of environments, or all")
+    p.add_argument(
+        "env", nargs="+", metavar="ENV",
+        help="ids, module:ID, or FILE or FILE:Class of your own, whose code is run; all: the package's",
+    )  # fmt: skip
     p.add_argument(
         "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default ppo)"
     )
@@ -65,7 +70,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--first-seed", type=int, default=0, metavar="K", help="the first one (default %(default)s)"
     )
-    p.add_argument("--steps", type=int, help="environment steps per seed, in place of the file's n_timesteps")
+    p.add_argument("--steps", type=int, help="environment steps per seed, in place of n_timesteps")
     p.add_argument(
         "--jobs", type=int, metavar="N", help="seeds trained at once (default: the number of cores)"
     )
@@ -108,7 +113,10 @@ def plan(args: argparse.Namespace) -> list[Run]:
     """Return the runs that are asked for, or raise a UserError."""
     if "all" in args.env and len(args.env) > 1:
         raise UserError(f"all stands alone, got {' '.join(args.env)}")
-    envs = list(TASKS) if args.env == ["all"] else [check_env(name) for name in dict.fromkeys(args.env)]
+    given = list(TASKS) if args.env == ["all"] else list(dict.fromkeys(args.env))
+    sources = {own_env(name): "" if name in TASKS else name for name in given}
+    if args.ray and any(map(is_file, given)):
+        raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
     algos = [check_name("algorithm", name, ALGORITHMS) for name in dict.fromkeys(args.algo)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
         value = getattr(args, name)
@@ -118,7 +126,7 @@ def plan(args: argparse.Namespace) -> list[Run]:
     if args.output.exists() and not args.output.is_dir():
         raise UserError(f"--output must be a folder, {args.output} is not")
     runs = []
-    for env, algo in product(envs, algos):
+    for (env, source), algo in product(sources.items(), algos):
         hyper = hyperparameters(algo, env, args.config)
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))
@@ -127,7 +135,8 @@ def plan(args: argparse.Namespace) -> list[Run]:
         if steps < 1:
             raise UserError(f"n_timesteps must be a number of steps, got {hyper.get('n_timesteps')!r}")
         for seed in range(args.first_seed, args.first_seed + args.seeds):
-            runs.append(Run(args.output / env / algo / f"seed{seed}", env, algo, seed, steps, hyper))
+            folder = args.output / env / algo / f"seed{seed}"
+            runs.append(Run(folder, env, algo, seed, steps, hyper, source))
     if args.ray:  # before anything is removed
         try:
             check_address(args.ray)
@@ -177,6 +186,8 @@ def work(run: Run, tell: Callable[[tuple], None], stop: Callable[[], bool], ship
         tell(("tested", run.name, run.curve))
 
     try:
+        if run.source:  # in this process it may not be registered yet
+            own_env(run.source)
         finished = train(run, show=show, tested=tested, stop=stop)
         if finished:
             send(MODEL, NORMALISATION, RESULT)

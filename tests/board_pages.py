@@ -12,7 +12,8 @@ import gymnasium as gym
 import numpy as np
 
 import lag_envs  # noqa: F401
-from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.scores import known_returns
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
 AGENTS = (
     ("Value iteration, 81 nodes", "optimal", 1.0), ("iLQR", "controller", 0.996), ("PPO", "learned", 0.981),
@@ -45,13 +46,13 @@ def replay(env_id, seed):
         found["rewards"].append(round(float(reward), 5))
     env.close()
     total = sum(found["rewards"])
-    known = KNOWN_RETURNS[env_id]
+    known = known_returns(env_id)
     return found | {"return": total, "score": (total - known.random) / (known.best - known.random)}
 
 
 def row(env_id, i, name, kind, score):
     rng = np.random.default_rng(i)
-    known, spread = KNOWN_RETURNS[env_id], 0.002 + 0.05 * (1.0 - score)
+    known, spread = known_returns(env_id), 0.002 + 0.05 * (1.0 - score)
     learned = kind == "learned"
     steps = np.linspace(0, 400_000, 41)
     rise = 60_000 * (1.3 - score)
@@ -91,13 +92,13 @@ def value():
     return {"axes": axes, "values": (-np.abs(energy)).round(2).tolist()}
 
 
-def data(env_ids=("PivotedBar-v0", "InclineBrake-v0", "CylinderInCylinderTilt-v0"), agents=AGENTS):
+def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id), agents=AGENTS):
     """Return what `board_data` returns, for environments of all three scenes."""
     boards = [
         {
             "id": env_id,
-            "known": KNOWN_RETURNS[env_id]._asdict(),
-            "value": value() if env_id.startswith("PivotedBar") and "Balance" not in env_id else None,
+            "known": known_returns(env_id)._asdict(),
+            "value": value() if issubclass(TASKS[env_id], pivoted_bar.SwingUp) else None,
             "rows": [row(env_id, i, *agent) for i, agent in enumerate(agents)],
             "other": [
                 {
@@ -117,4 +118,4 @@ def data(env_ids=("PivotedBar-v0", "InclineBrake-v0", "CylinderInCylinderTilt-v0
 if __name__ == "__main__":
     from lag_envs.leaderboard.site.build import build
 
-    build(data(tuple(KNOWN_RETURNS)), Path(sys.argv[1]))
+    build(data(tuple(TASKS)), Path(sys.argv[1]))

@@ -1,12 +1,14 @@
 """Roll-outs that are kept, so that whatever is rewritten later can be held against them.
 
-``python tests/golden_rollouts.py`` records them anew, into ``golden/rollouts.npz``. That is right only where
-an environment is meant to change: the file is what the package did when version 0 of its environments was
-settled. Only what a user can call is used here, so a rewrite need not touch this file.
+``python tests/golden_rollouts.py`` records them anew, into ``golden/rollouts.npz`` and ``runs.json``. That is
+right only where an environment is meant to change: the file is what the package did when version 0 of its
+environments was settled. Only what a user can call is used here, so a rewrite need not touch this file.
 """
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,38 +16,10 @@ import gymnasium as gym
 import numpy as np
 
 import lag_envs
+from lag_envs.tasks import TASKS
 
-GOLDEN = Path(__file__).parent / "golden" / "rollouts.npz"
+GOLDEN, RUNS = (Path(__file__).parent / "golden" / name for name in ("rollouts.npz", "runs.json"))
 MODES = ("NextStep", "SameStep", "Disabled")
-
-#: Parameters, one per environment of a batch: mild, strong, and stiff ones side by side.
-MIXED: dict[str, dict[str, list[float]]] = {
-    "PivotedBar-v0": {"damping": [0.0, 0.5, 50.0, 0.02], "gravity": [9.81, 50.0, 9.81, 0.0]},
-    "PivotedBarFree-v0": {"com_distance": [0.3, 1e-2, 1.0, 5.0], "damping": [0.0, 0.0, 1.0, 10.0]},
-    "PivotedBarBalance-v0": {"damping": [0.0, 0.1, 50.0, 1e4], "track": [0.5, 0.6, 1.0, 0.3]},
-    "InclineTilt-v0": {"damping": [0.0, 0.03, 5.0, 1e5], "radius": [0.05, 0.1, 0.05, 0.02]},
-    "InclineBrake-v0": {"tilt": [0.0, 0.2, 1.5, 0.5], "damping": [0.0, 0.03, 0.0, 500.0]},
-    "CylinderInCylinderTilt-v0": {"radius": [0.1, 0.4, 1e-2, 0.2], "damping": [0.0, 0.24, 5.0, 1e4]},
-    "CylinderInCylinderPump-v0": {"gravity": [1.6, 9.81, 100.0, 9.81], "damping": [0.0, 0.2, 5.0, 500.0]},
-    "CylinderInCylinderDamping-v0": {"gravity": [1.6, 9.81, 100.0, 9.81], "damping": [0.0, 0.2, 5.0, 1e4]},
-}
-#: Keywords of some ids that are more than numbers.
-VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "PivotedBar-v0": {"endless track": {"track": float("inf")}, "no track": {"track": None}},
-    "InclineTilt-v0": {"quasi-static": {"control": "tilt"}, "fixed target": {"target": 0.2}},
-    "CylinderInCylinderTilt-v0": {"fixed target": {"target": -0.4}},
-}
-#: A start for each id, and a target for those that have one.
-STARTS: dict[str, dict[str, Any]] = {
-    "PivotedBar-v0": {"state": [0.1, -0.2, 2.0, 3.0]},
-    "PivotedBarFree-v0": {"state": [2.0, 30.0]},
-    "PivotedBarBalance-v0": {"state": [0.1, -0.2, 3.0, 0.5]},
-    "InclineTilt-v0": {"state": [0.1, -0.2, 0.05], "target": -0.2},
-    "InclineBrake-v0": {"state": [-1.5, 0.4]},
-    "CylinderInCylinderTilt-v0": {"state": [0.3, -0.2, 1.0], "target": -0.4},
-    "CylinderInCylinderPump-v0": {"state": [0.3, -0.2, 1.0]},
-    "CylinderInCylinderDamping-v0": {"state": [3.0, 7.0]},  # soon loses contact
-}
 
 
 class Run(NamedTuple):
@@ -80,18 +54,25 @@ class Run(NamedTuple):
 
 
 def runs() -> dict[str, Run]:
-    """Return all runs, by name: the id, a slash, and what is special."""
+    """Return the runs that are kept, by name: the id, a slash, and what is special."""
+    return {name: Run(**run) for name, run in json.loads(RUNS.read_text()).items()}
+
+
+def planned() -> dict[str, Run]:
+    """Return what to record: runs of every task by its examples."""
     out = {}
-    for env_id, start in STARTS.items():
+    for env_id, task in TASKS.items():
+        cases = task.examples
+        start = {**cases.start, **({"state": cases.moving} if cases.moving else {})}
         out[f"{env_id}/defaults"] = Run({}, 400)
         out[f"{env_id}/another dt"] = Run({"dt": 0.03, "duration": 3.0, "diagnostics": True}, 120, start)
-        for name, keywords in VARIANTS.get(env_id, {}).items():
+        for name, keywords in cases.variants.items():
             out[f"{env_id}/{name}"] = Run({"duration": 4.0, **keywords}, 90)
-        # The line that ends the brake's episode is farther off.
-        steps = 110 if env_id == "InclineBrake-v0" else 40
-        duration = steps * gym.make(env_id).unwrapped.task.dt
+        # The line that ends an episode is farther off.
+        steps = 110 if task.goal and task.goal.terminated else 40
         for mode in MODES:
-            out[f"{env_id}/{mode}"] = Run({**MIXED[env_id], "duration": duration}, 90, mode=mode)
+            mixed = {name: list(values[:4]) for name, values in cases.batch.items()}
+            out[f"{env_id}/{mode}"] = Run({**mixed, "duration": steps * task.interval}, 90, mode=mode)
     return out
 
 
@@ -188,10 +169,10 @@ def stack(seen: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def record() -> dict[str, np.ndarray]:
-    """Return all runs as arrays, by "run/array"."""
+def record(chosen: dict[str, Run]) -> dict[str, np.ndarray]:
+    """Return runs as arrays, by "run/array"."""
     out = {"version": np.array(lag_envs.__version__)}
-    for number, (name, run) in enumerate(runs().items()):
+    for number, (name, run) in enumerate(chosen.items()):
         rng = np.random.default_rng(number)
         # Held for some steps, so that they move something.
         given = rng.integers(-120, 121, (400, run.lanes)).repeat(rng.choice([1, 4]), axis=0).astype(np.int8)
@@ -203,9 +184,17 @@ def record() -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    GOLDEN.parent.mkdir(exist_ok=True)
-    recorded = record()
+    # With ids, those beside the others that are kept.
+    chosen = {
+        name: run for name, run in planned().items() if name.partition("/")[0] in (sys.argv[1:] or TASKS)
+    }
+    kept_runs = {name: run for name, run in runs().items() if sys.argv[1:] and name not in chosen}
+    with np.load(GOLDEN) as file:
+        kept = {key: file[key] for key in file if key.rpartition("/")[0] in kept_runs}
+    recorded = kept | record(chosen)
+    everything = {name: run._asdict() for name, run in (kept_runs | chosen).items()}
+    RUNS.write_text(json.dumps(everything, indent=1) + "\n")
     np.savez_compressed(GOLDEN, **recorded)  # type: ignore[arg-type]
     ends = sum(np.count_nonzero(v) for k, v in recorded.items() if k.endswith("/over"))
     calls = sum(v.size for k, v in recorded.items() if k.endswith("/over"))
-    print(f"{GOLDEN}: {len(runs())} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")
+    print(f"{GOLDEN}: {len(everything)} runs, {calls} calls, {ends} ends, {GOLDEN.stat().st_size:,} bytes")

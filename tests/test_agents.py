@@ -15,16 +15,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from agents import bench, demo, report, scale
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
-from lag_envs.scores import KNOWN_RETURNS, score
-from lag_envs.tasks import TASKS
+from lag_envs.scores import known_returns, score
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 ENV = "PivotedBar-v0"
 
 
 def test_score():
-    assert set(KNOWN_RETURNS) == set(TASKS)
-    for env_id, known in KNOWN_RETURNS.items():
+    for env_id in TASKS:
+        known = known_returns(env_id)
         assert score(env_id, known.best) == 1.0 and score(env_id, known.random) == 0.0
         assert known.random < known.best
     assert score("Elsewhere-v0", 1.0) is None
@@ -44,7 +44,7 @@ def pair(env_id, n=3, seed=7, **options):
 
 @pytest.mark.parametrize(
     ("env_id", "options"),
-    [(ENV, {"duration": 1.0}), ("PivotedBarBalance-v0", {}), ("InclineBrake-v0", {}), ("InclineTilt-v0", {})],
+    [(ENV, {"duration": 1.0}), (pivoted_bar.Balance.id, {}), (incline.Brake.id, {}), (incline.Tilt.id, {})],
 )
 def test_adapter_equals_dummy_vec_env(env_id, options):
     ours, theirs = pair(env_id, **options)
@@ -151,7 +151,7 @@ def demonstrate(monkeypatch, capsys, tmp_path):
 
 def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     folder = tmp_path / "run"
-    status, output = demonstrate("--steps", "5000", "--env", "InclineBrake-v0")
+    status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id)
     assert status == 0, output
     assert "switching line" in output and "best known" in output
     comparison = json.loads((folder / "comparison.json").read_text())
@@ -163,10 +163,10 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     # The same command evaluates it again; other settings need --new.
     (folder / "episode.mp4").unlink()
     before = (folder / "model.zip").stat().st_mtime_ns
-    status, output = demonstrate("--steps", "5000", "--env", "InclineBrake-v0", "--no-video")
+    status, output = demonstrate("--steps", "5000", "--env", incline.Brake.id, "--no-video")
     assert status == 0 and "switching line" in output and not (folder / "episode.mp4").exists()
     assert (folder / "model.zip").stat().st_mtime_ns == before
-    status, output = demonstrate("--env", "InclineBrake-v0", "--seed", "5", "--steps", "5000")
+    status, output = demonstrate("--env", incline.Brake.id, "--seed", "5", "--steps", "5000")
     assert status == 2 and "is of a run with seed 0, not 5; --new starts anew" in output
 
 
@@ -221,23 +221,25 @@ def test_bench_writes_what_the_page_shows(tmp_path, monkeypatch, capsys):
 def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(scale, "BATCH", 500)
     file = tmp_path / "scale.json"
-    assert scale.main(["InclineBrake-v0", "--batches", "2", "--output", str(file)]) == 0
-    found = json.loads(file.read_text())["envs"]["InclineBrake-v0"]
-    assert list(found) == ["random", "switching line", "reference", "optimum"]
+    assert scale.main([incline.Brake.id, "--batches", "2", "--output", str(file)]) == 0
+    found = json.loads(file.read_text())["envs"][incline.Brake.id]
+    assert found["scale"] == {k: v for k, v in known_returns(incline.Brake.id)._asdict().items()}
+    found = found["measured"]
+    assert list(found) == ["random", "zero", "switching line", "reference", "optimum"]
     assert {row["episodes"] for row in found.values()} == {1000}
     # The same starts: so little is lost by acting at intervals.
     assert 0.0 < found["optimum"]["mean"] - found["switching line"]["mean"] < 4e-4
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines] == ["InclineBrake-v0"] * 4
-    for line in lines:
+    assert [line.split("  ")[0] for line in lines] == [incline.Brake.id] * 5
+    for line in [line for line in lines if " zero " not in line]:
         mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
         assert abs(mean - used) < 5.0 * error
-    assert scale.main(["CylinderInCylinderPump-v0", "--quick"]) == 0
+    assert scale.main([cylinder_in_cylinder.Pump.id, "--quick"]) == 0
     assert "optimal" not in capsys.readouterr().out
-    monkeypatch.setitem(scale.SLOW, "iLQR", 20)
-    assert scale.main(["CylinderInCylinderTilt-v0", "--batches", "1", "--output", str(file)]) == 0
-    assert list(json.loads(file.read_text())["envs"]) == ["InclineBrake-v0", "CylinderInCylinderTilt-v0"]
+    monkeypatch.setattr(scale, "PLANNED", 20)
+    assert scale.main([cylinder_in_cylinder.Tilt.id, "--batches", "1", "--output", str(file)]) == 0
+    assert list(json.loads(file.read_text())["envs"]) == [incline.Brake.id, cylinder_in_cylinder.Tilt.id]
     (line,) = (line for line in capsys.readouterr().out.splitlines() if " iLQR " in line)
     mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
     assert abs(mean - used) < 5.0 * error < 1.0
-    assert scale.main(["InclineBrak-v0"]) == 2 and scale.main(["--batches", "0"]) == 2
+    assert scale.main(["PivotedBra-v0"]) == 2 and scale.main(["--batches", "0"]) == 2

@@ -23,6 +23,7 @@ from lag_envs.leaderboard.alike import Likeness, check_twins
 from lag_envs.leaderboard.board import Board, Neighbours, others
 from lag_envs.leaderboard.ranking import policy_error
 from lag_envs.leaderboard.submission import Refused, load, write
+from lag_envs.tasks import cylinder_in_cylinder, incline
 
 ROOT = Path(__file__).parents[1]
 BOARD = Board(ROOT / "leaderboard")
@@ -138,7 +139,9 @@ def error_of(id):
     return policy_error(reference, BOARD.result(entry)["policies"])
 
 
-QUICK = ("InclineBrake-v0-ppo", "CylinderInCylinderTilt-v0-ppo", "CylinderInCylinderPump-v0-td3")
+QUICK = (
+    f"{incline.Brake.id}-ppo", f"{cylinder_in_cylinder.Tilt.id}-ppo", f"{cylinder_in_cylinder.Pump.id}-td3",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -175,10 +178,10 @@ def test_ours_are_all_different(env, nonce):
 
 def test_trainings_are_different_though_all_else_is_the_same():
     """The closest policies of our own are two of these."""
-    submission = load(BOARD.submission(next(i for i in ours() if i.startswith("InclineBrake-v0-ppo"))))
+    submission = load(BOARD.submission(next(i for i in ours() if i.startswith(QUICK[0]))))
     check_twins(submission, "a nonce")
     tracks = Likeness(submission.env, "a nonce").tracks(submission)
-    error = error_of(next(i for i in ours() if i.startswith("InclineBrake-v0-ppo")))
+    error = error_of(next(i for i in ours() if i.startswith(QUICK[0])))
     found = [alike.distance(a, b, error) for i, a in enumerate(tracks) for b in tracks[:i]]
     assert min(distance.closeness for distance in found) > 1.2
 
@@ -274,12 +277,12 @@ def test_on_a_board(tmp_path):
     policy = {"architecture": "linear"}
     gains = {"A": 1.0, "B": 1.0 + 1e-6, "C": 0.5}
     for name, factor in gains.items():
-        about = ABOUT | {"env": "InclineBrake-v0", "name": name, "authors": [name]}
+        about = ABOUT | {"env": incline.Brake.id, "name": name, "authors": [name]}
         arrays = {"gain": factor * np.array([-1.0, 2.0]), "offset": np.full(1, -0.4)}
         board.add(write(tmp_path / name, **about, policy=policy, arrays={0: arrays}))
     board.publish("n")
     assert finish(board) == 0
-    found = next(e for e in board_data(board)["environments"] if e["id"] == "InclineBrake-v0")
+    found = next(e for e in board_data(board)["environments"] if e["id"] == incline.Brake.id)
     rows = {row["name"]: row for row in found["rows"]}
     assert rows["B"]["rank"] is None and rows["B"]["alike"]["name"] == "A"
     assert {rows["A"]["rank"], rows["C"]["rank"]} == {1, 2}

@@ -17,6 +17,7 @@ from lag_envs import cli
 from lag_envs.leaderboard import audit, log
 from lag_envs.leaderboard.board import Board, board_data, finish
 from lag_envs.leaderboard.log import BoardError
+from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]
 needs_git = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
@@ -245,7 +246,7 @@ LOG = {
     "the scale": lambda told: at(told, "protocol")["scales"][ENV].update(best=100.0),
     "the scale becomes a point": lambda told: at(told, "protocol")["scales"][ENV].update(best=-0.72),
     "the scale becomes huge": lambda told: at(told, "protocol")["scales"][ENV].update(best=1e300),
-    "a reference": lambda told: at(told, "protocol")["references"]["InclineTilt-v0"].update(mean=1.0),
+    "a reference": lambda told: at(told, "protocol")["references"][incline.Tilt.id].update(mean=1.0),
     "the rules": lambda told: at(told, "protocol")["rules"].update(episodes=3),
     "a likeness": lambda told: at(told, "verified").update(alike=[]),
     "a withdrawal is deleted": lambda told: told.pop(),

@@ -15,6 +15,7 @@ import fake_submissions
 import pytest
 from fake_submissions import ENV, write
 
+from lag_envs import scores
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, submission
 from lag_envs.leaderboard.board import Board, BoardError, board_data, closed, finish, id_of
@@ -23,7 +24,8 @@ from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.leaderboard.spread import map_submissions, packed
 from lag_envs.leaderboard.submission import Refused
 from lag_envs.leaderboard.verify import verify_folder
-from lag_envs.scores import KNOWN_RETURNS, score
+from lag_envs.scores import known_returns, score
+from lag_envs.tasks import incline, pivoted_bar
 
 
 @pytest.fixture(autouse=True)
@@ -130,7 +132,7 @@ def test_rejected_with_a_reason_and_may_be_added_again(board):
 def test_the_same_authors_name_replaces_what_they_had(board):
     old = add(board, nonce="1", authors=["A", "B"])
     others = add(board, nonce="2", authors=["C"])
-    elsewhere = add(board, nonce="3", authors=["A", "B"], env="InclineTilt-v0")
+    elsewhere = add(board, nonce="3", authors=["A", "B"], env=incline.Tilt.id)
     new = add(board, nonce="4", authors=["B", "A"], score=0.1)  # even if it is worse
     assert states(board) == {
         old: "superseded", others: "verified", elsewhere: "verified", new: "verified",
@@ -276,7 +278,7 @@ def test_better_luck_is_not_had_by_submitting_the_same_again(board):
 
 def test_likeness_counts_within_a_board(board):
     add(board, nonce="1", acts="x")
-    add(board, nonce="2", acts="x", env="PivotedBarFree-v0")
+    add(board, nonce="2", acts="x", env=pivoted_bar.SwingUpFree.id)
     assert all(
         [row["rank"] for row in found["rows"]] == [1] for found in board_data(board)["environments"][:2]
     )
@@ -327,9 +329,10 @@ def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):
 def test_a_later_record_does_not_move_the_scale_of_a_board(board, monkeypatch):
     add(board, nonce="1", score=1.0)
     before = board_data(board, "today")
-    known = KNOWN_RETURNS[ENV]
+    known = known_returns(ENV)
     record = known._replace(best=known.random + 2.0 * (known.best - known.random), policy="a record")
-    monkeypatch.setitem(KNOWN_RETURNS, ENV, record)
+    for place in (scores, fake_submissions):
+        monkeypatch.setattr(place, "known_returns", lambda id: record if id == ENV else known_returns(id))
     assert board_data(board, "today") == before
     board.open()
     board.publish("2")
@@ -377,7 +380,7 @@ def test_a_new_version_of_an_environment_freezes_the_board_of_the_old(board, mon
     tasks = {"PivotedBar-v10": module.TASKS[ENV]}
     monkeypatch.setattr(module, "TASKS", module.TASKS | tasks)
     assert closed(ENV, 1, 1) == "PivotedBar-v10 has taken its place"
-    assert closed("PivotedBar-v10", 1, 1) == closed("PivotedBarFree-v0", 1, 1) == ""
+    assert closed("PivotedBar-v10", 1, 1) == closed(pivoted_bar.SwingUpFree.id, 1, 1) == ""
     with pytest.raises(BoardError, match=f"board of {ENV} is frozen: PivotedBar-v10 has taken its place"):
         add(board, "SAC")
     board.publish("2")
@@ -388,7 +391,7 @@ def test_a_new_version_of_an_environment_freezes_the_board_of_the_old(board, mon
 
 def test_the_board_of_an_environment_that_is_gone_is_still_shown(board, monkeypatch):
     id = add(board, nonce="1")
-    other = add(board, env="PivotedBarFree-v0", nonce="2")
+    other = add(board, env=pivoted_bar.SwingUpFree.id, nonce="2")
     before = board_data(board, "today")["environments"][0]
     tasks = {name: task for name, task in module.TASKS.items() if name != ENV}
     for place in (module, ranking):
@@ -640,7 +643,7 @@ def test_verifying_on_ray_is_verifying_here(tmp_path, monkeypatch):
     kinds = {"kind": "controller", "license": "MIT", "authors": ["A"]}
     for name in ("full damping", "switching line"):
         policy = {"architecture": "controller", "name": name}
-        submission.write(tmp_path / name, env="InclineBrake-v0", name=name, policy=policy, **kinds)
+        submission.write(tmp_path / name, env=incline.Brake.id, name=name, policy=policy, **kinds)
     (tmp_path / "refused").mkdir()
     (tmp_path / "refused" / "link").symlink_to(tmp_path)
     folders = [path for path in tmp_path.iterdir() if path.is_dir()]
@@ -677,7 +680,7 @@ def test_board_data(board):
     assert [e["id"] for e in data["environments"]] == list(module.TASKS)
     found = data["environments"][0]
     assert (
-        found["known"]["best"] == KNOWN_RETURNS[ENV].best
+        found["known"]["best"] == known_returns(ENV).best
         and found["title"]
         and found["scene"] == "PivotedBar"
     )
@@ -776,7 +779,7 @@ def test_coarse_value_functions():
     assert len(value["values"]) == theta["n"] and {len(row) for row in value["values"]} == {theta_dot["n"]}
     best = max(range(theta["n"]), key=lambda i: value["values"][i][theta_dot["n"] // 2])
     assert best == theta["n"] // 2  # upright
-    assert coarse("InclineBrake-v0", None)["axes"][1]["label"] == "x_dot"
+    assert coarse(incline.Brake.id, None)["axes"][1]["label"] == "x_dot"
 
 
 def test_an_empty_board(board):

@@ -242,8 +242,8 @@ def environment():
 
 STEP = """
 import hashlib, sys, gymnasium as gym, numpy as np, lag_envs
-env = gym.make("InclineBrake-v0").unwrapped
-envs = gym.make_vec("InclineBrake-v0", num_envs=3)
+env = gym.make("PivotedBar-v0").unwrapped
+envs = gym.make_vec("PivotedBar-v0", num_envs=3)
 digest = hashlib.sha256(env.reset(seed=1)[0])
 envs.reset(seed=1)
 for i in range(50):

@@ -15,16 +15,17 @@ from rollouts import IDS, make
 
 from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
-from lag_envs.leaderboard.protocol import REFERENCES
+from lag_envs.leaderboard.protocol import reference
 from lag_envs.report.docs import generated
 from lag_envs.report.environment_results import LARGEST_STEP
 from lag_envs.report.episodes import play, random_actions
 from lag_envs.report.reference import flow
 from lag_envs.report.report import SECTIONS
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
-from lag_envs.scores import KNOWN_RETURNS
+from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS, pivoted_bar
+from lag_envs.tasks.measured import measured
 
 ROOT = Path(__file__).parents[1]
 HEADINGS = [
@@ -130,10 +131,10 @@ def test_episode_length(env_id):
     assert f"after {task.steps} steps ({task.duration:g} s)" in plain(page(make(env_id))["Episode End"])
 
 
-@pytest.mark.parametrize("place", dict.fromkeys(place for place, _ in TASKS.values()))
-def test_argument_table(place):
+@pytest.mark.parametrize("kind", {t.__doc__: t for t in reversed([*TASKS.values()])}.values())
+def test_argument_table(kind):
     """Every parameter that the task leaves free is there, with its default and its range."""
-    task = load_task(place)()
+    task = kind()
     rows = {row["Keyword"]: row for row in table(sections(type(task).__doc__)["Arguments"])}
     fields = {field.name: field for field in dataclasses.fields(task.scene)}
     own = {"dt": task.dt, "duration": task.duration}
@@ -171,7 +172,8 @@ def test_certified_speed(env_id):
     assert f"order {order}." in text
     assert stated[1] == f"{math.floor(10.0 * certified) / 10.0:.1f}"
     top = task.limit_control
-    controls = (0.0, 0.5 * top, top) if "Damping" in env_id else (-top, 0.0, top)
+    (lowest,), _ = task.control_range
+    controls = (lowest, 0.5 * (lowest + top), top)
     fastest = getattr(task, "fastest_shell", 0.0)
 
     def bounds(speed):
@@ -212,45 +214,17 @@ def test_measured_error(env_id):
         assert max(errors) < LARGEST_STEP
 
 
-def balance(o):
-    return 1.83 * o[:, 0] + 1.43 * o[:, 1] - 12.4 * o[:, 2] - 1.84 * o[:, 3]
+def feedback(task):
+    """Return the law that the page states, as a policy; None where there is none."""
+    law = compile(task.examples.feedback or "None", "feedback", "eval")
 
+    def policy(observations):
+        seen = dict(zip(task.observation, observations.T, strict=True))
+        return eval(
+            law, {"clip": np.clip, "abs": np.abs, "where": np.where, "sin": np.sin, "cos": np.cos}, seen
+        )
 
-def cascade(o):
-    x, w, phi, target = o.T
-    return 43.4 * (np.clip(-1.45 * (x - target) - 1.28 * w, -0.1, 0.1) - phi)
-
-
-def switching_line(o):
-    distance, v = o.T
-    return 14.6 * (v - 0.149 - 2.33 * distance)
-
-
-def hold(o):
-    theta, theta_dot, psi_dot, target = o.T
-    return 30.3 * (target - theta) - 3.77 * theta_dot + 0.355 * (16.35 * np.sin(target) - psi_dot)
-
-
-def energy_pump(o):
-    theta, theta_dot, psi_dot = o.T
-    energy = 0.5 * theta_dot**2 + 16.35 * (1.0 - np.cos(theta))
-    return 1.78 * (6.187 - energy) * theta_dot - 0.932 * psi_dot + 0.315 * theta
-
-
-def calm(o):
-    theta, theta_dot = o.T
-    return np.where(theta * theta_dot >= 0.0, 1.0, 14.6 * (np.abs(theta_dot) - 6.94 * np.abs(theta)))
-
-
-#: The feedback laws that the pages state.
-LAWS = {
-    "PivotedBarBalance-v0": balance,
-    "InclineTilt-v0": cascade,
-    "InclineBrake-v0": switching_line,
-    "CylinderInCylinderTilt-v0": hold,
-    "CylinderInCylinderPump-v0": energy_pump,
-    "CylinderInCylinderDamping-v0": calm,
-}
+    return policy if task.examples.feedback else None
 
 
 def returns(env_id, policy, episodes=4096):
@@ -269,12 +243,13 @@ def returns(env_id, policy, episodes=4096):
 def test_stated_returns(env_id):
     """Random actions, zero control, and the page's feedback law return what the page says."""
     rng = np.random.default_rng(0)
-    zero = -1.0 if env_id in ("InclineBrake-v0", "CylinderInCylinderDamping-v0") else 0.0
+    task = TASKS[env_id]()
+    zero = task.rest_action
     policies = [lambda o: rng.uniform(-1.0, 1.0, len(o)), lambda o: np.full(len(o), zero)]
-    policies += [LAWS[env_id]] if env_id in LAWS else []
+    policies += [law] if (law := feedback(task)) else []
     rows = {row["Id"]: row for row in table(page(make(env_id))["Optimal Value"])}
     _, *cells, best = rows[env_id].values()
-    assert_measured(best, env_id, KNOWN_RETURNS[env_id].policy)
+    assert_measured(best, env_id, known_returns(env_id).policy)
     for cell, policy in zip(cells, policies, strict=True):
         stated, error = cell.split(" ± ")
         mean, standard_error = returns(env_id, policy)
@@ -282,28 +257,28 @@ def test_stated_returns(env_id):
         assert agrees(error, standard_error), (standard_error, cell)
 
 
-def scale():
-    """Return what `python -m agents.scale` measured, by environment and policy."""
-    return json.loads((ROOT / "agents" / "results" / "scale.json").read_text(encoding="utf-8"))["envs"]
+def scale(env_id):
+    """Return what `python -m agents.scale` measured, by policy."""
+    return measured(env_id)["measured"]
 
 
 def assert_measured(cell, env_id, policy):
     """Hold a mean ± standard error against what was measured."""
-    found, (mean, error) = scale()[env_id][policy], cell.split(" ± ")
+    found, (mean, error) = scale(env_id)[policy], cell.split(" ± ")
     assert agrees(mean, found["mean"]) and agrees(error, found["error"]), (env_id, cell, found)
 
 
 @each_id
 def test_scale_is_what_was_measured(env_id):
     """It was set once; what was measured since lies within the errors of both, or it would mislead."""
-    known, found = KNOWN_RETURNS[env_id], scale()[env_id]
+    known, found = known_returns(env_id), scale(env_id)
     best = found[known.policy]
     assert known.error == pytest.approx(best["error"], rel=0.2)
     assert abs(known.best - best["mean"]) < 3.0 * known.error
     # What counts as random was set from fewer episodes.
     assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
-    if env_id in REFERENCES:
-        mean, error, episodes = REFERENCES[env_id][1:]
+    if found_reference := reference(env_id):
+        mean, error, episodes = found_reference[1:]
         assert (mean, error) == pytest.approx(
             (found["reference"]["mean"], found["reference"]["error"]), rel=0.05
         )
@@ -343,10 +318,10 @@ def test_readme_row(env_id):
     """README's table repeats what page and measurements say."""
     env, row = make(env_id), environments()[env_id]
     best, _, optimum = row["best known"].partition("; optimum ")
-    assert_measured(best, env_id, KNOWN_RETURNS[env_id].policy)
+    assert_measured(best, env_id, known_returns(env_id).policy)
     assert_measured(row["random"], env_id, "random")
-    if optimum or "optimum" in scale()[env_id]:
-        assert agrees(optimum, scale()[env_id]["optimum"]["mean"])
+    if optimum or "optimum" in scale(env_id):
+        assert agrees(optimum, scale(env_id)["optimum"]["mean"])
     stated = re.search(r"is at most ([\d.]+) rad/s", plain(page(env)["Numerical Accuracy"]))
     assert row["certified"] == (stated[1] if stated else "exact")
     (control,) = table(page(env)["Action Space"])
@@ -415,7 +390,7 @@ def test_numbers_in_the_prose():
     pages = {
         name: plain((ROOT / name).read_text(encoding="utf-8")) for name in ("README.md", "docs/numerics.md")
     }
-    weight = make("PivotedBarFree-v0").scene._constants()["alpha"]
+    weight = make(pivoted_bar.SwingUpFree.id).scene._constants()["alpha"]
     doubling = math.log(2.0) / math.sqrt(weight)
     bar, brake = PivotedBar(), CylinderInCylinder(control="damping")
     assert brake._order(0.02) == bar._order(0.031)

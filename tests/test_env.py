@@ -14,35 +14,23 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from rollouts import ANY_BAR, IDS, RENDERS, actions, make, trace
+from rollouts import ANY_BAR, IDS, RENDERS, SINGLE, actions, make, trace
 
 from lag_envs.envs import program
 from lag_envs.envs.model import Model
 from lag_envs.envs.program import Program
 from lag_envs.envs.single import LagrangianEnv
+from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
 
 each_id = pytest.mark.parametrize("env_id", IDS)
+each_single = pytest.mark.parametrize("env_id", SINGLE)
 
-#: A safe start for each id, and some that its task must refuse.
-STARTS = {
-    "PivotedBar-v0": ([0.1, -0.2, 2.0, 3.0], [[0.6, 0, 0, 0], [0.3, 1.5, 0, 0], [-0.3, -1.5, 0, 0]]),
-    "PivotedBarFree-v0": ([2.0, 3.0], []),
-    "PivotedBarBalance-v0": (
-        [0.1, -0.2, 3.0, 0.5],
-        [[0, 0, 0, 0], [0.51, 0, math.pi, 0], [0, 0, -math.pi, 0]],
-    ),
-    "InclineTilt-v0": ([0.1, -0.2, 0.05], [[0.6, 0, 0], [0, 0, 0.11], [-0.6, 0, 0]]),
-    "InclineBrake-v0": ([-1.5, 0.4], [[0.1, 0.5], [0.0, 0.5], [-1.0, -0.1], [-2e3, 0]]),
-    "CylinderInCylinderTilt-v0": ([0.3, -0.2, 1.0], [[1.1, 0, 0], [0, 0, 6.1], [-1.1, 0, 0]]),
-    "CylinderInCylinderPump-v0": ([0.3, -0.2, 1.0], [[1.4, 0, 0], [0, 0, -3.1]]),
-    "CylinderInCylinderDamping-v0": ([0.3, -0.2], [[3.0, 0.0], [2e3, 20.0]]),
-}
-TARGETS = {"InclineTilt-v0": (0.2, 0.6), "CylinderInCylinderTilt-v0": (-0.4, 1.2)}
-#: Parameters that the scene or the task must refuse.
+#: Parameters that a scene, or a task, must refuse.
 IMPOSSIBLE = {
-    "PivotedBar": [
+    PivotedBar: [
         {"mass": 0.0},
         {"mass": -1.0},
         {"com_distance": math.nan},
@@ -54,21 +42,21 @@ IMPOSSIBLE = {
         {"mass": True},
         {"mass": "0.2"},
     ],
-    "PivotedBarBalance": [{"track": None}, {"track": math.inf}],
-    "Incline": [{"radius": 0.0}, {"mass": math.nan}, {"gravity": -1.0}, {"damping": math.inf}],
-    "InclineTilt": [
+    pivoted_bar.Balance: [{"track": None}, {"track": math.inf}],
+    Incline: [{"radius": 0.0}, {"mass": math.nan}, {"gravity": -1.0}, {"damping": math.inf}],
+    incline.Tilt: [
         {"control": "damping"},
         {"control": "magic"},
         {"tilt": 0.1},
         {"target": 0.51},
         {"target": math.nan},
     ],
-    "InclineBrake": [{"control": "tilt_rate"}, {"tilt": -0.1}, {"tilt": 1.6}, {"target": 0.1}],
-    "CylinderInCylinder": [{"radius": 0.5}, {"radius": 0.6}, {"shell_radius": 0.0}, {"mass": -1.0}],
-    "CylinderInCylinderTilt": [{"control": "damping"}, {"target": 1.06}, {"target": "up"}],
-    "CylinderInCylinderPump": [{"gravity": 0.0}],
-    "CylinderInCylinderDamping": [{"gravity": 0.0}, {"control": "tilt"}],
-    "": [
+    Brake: [{"control": "tilt_rate"}, {"tilt": -0.1}, {"tilt": 1.6}, {"target": 0.1}],
+    CylinderInCylinder: [{"radius": 0.5}, {"radius": 0.6}, {"shell_radius": 0.0}, {"mass": -1.0}],
+    cylinder_in_cylinder.Tilt: [{"control": "damping"}, {"target": 1.06}, {"target": "up"}],
+    cylinder_in_cylinder.Pump: [{"gravity": 0.0}],
+    cylinder_in_cylinder.Damping: [{"gravity": 0.0}, {"control": "tilt"}],
+    Task: [
         {"dt": 0.0},
         {"dt": 2.0},
         {"dt": -0.02},
@@ -101,7 +89,7 @@ def test_stable_baselines_checker(env_id):
 def test_made_with_all_wrappers(env_id):
     env = gym.make(env_id)  # PassiveEnvChecker warns of what it dislikes
     env.reset(seed=1)
-    trace(env, actions(300, 1))
+    trace(env, actions(300, *env.action_space.shape))
     env.close()
 
 
@@ -124,7 +112,8 @@ def test_spec_survives_json(env_id):
     assert twin.observation_space == env.observation_space
     for e in (env, twin):
         e.reset(seed=3)
-    assert trace(env, actions(60, 1)) == trace(twin, actions(60, 1))
+    given = actions(60, *env.action_space.shape)
+    assert trace(env, given) == trace(twin, given)
 
 
 @each_id
@@ -138,7 +127,9 @@ def test_spec_survives_json(env_id):
 )
 def test_spec_names_the_steps_of_an_episode(env_id, options, copied):
     first = gym.make(env_id, **options)
-    steps = round(options.get("duration", 10.0) / options.get("dt", first.unwrapped.task.interval))
+    kind = TASKS[env_id]
+    seconds = options.get("duration", kind.interval * kind.steps)
+    steps = round(seconds / options.get("dt", kind.interval))
     again = gym.make(copied(gym.make(copied(first.spec)).spec))  # twice: limits don't add up
     native = gym.make_vec(env_id, num_envs=2, **options)
     many = gym.make_vec(copied(gym.make_vec(copied(native.spec)).spec))
@@ -170,7 +161,7 @@ def test_spec_of_parameters_in_numpys_types_survives_json():
 
 
 def test_spec_of_an_endless_episode_survives_json():
-    env = gym.make("PivotedBarFree-v0", duration=math.inf)
+    env = gym.make(pivoted_bar.SwingUpFree.id, duration=math.inf)
     spec = EnvSpec.from_json(env.spec.to_json())
     assert spec == env.spec and spec.max_episode_steps is None
     assert gym.make(spec).unwrapped.task.duration == math.inf
@@ -179,10 +170,10 @@ def test_spec_of_an_endless_episode_survives_json():
 @each_id
 def test_spaces(env_id):
     env = make(env_id)
-    assert env.action_space == gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    assert env.action_space == gym.spaces.Box(-1.0, 1.0, (len(env.task.action),), np.float32)
     space = env.observation_space
     assert space.dtype == np.float32 and space.shape == (len(env.task.observation),)
-    assert np.isfinite(space.high).all() and (space.low == -space.high).all()
+    assert (space.low == -space.high).all() and (env_id not in SINGLE or np.isfinite(space.high).all())
     assert type(env).metadata["render_modes"] == ["human", "rgb_array"]
     assert env.metadata["render_fps"] == round(1.0 / env.task.dt)
 
@@ -192,8 +183,8 @@ def test_spaces(env_id):
 
 @each_id
 def test_a_seed_gives_one_episode(env_id):
-    given = actions(700, 1)
     first, second, other = make(env_id), make(env_id), make(env_id)
+    given = actions(700, *first.action_space.shape)
     starts = [env.reset(seed=seed)[0] for env, seed in ((first, 7), (second, 7), (other, 8))]
     assert starts[0].tobytes() == starts[1].tobytes()
     assert (starts[0] != starts[2]).any()
@@ -230,7 +221,8 @@ def test_bad_seed(seed):
     env, twin = running_twins("PivotedBar-v0")
     with pytest.raises((TypeError, ValueError), match=f"seed must be .*{seed}"):
         env.reset(seed=seed)
-    assert trace(env, actions(30, 1)) == trace(twin, actions(30, 1))
+    given = actions(30, *env.action_space.shape)
+    assert trace(env, given) == trace(twin, given)
 
 
 @each_id
@@ -240,10 +232,11 @@ def test_bad_seed(seed):
 def test_copies_go_on_alike(env_id, clone):
     env = gym.make(env_id)
     env.reset(seed=2)
-    trace(env, actions(37, 1))
+    trace(env, actions(37, *env.action_space.shape))
     twin = clone(env)
     assert (twin.unwrapped.state == env.unwrapped.state).all()
-    assert trace(env, actions(300, 1, seed=1)) == trace(twin, actions(300, 1, seed=1))
+    given = actions(300, *env.action_space.shape, seed=1)
+    assert trace(env, given) == trace(twin, given)
     assert twin.spec == env.spec
 
 
@@ -252,7 +245,7 @@ def test_copies_are_independent():
     env.reset(seed=2)
     before = env.state
     twin = copy.deepcopy(env)
-    trace(twin, actions(5, 1))
+    trace(twin, actions(5, *env.action_space.shape))
     assert (env.state == before).all()
 
 
@@ -273,7 +266,7 @@ def test_unknown_keyword(env_id):
         (env_id, options)
         for env_id in IDS
         for part, many in IMPOSSIBLE.items()
-        if env_id.startswith(part)
+        if issubclass(TASKS[env_id], part) or issubclass(TASKS[env_id].scene, part)
         for options in many
     ],
 )
@@ -305,14 +298,16 @@ def test_parameters_reach_the_scene():
 @each_id
 def test_steps_are_those_of_simulate(env_id):
     env = make(env_id)
-    env.reset(seed=1, options={"state": STARTS[env_id][0]})
-    for action in actions(40, 1):
+    env.reset(seed=1, options={"state": TASKS[env_id].examples.start["state"]})
+    for action in actions(40, *env.action_space.shape):
         before = env.state
         _, _, terminated, truncated, _ = env.step(action)
         after = env.scene.simulate(before, [env.control], env.task.dt)[1]
         moved = env.state - after
-        if "Balance" in env_id or "InCylinderDamping" in env_id:
-            moved[-1] -= round(moved[-1] / 1.5) * 1.5 if "Damping" in env_id else moved[-1]  # a kick
+        if env_id == cylinder_in_cylinder.Damping.id:
+            moved[-1] -= round(moved[-1] / 1.5) * 1.5  # a kick
+        elif env.task.draws:
+            moved[-1] = 0.0
         np.testing.assert_allclose(moved, 0.0, atol=2e-15)
         if terminated or truncated:
             break
@@ -321,12 +316,12 @@ def test_steps_are_those_of_simulate(env_id):
 # --- what a step returns ---
 
 
-@each_id
+@each_single
 def test_types(env_id):
     env = make(env_id)
     observation, info = env.reset(seed=1)
     assert type(observation) is np.ndarray and observation.dtype == np.float32 and info == {}
-    for action in actions(5, 1):
+    for action in actions(5, *env.action_space.shape):
         observation, reward, terminated, truncated, info = env.step(action)
         assert type(observation) is np.ndarray and observation.dtype == np.float32
         assert type(reward) is float and type(terminated) is bool and type(truncated) is bool and info == {}
@@ -338,12 +333,12 @@ def test_types(env_id):
 def test_nothing_is_shared(env_id):
     env = make(env_id, diagnostics=True)
     arrays, infos = [env.reset(seed=1)[0]], []
-    for action in actions(5, 1):
+    for action in actions(5, *env.action_space.shape):
         observation, *_, info = env.step(action)
         arrays += [observation, env.state]
         infos.append(info)
     kept = [a.copy() for a in arrays]
-    env.step(actions(1, 1)[0])
+    env.step(actions(1, *env.action_space.shape)[0])
     for i, a in enumerate(arrays):
         assert (a == kept[i]).all()
         assert not any(np.shares_memory(a, b) for b in arrays[:i])
@@ -353,7 +348,7 @@ def test_nothing_is_shared(env_id):
     assert (env.state == state).all()
 
 
-@each_id
+@each_single
 @pytest.mark.parametrize(
     "options", [{}, {"dt": 0.1}, {"dt": 1.0, "duration": 1.0}], ids=["usual", "slow", "one step"]
 )
@@ -375,7 +370,7 @@ def test_observations_stay_in_the_space(env_id, options):
                 observation, _ = env.reset()
 
 
-@each_id
+@each_single
 @pytest.mark.parametrize("dt", [None, 1.0])
 def test_fastest_starts_stay_in_the_space(env_id, dt):
     env = make(env_id, dt=dt, duration=dt)
@@ -383,7 +378,7 @@ def test_fastest_starts_stay_in_the_space(env_id, dt):
     n = len(env.scene.state_names)
     tried = 0
     for _ in range(300):
-        state = np.array(STARTS[env_id][0]) * rng.choice([-1.0, 1.0, 1.8], n)
+        state = np.array(TASKS[env_id].examples.start["state"]) * rng.choice([-1.0, 1.0, 1.8], n)
         fast = [unit.endswith("/s") for unit in env.scene.state_units]
         state[fast] = np.where(
             rng.random(sum(fast)) < 0.5, state[fast], rng.choice([-100.0, 100.0], sum(fast))
@@ -445,16 +440,17 @@ def running_twins(env_id, **options):
     return twins
 
 
-@each_id
+@each_single
 def test_bad_actions_leave_the_environment_as_it_was(env_id):
     env, twin = running_twins(env_id)
     for action in BAD:
         with pytest.raises(ValueError, match=r"action|inhomogeneous"):
             env.step(action)
-    assert trace(env, actions(50, 1)) == trace(twin, actions(50, 1))
+    given = actions(50, *env.action_space.shape)
+    assert trace(env, given) == trace(twin, given)
 
 
-@each_id
+@each_single
 @pytest.mark.parametrize(
     ("given", "meant"),
     [
@@ -476,7 +472,7 @@ def test_other_actions_mean_their_value(env_id, given, meant):
     assert trace(env, [given]) == trace(twin, [np.array([meant])])
 
 
-@each_id
+@each_single
 def test_actions_are_not_rounded(env_id):
     env, twin = running_twins(env_id)
     env.step(np.array([0.3]))
@@ -484,7 +480,7 @@ def test_actions_are_not_rounded(env_id):
     assert 0.0 < abs(env.control - twin.control) < 1e-7 * env.task.limit_control
 
 
-@each_id
+@each_single
 def test_the_action_is_not_changed(env_id):
     env, _ = running_twins(env_id)
     action = np.array([3.0], dtype=np.float32)
@@ -499,64 +495,55 @@ def test_the_action_is_not_changed(env_id):
 def test_step_before_reset(env_id):
     env = make(env_id)
     with pytest.raises(ResetNeeded, match="no episode has begun"):
-        env.step(np.zeros(1))
+        env.step(np.zeros(env.action_space.shape))
     env.reset(seed=1)
-    env.step(np.zeros(1))
+    env.step(np.zeros(env.action_space.shape))
 
 
-@pytest.mark.parametrize(
-    ("env_id", "start", "action"),
-    [
-        ("PivotedBarBalance-v0", [0.0, 0.0, math.pi + 0.34, 3.0], 0.0),
-        ("InclineTilt-v0", [0.499, 1.0, 0.0], 0.0),
-        ("InclineBrake-v0", [-0.001, 1.0], -1.0),
-        ("CylinderInCylinderTilt-v0", [1.049, 1.0, 0.0], 0.0),
-        ("CylinderInCylinderPump-v0", [1.299, 2.0, 0.0], 0.0),
-        ("CylinderInCylinderDamping-v0", [2.0, 3.4], 1.0),
-    ],
-)
-def test_step_after_termination(env_id, start, action):
-    env = make(env_id)
+@pytest.mark.parametrize("env_id", [env_id for env_id, task in TASKS.items() if task.examples.ending])
+def test_step_after_termination(env_id):
+    env, (start, action) = make(env_id), TASKS[env_id].examples.ending
     env.reset(seed=1, options={"state": start})
     terminated = False
     for _ in range(20):
-        _, _, terminated, truncated, _ = env.step(np.array([action]))
+        _, _, terminated, truncated, _ = env.step(np.full(env.action_space.shape, action))
         if terminated:
             break
     assert terminated and not truncated
     state = env.state
     with pytest.raises(ResetNeeded, match="terminated"):
-        env.step(np.zeros(1))
+        env.step(np.zeros(env.action_space.shape))
     assert (env.state == state).all()
     env.reset()
-    env.step(np.zeros(1))
+    env.step(np.zeros(env.action_space.shape))
 
 
-@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarFree-v0"])
+@pytest.mark.parametrize("env_id", ["PivotedBar-v0", pivoted_bar.SwingUpFree.id])
 def test_going_on_after_truncation_is_allowed(env_id):
     env = make(env_id, duration=0.1)
     env.reset(seed=1)
-    assert [env.step(np.zeros(1))[3] for _ in range(7)] == [False] * 4 + [True] * 3
+    assert [env.step(np.zeros(env.action_space.shape))[3] for _ in range(7)] == [False] * 4 + [True] * 3
 
 
 @each_id
 def test_options_state(env_id):
     env = make(env_id)
-    start = STARTS[env_id][0]
+    start = TASKS[env_id].examples.start["state"]
     observation, _ = env.reset(seed=1, options={"state": start})
     assert env.state.tolist() == start
-    assert env.control == 0.0
-    env.step(np.ones(1))
+    assert not np.any(env.control)
+    env.step(np.ones(env.action_space.shape))
     again, _ = env.reset(options={"state": np.array(start, dtype=np.float64)})
-    n = len(observation) - (env.target is not None)
+    n = len(observation) - env.task.formulas.targets
     assert again[:n].tobytes() == observation[:n].tobytes()
     assert env.reset(options={})[0].tobytes() != observation.tobytes()
 
 
-@each_id
+@each_single
 def test_unsafe_starts_are_refused(env_id):
     env, twin = running_twins(env_id)
-    good, unsafe = STARTS[env_id]
+    cases = TASKS[env_id].examples
+    good, unsafe = cases.start["state"], [case["state"] for case in cases.refused if "state" in case]
     fast = [101.0 if unit.endswith("/s") else x for x, unit in zip(good, env.scene.state_units, strict=True)]
     for state in [
         *unsafe,
@@ -575,26 +562,30 @@ def test_unsafe_starts_are_refused(env_id):
         with pytest.raises(ValueError, match="unknown reset option"):
             env.reset(options=options)
     assert env.control == twin.control
-    assert trace(env, actions(50, 1)) == trace(twin, actions(50, 1))
+    given = actions(50, *env.action_space.shape)
+    assert trace(env, given) == trace(twin, given)
 
 
-@each_id
+@each_single
 def test_targets(env_id):
-    if env_id not in TARGETS:
+    cases = TASKS[env_id].examples
+    if "target" not in cases.start:
         env, twin = running_twins(env_id)
         assert env.target is None
         with pytest.raises(ValueError, match="no target"):
             env.reset(options={"target": 0.1})
-        assert trace(env, actions(20, 1)) == trace(twin, actions(20, 1))
+        given = actions(20, *env.action_space.shape)
+        assert trace(env, given) == trace(twin, given)
         with pytest.raises(ValueError, match="no target"):
             make(env_id, target=0.1)
         return
-    good, bad = TARGETS[env_id]
+    good, (bad,) = cases.start["target"], [case["target"] for case in cases.refused if "target" in case]
     env, twin = running_twins(env_id)
     for target in (bad, math.nan, "high", [0.1]):
         with pytest.raises(ValueError, match="target"):
             env.reset(options={"target": target})
-    assert trace(env, actions(20, 1)) == trace(twin, actions(20, 1))
+    given = actions(20, *env.action_space.shape)
+    assert trace(env, given) == trace(twin, given)
     observation, _ = env.reset(options={"target": good})
     assert env.target == good and observation[-1] == np.float32(good)
     env.reset()
@@ -615,7 +606,7 @@ def test_targets(env_id):
 def steps_until_truncated(env, action=0.0):
     env.reset(seed=1)
     for n in range(1, 100_000):
-        *_, terminated, truncated, _ = env.step(np.array([action]))
+        *_, terminated, truncated, _ = env.step(np.full(env.action_space.shape, action))
         if truncated:
             return n
         if terminated:
@@ -628,7 +619,7 @@ def steps_until_truncated(env, action=0.0):
 def test_episodes_keep_their_seconds(env_id):
     env = make(env_id)
     seconds = env.task.duration
-    assert seconds == 10.0
+    assert seconds == env.task.interval * env.task.steps
     assert gym.make(env_id).spec.max_episode_steps == env.task.limit == round(seconds / env.task.dt)
     for dt in (0.01, 0.04, 0.1):
         assert gym.make(env_id, dt=dt).spec.max_episode_steps == round(seconds / dt)
@@ -639,7 +630,7 @@ def test_episodes_keep_their_seconds(env_id):
     "options", [{}, {"dt": 0.1}, {"duration": 0.06}, {"dt": 0.03, "duration": 0.1}], ids=str
 )
 def test_truncation_comes_in_time(options):
-    for env_id in ("PivotedBar-v0", "CylinderInCylinderPump-v0"):
+    for env_id in ("PivotedBar-v0", cylinder_in_cylinder.Pump.id):
         env = make(env_id, **options)
         assert steps_until_truncated(env) == env.task.limit == round(env.task.duration / env.task.dt)
 
@@ -653,40 +644,40 @@ def test_max_episode_steps_shortens():
 
 
 def test_an_endless_episode():
-    env = gym.make("PivotedBarFree-v0", duration=math.inf)
+    env = gym.make(pivoted_bar.SwingUpFree.id, duration=math.inf)
     assert env.spec.max_episode_steps is None
     env.reset(seed=1)
-    assert not any(env.step(np.zeros(1))[3] for _ in range(2000))
+    assert not any(env.step(np.zeros(env.action_space.shape))[3] for _ in range(2000))
 
 
-@pytest.mark.parametrize("env_id", [i for i in IDS if i != "InclineBrake-v0"])
+@pytest.mark.parametrize("env_id", [i for i in IDS if i != incline.Brake.id])
 def test_running_rewards_scale_with_the_interval(env_id):
-    start = STARTS[env_id][0]
+    start = TASKS[env_id].examples.start["state"]
     rates = []
     for dt in (1e-6, 2e-6):
         env = make(env_id, dt=dt, duration=1.0)
         env.reset(seed=1, options={"state": start})
-        rates.append(env.step(np.array([0.5]))[1] / dt)
+        rates.append(env.step(np.full(env.action_space.shape, 0.5))[1] / dt)
     assert rates[0] == pytest.approx(rates[1], rel=1e-3)
 
 
 # --- diagnostics ---
 
 
-@each_id
+@each_single
 def test_diagnostics(env_id):
     env = make(env_id, diagnostics=True)
     _, info = env.reset(seed=1)
     names = {"control", "energy", *env.scene.forces(env.state)}
     assert set(info) == names and info["control"] == 0.0
-    for action in actions(5, 1):
+    for action in actions(5, *env.action_space.shape):
         *_, info = env.step(action)
         assert set(info) == names
         assert info["control"] == env.control
         assert info["energy"] == env.scene.energy(env.state, env.control)["total"]
         for name, value in env.scene.forces(env.state, env.control).items():
             assert info[name] == value
-    if not env_id.startswith("PivotedBar"):
+    if "support_vertical" not in names:
         assert {"normal", "friction", "needed_friction"} <= names
 
 
@@ -695,12 +686,12 @@ def test_diagnostics(env_id):
 
 def test_a_refused_step_changes_nothing():
     extreme = {"com_distance": 1e-9, "inertia": 1e-30, "gravity": 1e3, "mass": 1.0, "damping": 0.0}
-    env = make("PivotedBarFree-v0", dt=1.0, **extreme, **ANY_BAR)
+    env = make(pivoted_bar.SwingUpFree.id, dt=1.0, **extreme, **ANY_BAR)
     env.reset(seed=1)
     state = env.state
     for _ in range(2):
         with pytest.raises(StepRefused, match="the step was refused: from \\(theta="):
-            env.step(np.ones(1))
+            env.step(np.ones(env.action_space.shape))
         assert (env.state == state).all() and env.control == 0.0
     env.reset(seed=2)
 
@@ -708,7 +699,8 @@ def test_a_refused_step_changes_nothing():
 @each_id
 def test_making_again_derives_nothing(env_id, monkeypatch):
     """Other numbers need no other equations: 64 environments are made in some 30 ms."""
-    make(env_id)
+    scene = make(env_id).scene
+    others = {name: 1.1 * getattr(scene, name) for name in ("mass", "gravity") if hasattr(scene, name)}
 
     def refuse(*arguments):
         raise AssertionError("derived anew")
@@ -716,7 +708,7 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
     monkeypatch.setattr("lag_envs.mechanics.motion.derive_motion", refuse)
     monkeypatch.setattr("lag_envs.mechanics.recording.record", refuse)
     monkeypatch.setattr("lag_envs.tasks.base.TaskFormulas._names", refuse)
-    make(env_id, mass=1.7, gravity=3.0)
+    make(env_id, **others)
 
 
 def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
@@ -743,8 +735,8 @@ def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
     gym.make_vec("PivotedBar-v0", num_envs=2, mass=[0.3, 0.2])
     assert len(recorded) == 2 + len(others)
     for options in ({}, {"target": 0.1}, {"control": "tilt"}):
-        make("InclineTilt-v0", **options)
-        make("InclineTilt-v0", **options)
+        make(incline.Tilt.id, **options)
+        make(incline.Tilt.id, **options)
     assert len(recorded) == 5 + len(others)
 
 
@@ -754,7 +746,7 @@ def test_attributes_set_by_hand_are_not_taken_from_elsewhere(monkeypatch):
         return Model(task)([[-0.001, 2.0]], [-1.0])[1][0]
 
     def task():
-        return make("InclineBrake-v0").task
+        return make(incline.Brake.id).task
 
     usual, lenient = crossing(task()), task()
     lenient.gentle = 1.5

@@ -23,6 +23,7 @@ from lag_envs.leaderboard import alike, audit, docs, protocol
 from lag_envs.leaderboard.board import Board, board_data
 from lag_envs.leaderboard.log import STATES
 from lag_envs.leaderboard.ranking import LEVEL, RESAMPLES
+from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]
 
@@ -142,9 +143,8 @@ def test_mistakes(run):
     assert status == 2 and "nothing is pending" in err
     write("a")
     run("add", "a", "--nonce", "n")
-    assert (
-        "the board has nothing of 'InclineTilt-v0'; it has PivotedBar-v0" in run("list", "InclineTilt-v0")[2]
-    )
+    other = incline.Tilt.id
+    assert f"the board has nothing of {other!r}; it has PivotedBar-v0" in run("list", other)[2]
     assert "there is no 'x' on the board" in run("show", "x")[2]
     assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
     assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
@@ -224,7 +224,7 @@ def test_generated_parts_are_as_generated():
 def test_top_of_each_board(run):
     for number in range(4):
         write(f"{number}", f"agent {number}", score=0.2 * number)
-    write("other", "x | <b>[y](z)</b>", env="InclineTilt-v0", kind="controller")
+    write("other", "x | <b>[y](z)</b>", env=incline.Tilt.id, kind="controller")
     run("add", *range(4), "other", "--nonce", "n")
     lines = docs.top(board_data(Board("leaderboard"))).splitlines()
     cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
@@ -232,7 +232,7 @@ def test_top_of_each_board(run):
         [ENV, "1", "agent 3, learned"],
         ["", "2", "agent 2, learned"],
         ["", "3", "agent 1, learned"],
-        ["InclineTilt-v0", "1", r"x \| &lt;b&gt;\[y\]\(z\)&lt;/b&gt;, controller"],
+        [incline.Tilt.id, "1", r"x \| &lt;b&gt;\[y\]\(z\)&lt;/b&gt;, controller"],
     ]
     assert {len(row) for row in cells} == {6}
 

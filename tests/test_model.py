@@ -11,7 +11,7 @@ from rollouts import IDS, actions, make
 
 from lag_envs.envs.model import Model
 from lag_envs.scenes import StepRefused
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 
 @pytest.mark.parametrize("env_id", IDS)
@@ -38,14 +38,14 @@ def test_steps_as_the_environment_does(env_id):
 
 
 def test_far_from_ordinary_steps_are_taken_too():
-    task = make("PivotedBarFree-v0").task
+    task = make(pivoted_bar.SwingUpFree.id).task
     ends, _, _ = Model(task)([[0.3, 90.0]], [0.5])
     exact = task.scene.simulate([0.3, 90.0], [2.5], 0.02)[1]
     np.testing.assert_allclose(ends[0], exact, rtol=1e-14)
 
 
 def test_bad_input_is_named():
-    model = Model(make("InclineTilt-v0").task)
+    model = Model(make(incline.Tilt.id).task)
     state = np.zeros((2, 3))
     for arguments, message in (
         ((np.zeros((2, 2)), [0, 0], 0.1), r"states must have shape \(n, 3\)"),
@@ -59,21 +59,20 @@ def test_bad_input_is_named():
     with pytest.raises(ValueError, match="has no target"):
         Model(make("PivotedBar-v0").task)(np.zeros((1, 4)), [0.0], 0.1)
     with pytest.raises(StepRefused, match="row 1"):
-        Model(make("PivotedBarFree-v0", dt=1.0).task)([[0.0, 0.0], [0.0, 1e12]], [0.0, 0.0])
+        Model(make(pivoted_bar.SwingUpFree.id, dt=1.0).task)([[0.0, 0.0], [0.0, 1e12]], [0.0, 0.0])
 
 
 def test_a_fixed_target_is_taken():
-    model = Model(make("InclineTilt-v0", target=0.2).task)
+    model = Model(make(incline.Tilt.id, target=0.2).task)
     states = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
     _, rewards, _ = model(states, [0.0, 0.0])
     assert rewards[0] > 0.99 > 0.1 > rewards[1]
 
 
-@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarFree-v0", "InclineTilt-v0"])
+@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, pivoted_bar.SwingUpFree.id, incline.Tilt.id])
 def test_expansion_of_a_step(env_id):
     """Slopes, gradient and curvature beside differences of the step itself, away from kinks."""
-    place, fixed = TASKS[env_id]
-    task = load_task(place)(**fixed)
+    task = TASKS[env_id]()
     model, rng = Model(task), np.random.default_rng(3)
     n, width = 20, len(task.scene.state_names)
     x, a = rng.uniform(-0.05, 0.05, (n, width)), rng.uniform(-0.5, 0.5, n)
@@ -89,7 +88,7 @@ def test_expansion_of_a_step(env_id):
 
 
 def test_expansion_needs_actions_between():
-    class Choices(load_task(TASKS["PivotedBarFree-v0"][0])):
+    class Choices(pivoted_bar.SwingUpFree):
         action: ClassVar = {"s_ddot": [-1.0, 1.0]}
 
     with pytest.raises(ValueError, match="Choices has a list of actions to choose from"):

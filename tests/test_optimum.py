@@ -19,12 +19,13 @@ from scipy.optimize import brentq, minimize_scalar
 
 from agents import optimum
 from agents.evaluate import evaluate, evaluate_batch
-from agents.optimum import IMAGES, PROBLEMS, RELAXATIONS, RESULTS, Optimal, Solution, extrapolated
+from agents.optimum import IMAGES, RESULTS, Optimal, Solution, extrapolated, grid, played, solvable
 from agents.value_iteration import PROGRESS, VALUES, CacheError, Grid, ValueIteration, stretched
 from lag_envs.controllers import make_controller, optimal_return
+from lag_envs.controllers.basic import Reader
 from lag_envs.envs.model import Model
-from lag_envs.leaderboard.protocol import REFERENCES, first_seed
-from lag_envs.tasks import TASKS
+from lag_envs.leaderboard.protocol import first_seed
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
 
 ROOT = Path(__file__).parents[1]
@@ -256,18 +257,18 @@ def test_full_disk_is_an_error(small, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def brake():
-    return Optimal("InclineBrake-v0", level=2.0, folder=None)
+    return Optimal(incline.Brake.id, level=2.0, folder=None)
 
 
 def test_brake_in_a_few_seconds(brake):
-    returns = evaluate_batch("InclineBrake-v0", brake, 1_000_000_000, 500)
+    returns = evaluate_batch(incline.Brake.id, brake, 1_000_000_000, 500)
     assert returns.mean() > -1.78
 
 
 def test_agent_takes_one_observation_as_a_batch(brake):
-    with gym.make("InclineBrake-v0") as env:
+    with gym.make(incline.Brake.id) as env:
         one = evaluate(env, brake, range(5, 8))
-    np.testing.assert_allclose(one, evaluate_batch("InclineBrake-v0", brake, 5, 3), rtol=1e-12)
+    np.testing.assert_allclose(one, evaluate_batch(incline.Brake.id, brake, 5, 3), rtol=1e-12)
 
 
 def test_agent_counts_the_steps_of_each_episode(brake):
@@ -281,25 +282,26 @@ def test_agent_counts_the_steps_of_each_episode(brake):
 
 
 def test_agent_is_there_for_what_is_solved():
-    with pytest.raises(ValueError, match=r"no policy for 'PivotedBar-v0', only for PivotedBarFree-v0"):
+    able = f"no policy for 'PivotedBar-v0', only for {pivoted_bar.SwingUpFree.id}"
+    with pytest.raises(ValueError, match=able):
         Optimal("PivotedBar-v0")
 
 
-@pytest.mark.parametrize("env_id", [id for id, p in PROBLEMS.items() if p.observed])
+@pytest.mark.parametrize("env_id", played())
 def test_observations_are_read_back(env_id):
-    problem = PROBLEMS[env_id]
+    read = Reader(TASKS[env_id]())
     envs = gym.make_vec(env_id, 50)
     observations, _ = envs.reset(seed=3)
     for _ in range(5):
         observations, *_ = envs.step(envs.action_space.sample())
-    found = problem.observed(observations.astype(np.float64))
+    found = read(observations)[0]
     np.testing.assert_allclose(found, envs.unwrapped.state, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("env_id", [id for id, p in PROBLEMS.items() if p.targets])
+@pytest.mark.parametrize("env_id", [id for id, p in solvable().items() if p.targets])
 def test_targets_have_mirror_images(env_id):
-    task = PROBLEMS[env_id].task()
-    assert PROBLEMS[env_id].targets[-1] == task.target_range
+    task = TASKS[env_id]()
+    assert task.value_iteration.targets[-1] == task.target_range
     model, rng = Model(task), np.random.default_rng(0)
     states = rng.uniform(-1.2, 1.2, (500, 3)) * [0.5, 1.0, 0.1]
     actions, targets = rng.uniform(-1.0, 1.0, 500), rng.uniform(-0.3, 0.3, 500)
@@ -311,7 +313,7 @@ def test_targets_have_mirror_images(env_id):
 
 
 def test_between_targets_values_are_interpolated():
-    solution = Solution(PROBLEMS["CylinderInCylinderTilt-v0"], 0.25, folder=None, quiet=True)
+    solution = Solution(cylinder_in_cylinder.Tilt.id, 0.25, folder=None, quiet=True)
     # At equal places among the nodes the value is linear in the target; at the solved ones it is the grid's.
     axes = solution.programs[1].grid.axes
     i, j, k = 3, 2, 2
@@ -319,7 +321,7 @@ def test_between_targets_values_are_interpolated():
     at_node = np.array([[axes[0][i], axes[1][j], axes[2][k]]])
     assert solution.value(0, at_node, np.array([first]))[0] == solution.values[1][0, i, j, k]
     middle, between = at_node.copy(), 0.5 * (first + second)
-    middle[0, 0] = solution.problem.axes[0].nodes(0.25, between)[i]
+    middle[0, 0] = optimum.nodes(solution.problem.axes[0], 0.25, between)[i]
     expected = 0.5 * (solution.values[1][0, i, j, k] + solution.values[2][0, i, j, k])
     assert solution.value(0, middle, np.array([between]))[0] == pytest.approx(expected, rel=1e-6)
     assert solution.value(0, -middle, np.array([-between]))[0] == pytest.approx(expected, rel=1e-6)
@@ -329,15 +331,15 @@ def test_between_targets_values_are_interpolated():
 
 
 def test_command_writes_numbers_and_a_figure(tmp_path, capsys, monkeypatch):
-    coarse = dataclasses.replace(PROBLEMS["InclineBrake-v0"], levels=(1.0,))
-    monkeypatch.setitem(PROBLEMS, "InclineBrake-v0", coarse)
-    arguments = ["InclineBrake-v0", "--quick", "--folder", str(tmp_path)]
+    coarse = dataclasses.replace(Brake.value_iteration, levels=(1.0,))
+    monkeypatch.setattr(Brake, "value_iteration", coarse)
+    arguments = [incline.Brake.id, "--quick", "--folder", str(tmp_path)]
     assert optimum.main(arguments) == 0
-    result = json.loads((tmp_path / "InclineBrake-v0.json").read_text())
+    result = json.loads((tmp_path / f"{incline.Brake.id}.json").read_text())
     estimate = result["estimate"]
     assert result["lower"]["mean"] > -1.9
     assert abs(estimate["value"] - result["bound"]["value"]) < estimate["error"] < 0.2
-    assert (tmp_path / "value-InclineBrake-v0.png").stat().st_size > 10_000
+    assert (tmp_path / f"value-{incline.Brake.id}.png").stat().st_size > 10_000
     assert "estimate -1." in capsys.readouterr().out
     # What is damaged is named, with the remedy.
     for file in tmp_path.rglob(VALUES):
@@ -347,8 +349,8 @@ def test_command_writes_numbers_and_a_figure(tmp_path, capsys, monkeypatch):
 
 
 def test_mistakes_are_named(capsys):
-    assert optimum.main(["InclineBrak-v0"]) == 2
-    assert "InclineBrake-v0" in capsys.readouterr().err
+    assert optimum.main(["PivotedBra-v0"]) == 2
+    assert "PivotedBar-v0" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -358,7 +360,7 @@ def test_killed_command_goes_on(tmp_path, number):
         sys.executable,
         "-m",
         "agents.optimum",
-        "PivotedBarFree-v0",
+        pivoted_bar.SwingUpFree.id,
         "--quick",
         "--folder",
         str(tmp_path),
@@ -371,17 +373,18 @@ def test_killed_command_goes_on(tmp_path, number):
         assert process.wait() == (-9 if number == signal.SIGKILL else 128 + number)
         assert done
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    fresh = Solution(PROBLEMS["PivotedBarFree-v0"], 1.0, folder=None, quiet=True)
-    kept = Solution(PROBLEMS["PivotedBarFree-v0"], 1.0, folder=tmp_path, quiet=True)
+    fresh = Solution(pivoted_bar.SwingUpFree.id, 1.0, folder=None, quiet=True)
+    kept = Solution(pivoted_bar.SwingUpFree.id, 1.0, folder=tmp_path, quiet=True)
     np.testing.assert_array_equal(fresh.values[0], kept.values[0])
 
 
 @pytest.mark.slow
 def test_bar_is_up_in_two_seconds():
-    agent = Optimal("PivotedBarFree-v0", level=2.0, folder=None)
-    up = optimum.seconds_to_upright(optimum.trajectory("PivotedBarFree-v0", agent), 0.02)
-    assert 1.5 < up < 2.5
-    assert evaluate_batch("PivotedBarFree-v0", agent, 1_000_000_000, 100).mean() > 419.5
+    agent = Optimal(pivoted_bar.SwingUpFree.id, level=2.0, folder=None)
+    states = optimum.trajectory(pivoted_bar.SwingUpFree.id, agent)
+    outside = ~agent.solution.task.goal_holds(states)
+    assert 1.5 < 0.02 * (np.flatnonzero(outside)[-1] + 1) < 2.5  # up for good
+    assert evaluate_batch(pivoted_bar.SwingUpFree.id, agent, 1_000_000_000, 100).mean() > 419.5
 
 
 # --- what is committed ---
@@ -395,14 +398,14 @@ def test_every_environment_has_its_optimum():
 def test_committed_results_are_consistent(file):
     result = json.loads(file.read_text())
     assert result["env"] == file.stem and result["schema"] == optimum.SCHEMA
-    source, _ = RELAXATIONS.get(file.stem, (file.stem, None))
-    problem = PROBLEMS[source]
+    source = TASKS[file.stem].value_iteration.relaxed or file.stem
+    problem = solvable()[source]
     assert [grid["level"] for grid in result["grids"]] == list(problem.levels)
     assert [grid["nodes"] for grid in result["grids"]] == [
-        list(problem.grid(level, 0.0).shape) for level in problem.levels
+        list(grid(problem, level, 0.0).shape) for level in problem.levels
     ]
     # The caches' names hang together with nodes, step and reward as they are now: none is out of date.
-    assert result["parameters"] == pytest.approx(optimum.parameters(problem.task()))
+    assert result["parameters"] == pytest.approx(optimum.parameters(TASKS[source](**problem.options)))
     assert problem.actions == result["actions"] and list(problem.targets) == result["targets"]
     if result["lower"] is not None:
         low, high = result["lower"]["interval"]
@@ -415,8 +418,13 @@ def test_committed_results_are_consistent(file):
     }
     assert result["order"] == pytest.approx(order, abs=0.006)
     picture = IMAGES / f"value-{file.stem}.png"
-    assert picture.exists() == (file.stem in PROBLEMS)
+    assert picture.exists() == (file.stem in solvable())
     assert not picture.exists() or picture.stat().st_size < 150_000
+
+
+def summary(env_id):
+    """Return what the agents' results hold of an environment, by agent."""
+    return json.loads((ROOT / "agents" / "results" / "summary.json").read_text())["envs"][env_id]["agents"]
 
 
 def numbers(env_id):
@@ -424,21 +432,20 @@ def numbers(env_id):
 
 
 def test_known_answers_come_out():
-    free = numbers("PivotedBarFree-v0")
-    assert 1.5 < free["known"]["seconds_to_upright"] < 2.5
+    free = numbers(pivoted_bar.SwingUpFree.id)
     assert free["lower"]["mean"] > 421.0
-    damping = numbers("CylinderInCylinderDamping-v0")
-    full = damping["known"]["full_damping"]
-    assert damping["lower"]["interval"][0] > full["interval"][1] + 50.0
-    assert numbers("InclineBrake-v0")["lower"]["mean"] > -1.76
-    assert numbers("CylinderInCylinderTilt-v0")["lower"]["mean"] > 197.6
-    assert numbers("InclineTilt-v0")["lower"]["mean"] > 179.9
-    assert numbers("CylinderInCylinderPump-v0")["lower"]["mean"] > 142.1
-    for env_id in ("PivotedBar-v0", "PivotedBarBalance-v0"):
+    damping = numbers(cylinder_in_cylinder.Damping.id)
+    full = summary(cylinder_in_cylinder.Damping.id)["full damping"]["conditions"]["nominal"]
+    assert damping["lower"]["interval"][0] > full["return"] + 2.0 * full["return_error"] + 50.0
+    assert numbers(incline.Brake.id)["lower"]["mean"] > -1.76
+    assert numbers(cylinder_in_cylinder.Tilt.id)["lower"]["mean"] > 197.6
+    assert numbers(incline.Tilt.id)["lower"]["mean"] > 179.9
+    assert numbers(cylinder_in_cylinder.Pump.id)["lower"]["mean"] > 142.1
+    for env_id in ("PivotedBar-v0", pivoted_bar.Balance.id):
         result = numbers(env_id)
         assert result["lower"] is None and highest(env_id) < 500.0
-    assert "too wide for a score" in numbers("PivotedBarBalance-v0")["how"]
-    assert math.isclose(highest("PivotedBar-v0"), highest("PivotedBarFree-v0"), rel_tol=2e-4)
+    assert "too wide for a score" in numbers(pivoted_bar.Balance.id)["how"]
+    assert math.isclose(highest("PivotedBar-v0"), highest(pivoted_bar.SwingUpFree.id), rel_tol=2e-4)
 
 
 # --- what nobody exceeds: the braking task's optimum, and all estimates, against all that was played ---
@@ -497,10 +504,10 @@ def test_optimum_of_braking_where_the_line_is_out_of_reach():
 
 @pytest.mark.parametrize("options", [{}, {"mass": 1.2}, {"dt": 0.1}, {"tilt": 0.4}])
 def test_nothing_beats_the_optimum_of_braking(options):
-    envs = gym.make_vec("InclineBrake-v0", 300, autoreset_mode="Disabled", **options)
+    envs = gym.make_vec(incline.Brake.id, 300, autoreset_mode="Disabled", **options)
     rng = np.random.default_rng(0)
     names = ("switching line", "best constant", "full damping", "zero", "random")
-    agents = [make_controller("InclineBrake-v0", name, **options) for name in names]
+    agents = [make_controller(incline.Brake.id, name, **options) for name in names]
     # And the line, with every action off by a little, to either side.
     line = agents[0]
     for agent in (*agents, None):
@@ -532,10 +539,9 @@ def highest(env_id):
 @pytest.mark.parametrize("env_id", TASKS)
 def test_no_agent_is_above_what_is_published_of_the_optimum(env_id):
     """All were played from the same starts, so only kicks are luck."""
-    agents = json.loads((ROOT / "agents" / "results" / "summary.json").read_text())["envs"][env_id]["agents"]
-    for name, agent in agents.items():
+    for name, agent in summary(env_id).items():
         found = agent["conditions"]["nominal"]
-        luck = 3.0 * found["return_error"] if PROBLEMS.get(env_id) and PROBLEMS[env_id].pushes else 0.0
+        luck = 3.0 * found["return_error"] if TASKS[env_id].value_iteration.pushes else 0.0
         mean = found["return"]
         assert mean <= highest(env_id) + luck, name
         assert mean <= numbers(env_id)["bound"]["value"]
@@ -556,10 +562,9 @@ def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
     result = json.loads(gzip.decompress(file.read_bytes()))
     env_id = result["env"]
     most = highest(env_id)
-    summary = json.loads((ROOT / "agents" / "results" / "summary.json").read_text())["envs"][env_id]["agents"]
     for number, policy in enumerate(result["policies"]):
         returns = np.array(policy["returns"])
-        if env_id == "InclineBrake-v0":
+        if TASKS[env_id].optimum:
             seed = first_seed(result["digest"], result["nonce"], number)
             task, states = starts_of(env_id, seed, len(returns))
             assert (returns <= optimal_return(task, *states.T) + 1e-9).all()
@@ -568,5 +573,5 @@ def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
         ahead, most_ahead = returns, most
         if policy.get("reference"):
             ahead = returns - np.array(policy["reference"])
-            most_ahead = most - summary[REFERENCES[env_id][0]]["conditions"]["nominal"]["return"]
+            most_ahead = most - summary(env_id)[TASKS[env_id].reference]["conditions"]["nominal"]["return"]
         assert ahead.mean() <= most_ahead + 3.0 * ahead.std() / math.sqrt(len(ahead))

@@ -10,10 +10,10 @@ from lag_envs.benchmark_tasks import ExactCartPole
 from lag_envs.cli import main
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS
 
 EXAMPLE = str(Path(__file__).parents[1] / "examples" / "ball_on_beam.py")
-PENDULUM = load_task(TASKS["PivotedBar-v0"][0])
+PENDULUM = TASKS["PivotedBar-v0"]
 
 
 def test_any_order_takes_the_same_steps():

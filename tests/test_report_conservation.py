@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lag_envs.report import conservation, leave_out
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS
 
 
 def claims(content):
@@ -15,8 +15,7 @@ def claims(content):
 
 
 def task(id, **keywords):
-    place, fixed = TASKS[id]
-    return load_task(place)(**fixed, **keywords)
+    return TASKS[id](**keywords)
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import Result
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.steppers import comparison
+from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 
 #: Limit on the error of one second of any environment, relative to the state's size; measured 5.3e-16.
 ONE_SECOND = 2e-15
@@ -100,7 +101,7 @@ def test_exact_states_are_those_of_equations_that_are_typed_in():
     given = [({"alpha": -15, "delta": 3 * Fraction(u)}, env.dt) for u in episode.controls]
     same(path, episode.states[0], given)
 
-    env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
+    env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
     episode = play(env, random_actions(env, 0))
     path = replay(env.task, 0, episode.states[0], episode.controls, 34)
@@ -153,7 +154,7 @@ def test_every_step_of_whole_episodes(id, seed):
 
 def test_one_step_is_the_worst_of_all_steps():
     """A single wrong step late in the episode shows, in its own entry, and nowhere else."""
-    env = gym.make("PivotedBarFree-v0", duration=1.0)
+    env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0)
     env.reset(seed=0)
     episode = play(env, random_actions(env, 0))
     task, late = env.unwrapped.task, len(episode.controls) - 3
@@ -179,18 +180,18 @@ def test_one_step_of_peers_is_the_worst_of_all_steps():
 
 def test_kicks_are_part_of_the_exact_states(monkeypatch):
     """With this seed there is one before the bar has fallen."""
-    (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
+    (row,) = environments.ours(pivoted_bar.Balance.id, seed=4)
     assert row["error"]["the end"] < ONE_SECOND
     monkeypatch.setattr(episodes, "episode_key", lambda key, episode: 0)
-    (row,) = environments.ours("PivotedBarBalance-v0", seed=4)
+    (row,) = environments.ours(pivoted_bar.Balance.id, seed=4)
     assert row["error"]["the end"] > 0.01
 
 
 @pytest.fixture(scope="module")
 def rows():
     jobs = [
-        environments.ours("InclineBrake-v0", 0, 1.0),
-        environments.ours("CylinderInCylinderPump-v0", 0, 1.0),
+        environments.ours(incline.Brake.id, 0, 1.0),
+        environments.ours(cylinder_in_cylinder.Pump.id, 0, 1.0),
         environments.theirs("Pendulum-v1", 1, 1.0),
         environments.undriven(),
         environments.undriven("Pendulum-v1"),
@@ -225,13 +226,13 @@ def test_episodes_with_cut_speeds_are_passed_over(rows):
 def test_undriven_pendulum(rows):
     angles = {row["case"]: environment_results._angle(row) for row in rows if row["seed"] is None}
     assert angles["Pendulum-v1, undriven"] == pytest.approx(0.178, abs=0.0005)
-    assert angles["PivotedBarFree-v0 with Pendulum-v1's equation, undriven"] < 2e-12
+    assert angles[f"{pivoted_bar.SwingUpFree.id} with Pendulum-v1's equation, undriven"] < 2e-12
     assert all(abs(row["gain"]) < 1e-12 for row in rows if row["seed"] is None and row["ours"])
 
 
 def test_a_worse_stepper_breaks_the_claims(rows):
     """RK4, once per control step, in place of ours."""
-    env = gym.make("PivotedBarFree-v0", duration=1.0).unwrapped
+    env = gym.make(pivoted_bar.SwingUpFree.id, duration=1.0).unwrapped
     env.reset(seed=0)
     episode = play(env, random_actions(env, 0))
     scene = Stepped(env.scene, comparison("RK4", Stepped(env.scene).flow))

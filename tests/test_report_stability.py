@@ -13,6 +13,7 @@ from lag_envs.report.runner import Result
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.pendulum import Drive
+from lag_envs.tasks import cylinder_in_cylinder
 
 PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
 
@@ -89,7 +90,7 @@ def test_cost_of_the_bound():
 
 
 def test_environments_keep_within_the_bound():
-    *steps, reach = bound.environment("CylinderInCylinderPump-v0", 4)
+    *steps, reach = bound.environment(cylinder_in_cylinder.Pump.id, 4)
     assert all(row["substeps"] == 1 and row["theta_dot"] < row["theta_dot_bound"] < 1.01e-12 for row in steps)
     assert reach["certified"] == pytest.approx(9.515, abs=0.001)
     assert reach["actual"] > 2.0 * reach["certified"]

@@ -26,12 +26,12 @@ from agents.analysis import (
 )
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
-from lag_envs.controllers import CONTROLLERS, Constant, do_nothing, make_controller
+from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
 from lag_envs.report.docs import replaced
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
-ENV = "InclineBrake-v0"
+ENV = incline.Brake.id
 
 
 def rliable_metrics():
@@ -143,8 +143,8 @@ def invented():
     agents = [learner("ppo", 5), learner("sac+", 3, 0.8), learner("td3", 1), classical("a|b", 9.9)]
     envs = {
         "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], (0.0, 10.0)),
-        "PivotedBarBalance-v0": summarise_env(agents[::2], None),
-        "InclineTilt-v0": summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
+        pivoted_bar.Balance.id: summarise_env(agents[::2], None),
+        incline.Tilt.id: summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
     }
     for env in envs.values():
         env |= {"spread": {"s": 0.5}, "problems": ["optimal: not computed"]}
@@ -219,8 +219,7 @@ def test_conditions_make_environments(env_id):
     found = {c.name: c for c in conditions(env_id)}
     assert list(found)[:2] == [NOMINAL, OFTEN] and {"noise 1 %", "noise 5 %", "late"} <= set(found)
     assert {"mass -20 %", "mass +20 %", "gravity -20 %", "gravity +20 %"} <= set(found)
-    place, fixed = TASKS[env_id]
-    tasks = {name: load_task(place)(**fixed | condition.options) for name, condition in found.items()}
+    tasks = {name: TASKS[env_id](**condition.options) for name, condition in found.items()}
     assert tasks[OFTEN].dt == pytest.approx(tasks[NOMINAL].interval / 10.0)
     assert tasks[OFTEN].limit == 10.0 * tasks[NOMINAL].steps
     assert tasks["gravity +20 %"].scene.gravity == pytest.approx(1.2 * tasks[NOMINAL].scene.gravity)
@@ -230,17 +229,16 @@ def test_agents_with_a_clock_are_told_its_pace():
     class Clock:
         pace = 1.0
 
-    class ILQR:
-        pass
-
     entrant = Entrant(ENV, "clock", "classical", Clock, "")
     usual, often = (Job(entrant, c, 1) for c in conditions(ENV)[:2])
     assert often.steps == 10 * usual.steps
     clock = Clock()
     assert measure.set_pace(clock, often) and clock.pace == pytest.approx(0.1)
     assert measure.set_pace(clock, usual) and clock.pace == 1.0
-    assert measure.set_pace(ILQR(), usual) and not measure.set_pace(ILQR(), often)
     assert measure.set_pace(Constant(0.0), often)
+    plan = Entrant("PivotedBar-v0", "iLQR", "classical", Clock, "")
+    usual, often = (Job(plan, c, 1) for c in conditions("PivotedBar-v0")[:2])
+    assert measure.set_pace(Constant(0.0), usual) and not measure.set_pace(Constant(0.0), often)
 
 
 # --- the command ---
@@ -272,7 +270,7 @@ def command(monkeypatch, capsys, tmp_path):
     ]
     for module in (measure, results):
         monkeypatch.setattr(module, "conditions", lambda env_id: few)
-    monkeypatch.setattr(measure, "classical", lambda env_id: {"zero": do_nothing})
+    monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
     monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
@@ -374,7 +372,7 @@ def test_command_that_is_broken_off(error, status, message, command, tmp_path, m
 
 def test_command_says_what_is_wrong(command, tmp_path):
     for arguments, message in (
-        (["--envs", "InclineBrak-v0"], "did you mean InclineBrake-v0"),
+        (["--envs", "PivotedBra-v0"], "did you mean PivotedBar-v0"),
         (["--envs", ENV, "--agents", "ppo"], "no agent 'ppo' here; there are zero"),
         (["--envs", ENV, "--episodes", "0"], "--episodes must lie between"),
         (["--redraw"], "measure first"),
@@ -425,8 +423,8 @@ def assert_reproduced(env_id, name, policies):
 
 @pytest.mark.parametrize("env_id", TASKS)
 def test_committed_results_of_controllers_come_out_again(env_id):
-    for name in CONTROLLERS[env_id]:
-        if name != "iLQR":  # it takes minutes
+    for name, found in controllers(TASKS[env_id]).items():
+        if not found.plans:  # that takes minutes
             assert_reproduced(env_id, name, [make_controller(env_id, name)])
 
 
@@ -434,7 +432,7 @@ def test_committed_results_of_controllers_come_out_again(env_id):
 @pytest.mark.parametrize("env_id", TASKS)
 def test_committed_results_of_learners_come_out_again(env_id):
     learned = {
-        name: policies for name, policies in behaviour.agents(env_id) if name not in CONTROLLERS[env_id]
+        name: policies for name, policies in behaviour.agents(env_id) if name not in TASKS[env_id].controllers
     }
     assert learned
     for name, policies in learned.items():
@@ -456,7 +454,7 @@ def test_how_agents_act_is_what_is_committed():
 def test_how_agents_act_by_hand():
     """Constant brakes: nothing has to be learnt, and time and speed have closed forms."""
     played = behaviour.play(ENV, Constant(1.0), 50)
-    measured = behaviour.crossed(played)
+    measured = behaviour.measures(played)
     x, v = played.states[0].T
     rate = 6.0 * 2.0 / 3.0  # a solid cylinder of 1 kg
     settled = 2.0 / 3.0 * 9.81 * np.sin(np.radians(15.0)) / rate
@@ -476,14 +474,14 @@ def test_how_agents_act_by_hand():
 
 def test_arrival_by_hand():
     """One episode is there for good after the second step, one never."""
-    task = load_task(TASKS["PivotedBarFree-v0"][0])(**TASKS["PivotedBarFree-v0"][1])
+    task = pivoted_bar.SwingUpFree()
     angles = np.array([[0.0, 0.0], [np.pi, np.pi], [0.0, 0.0], [np.pi, 0.0], [np.pi - 0.1, 0.0]])
     played = behaviour.Played(
-        "PivotedBarFree-v0", task, np.stack([angles, 0.0 * angles], axis=-1), np.zeros((4, 2)), np.zeros(2),
+        task, np.stack([angles, 0.0 * angles], axis=-1), np.zeros((4, 2)), np.zeros(2),
         np.array([4, 4]), np.array([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [0.75, 0.0]]),
     )  # fmt: skip
     assert played.settled().tolist() == [3 * task.dt, np.inf]
-    found = behaviour.upright(played)
+    found = behaviour.measures(played)
     assert found == {
         "upright after [s]": 3 * task.dt,
         "lost by then": 2.25,
@@ -494,10 +492,9 @@ def test_arrival_by_hand():
 
 def test_notes_are_about_environments_that_exist_and_hold_no_numbers():
     """A number needs a command that measures it, and those stand in tables."""
-    notes = report.load_notes()
-    assert set(notes) == set(TASKS)
-    for text in notes.values():
-        assert not re.search(r"\d", text.replace("TD3", "")), text
+    for task in TASKS.values():
+        text = task.note
+        assert text and not re.search(r"\d", text.replace("TD3", "")), text
     assert "It is best." in report.page(invented(), {"PivotedBar-v0": "It is best."})
 
 

@@ -17,7 +17,7 @@ from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import describe
 from lag_envs.scenes.shapes import Arrow, Circle, Lens, Line, Moment, Polygon
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline
 from tests import board_pages, chromium
 
 HOSTILE = (
@@ -160,14 +160,14 @@ def test_addresses_that_are_no_links(url):
 
 
 def test_numbers_that_json_does_not_have_are_left_out():
-    found = board_pages.data(("InclineTilt-v0",), board_pages.AGENTS[:2])
+    found = board_pages.data((incline.Tilt.id,), board_pages.AGENTS[:2])
     found["environments"][0]["rows"][0] |= {
         "score": math.nan,
         "interval": [math.nan, math.inf],
         "settle": None,
     }
     pages, _ = render(found)
-    row = json.loads(re.findall(r'id="data">(.*?)<', pages["InclineTilt-v0.html"])[0])["rows"][0]
+    row = json.loads(re.findall(r'id="data">(.*?)<', pages[f"{incline.Tilt.id}.html"])[0])["rows"][0]
     assert row["score"] is None and row["interval"] == [None, None]
 
 
@@ -186,14 +186,14 @@ def test_little_is_enough():
 
 
 def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
-    found = board_pages.data(("InclineBrake-v0",))
+    found = board_pages.data((incline.Brake.id,))
     rows = found["environments"][0]["rows"]
-    like = {"id": "InclineBrake-v0-first", "name": "The <first>", "state": "withdrawn"}
+    like = {"id": f"{incline.Brake.id}-first", "name": "The <first>", "state": "withdrawn"}
     rows[0] |= {"rank": None, "alike": like}
     rows[1] |= {"looks_like": "P\u0420O & co"}
     rows[2] |= {"reference": True}
     pages, _ = render(found)
-    page = pages["InclineBrake-v0.html"]
+    page = pages[f"{incline.Brake.id}.html"]
     ranks = re.findall(r'class="rank">([^<]*)<', page)
     assert ranks[0] == "–" and page.count(">acts like") == 1 and page.count("though it looks the same") == 1
     assert 'acts like <span dir="auto">The &lt;first&gt;</span>' in page and "(withdrawn)" in page
@@ -205,15 +205,15 @@ def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
 
 
 def test_frozen_boards_stand_apart():
-    found = board_pages.data(("InclineBrake-v0",))
+    found = board_pages.data((incline.Brake.id,))
     old = found["environments"][0] | {"frozen": True, "protocol": 1}
     found = found | {"protocol": 2, "environments": [found["environments"][0] | {"protocol": 2}, old]}
     pages, _ = render(found)
     index = pages["index.html"]
     assert index.count('class="card"') == 1
-    assert 'href="InclineBrake-v0-protocol-1.html">InclineBrake-v0, protocol 1<' in index
-    assert "protocol-1.html" not in pages["InclineBrake-v0.html"]
-    assert "frozen, protocol 1" in pages["InclineBrake-v0-protocol-1.html"]
+    assert f'href="{incline.Brake.id}-protocol-1.html">{incline.Brake.id}, protocol 1<' in index
+    assert "protocol-1.html" not in pages[f"{incline.Brake.id}.html"]
+    assert "frozen, protocol 1" in pages[f"{incline.Brake.id}-protocol-1.html"]
 
 
 def files_of(folder):
@@ -229,7 +229,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     assert all(t == first[n] for n, t in files_of(tmp_path).items() if n.startswith("assets/"))
     build({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
-    assert "InclineBrake-v0.html" not in left and "CNAME" in left
+    assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
     assert sum(name.startswith("assets/") for name in left) == 2 + len(board_pages.AGENTS)
 
 
@@ -247,8 +247,8 @@ def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
 
 
 def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
-    small = board_pages.data(("PivotedBar-v0", "InclineBrake-v0"), board_pages.AGENTS[:1])
-    other = board_pages.data(("InclineBrake-v0", "CylinderInCylinderTilt-v0"), board_pages.AGENTS[1:2])
+    small = board_pages.data(("PivotedBar-v0", incline.Brake.id), board_pages.AGENTS[:1])
+    other = board_pages.data((incline.Brake.id, cylinder_in_cylinder.Tilt.id), board_pages.AGENTS[1:2])
     real = os.replace
     for moment in itertools.count():
         out = tmp_path / str(moment)
@@ -325,8 +325,9 @@ def test_overview(open_page, data):
     for i in range(3):
         assert colours(page, f".card:nth-child({i + 1}) canvas") > 50
     page.click(".card:nth-child(2) .whole")
-    page.until("location.pathname.endsWith('InclineBrake-v0.html') && document.readyState === 'complete'")
-    assert page.js("document.querySelector('nav [aria-current]').textContent") == "InclineBrake-v0"
+    there = f"location.pathname.endsWith('{incline.Brake.id}.html')"
+    page.until(f"{there} && document.readyState === 'complete'")
+    assert page.js("document.querySelector('nav [aria-current]').textContent") == incline.Brake.id
 
 
 def flat(shape):
@@ -347,8 +348,8 @@ def flat(shape):
 def test_scenes_are_drawn_as_python_draws_them(open_page):
     page = open_page()
     rng = np.random.default_rng(0)
-    for env_id, (place, fixed) in TASKS.items():
-        task, board = load_task(place)(**fixed), describe(env_id)
+    for env_id, kind in TASKS.items():
+        task, board = kind(), describe(env_id)
         for _ in range(3):
             state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
             share = float(rng.uniform(0 if board["control"]["low"] == 0 else -1, 1))
@@ -486,7 +487,7 @@ def test_player(open_page, data):
 
 
 def test_speed_and_loop(open_page):
-    page = open_page("InclineBrake-v0")
+    page = open_page(incline.Brake.id)
     page.js("""(() => { const s = document.querySelector('.speed select'); s.value = '4';
         document.querySelector('.loop input').click(); })()""")
     page.click(".play")
@@ -536,7 +537,7 @@ def test_hostile_names_stay_names(open_page, hostile, tmp_path):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_narrow_screen(open_page, scheme):
-    for name in ("index", "PivotedBar-v0", "CylinderInCylinderTilt-v0"):
+    for name in ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id):
         page = open_page(name, width=320, height=640, media=[("prefers-color-scheme", scheme)])
         assert page.js("document.documentElement.scrollWidth") == 320
     # Cards instead of columns; what would be lost with the heads is sorted by a list.

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from functools import cache
+from itertools import product
 
 import gymnasium as gym
 import numpy as np
@@ -31,7 +32,7 @@ from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.pendulum import Drive
 from lag_envs.stepping.slope import Pull, Turn
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS
 
 KINDS = "task", "damped", "stiff", "extreme"
 
@@ -181,9 +182,9 @@ def test_bound_is_not_far_off():
 def test_every_task_is_one_certified_step():
     """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'."""
     pendulums = set()
-    for name, (place, fixed) in TASKS.items():
-        task = load_task(place)(**fixed)
-        for case in corners(name):
+    for name, kind in TASKS.items():
+        task = kind()
+        for case in corners(task) if task.certified_speed() is not None else ():
             bound = task.scene.step_bound(*case, task.dt)
             if bound.order:
                 pendulums.add(name)
@@ -233,19 +234,17 @@ def test_one_substep_leaves_out_no_more_than_the_tolerance(name, dt):
     assert {1, 2} <= reached or dt > 0.02
 
 
-def corners(name):
+def corners(task):
     """Return the fastest states and strongest controls of a task."""
-    signs = [(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]
-    if name.startswith("PivotedBar"):
-        speed, most = (7.0, 3.0) if "Balance" in name else (12.6, 5.0)
-        track = [] if "Free" in name else [0.5, 0.0]
-        return [([*track, theta, a * speed], b * most) for a, b, _ in signs for theta in (0.0, 1.5, math.pi)]
-    if name == "CylinderInCylinderDamping-v0":
-        return [([a * 1.3, b * 8.0], c) for a, b, _ in signs for c in (0.0, 2.4)]
-    if name.startswith("CylinderInCylinder"):
-        most, spin, place = (15.0, 6.0, 1.05) if "Tilt" in name else (4.0, 3.0, 1.3)
-        return [([place, a * 6.0, b * spin], c * most) for a, b, c in signs]
-    return [([0.0] * (3 if "Tilt" in name else 2), 0.0)]
+    form, reach = task.scene._form, task.examples.reach
+    (low,), (high,) = task.control_range
+    angle = None if task.certified_speed() is None else form.angle
+    for edge, speed, control in product(task.edges, (-reach, reach), (low, high)):
+        for place in (0.0, 1.5, math.pi) if angle is not None else (0.0,):
+            state = list(edge)
+            if angle is not None:
+                state[angle], state[angle + 1] = place, speed
+            yield state, control
 
 
 # --- one step against the reference ---------------------------------------------------------------
@@ -727,7 +726,7 @@ def test_simulate_is_the_environments_step(name):
         env.reset()
         start = env.state
         env.reset(options={"state": start})
-        env.step(rng.uniform(-1, 1, 1))
+        env.step(rng.uniform(-1, 1, env.action_space.shape))
         end, expected = env.state, env.scene.simulate(start, [env.control], env.task.dt)[1]
         kicks += not np.array_equal(end, expected)
         if kicks and not np.array_equal(end, expected):
@@ -737,7 +736,7 @@ def test_simulate_is_the_environments_step(name):
         env.reset(options={"state": start})
         controls, states = [], [start]
         for _ in range(100):
-            _, _, terminated, _, _ = env.step(rng.uniform(-0.2, 0.2, 1))
+            _, _, terminated, _, _ = env.step(rng.uniform(-0.2, 0.2, env.action_space.shape))
             controls.append(env.control)
             states.append(env.state)
             if terminated:

@@ -18,8 +18,9 @@ from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.kernels import affine
 from lag_envs.leaderboard.policies import bin_centres
 from lag_envs.leaderboard.submission import Refused, load, write
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
-ENV = "InclineTilt-v0"
+ENV = incline.Tilt.id
 ABOUT = {"env": ENV, "name": "An agent", "authors": ["A. Nobody"], "license": "MIT"}
 SLOW = pytest.mark.slow
 TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
@@ -217,11 +218,11 @@ def test_controller_is_the_built_in_one(tmp_path, numbers):
 
 
 def test_every_controller_of_every_environment_can_be_submitted(tmp_path):
-    from lag_envs.controllers import CONTROLLERS
+    from lag_envs.controllers import controllers
 
     policy = {"architecture": "controller"}
-    for env in ("PivotedBar-v0", "InclineBrake-v0"):
-        for i, name in enumerate(CONTROLLERS[env]):
+    for env in ("PivotedBar-v0", incline.Brake.id):
+        for i, name in enumerate(controllers(TASKS[env])):
             about = ABOUT | {"env": env, "policy": policy | {"name": name}}
             write(tmp_path / f"{env}{i}", **about)
 
@@ -385,8 +386,8 @@ def test_text_that_is_no_toml_or_a_bomb(folder, content, reason):
         ("schema = 1", "schema = 1\nprotocol = 9999-12-31", "protocol must be a whole number"),
         ("schema = 1", f"schema = 0x{'f' * 900}", "schema must be 1"),
         (f'env = "{ENV}"', 'env = "Nothing-v0"', "env must be one of"),
-        (f'env = "{ENV}"', 'env = ["InclineTilt-v0"]', "env must be one of"),
-        (f'env = "{ENV}"', 'env = "InclineBrake-v0"', "must have the shape"),
+        (f'env = "{ENV}"', f'env = ["{ENV}"]', "env must be one of"),
+        (f'env = "{ENV}"', f'env = "{incline.Brake.id}"', "must have the shape"),
         ("schema = 1", "schema = 1\nscore = 1e9", "unknown key 'score'"),
         ("schema = 1", 'schema = 1\n"\\u001b[31m" = 1', "unknown key"),
         ('name = "An agent"', "name = 5", "name must be one line"),
@@ -855,8 +856,8 @@ def test_command_exports_files(runs, tmp_path):
     given += ["--seconds", 5]
     with pytest.raises(UserError, match="one file for each file"):
         export_command(*given, "--normalise", norms[0])
-    with pytest.raises(UserError, match="do not fit InclineBrake-v0"):
-        export_command(*given, "--env", "InclineBrake-v0")
+    with pytest.raises(UserError, match=f"do not fit {incline.Brake.id}"):
+        export_command(*given, "--env", incline.Brake.id)
     with pytest.raises(UserError, match="there is no environment 'x'"):
         export_command(*given, "--env", "x")
     assert not (tmp_path / "out").exists()
@@ -890,18 +891,19 @@ def test_models_that_cannot_be_exported(runs, tmp_path):
 # --- our own agents -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env", ["PivotedBarFree-v0", "CylinderInCylinderPump-v0", "InclineTilt-v0"])
+@pytest.mark.parametrize("env", [pivoted_bar.SwingUpFree.id, cylinder_in_cylinder.Pump.id, incline.Tilt.id])
 def test_optimal_table_is_the_value_function(env, tmp_path):
     pytest.importorskip("tqdm")
     from dataclasses import replace as replaced
 
-    from agents.optimum import PROBLEMS, Optimal, Solution
-    from agents.submit import COARSE, tabulate
+    from agents.optimum import Optimal, Solution
+    from agents.submit import tabulate
 
-    problem = replaced(PROBLEMS[env], targets=(0.0, 0.3)[: len(PROBLEMS[env].targets)])
-    solution = Solution(problem, 0.25, folder=None, quiet=True)
-    coarse = replaced(COARSE[env], levels=(0.25,) * len(problem.axes), targets=problem.targets)
-    policy, arrays = tabulate(solution, coarse)
+    problem = TASKS[env].value_iteration
+    axes = tuple(replaced(axis, level=0.25) for axis in problem.axes)
+    problem = replaced(problem, axes=axes, targets=(0.0, 0.3)[: len(problem.targets)])
+    solution = Solution(env, 0.25, folder=None, quiet=True, problem=problem)
+    policy, arrays = tabulate(solution)
     about = ABOUT | {"env": env, "policy": policy, "arrays": {0: arrays}}
     agent = write(tmp_path / "a", **about).policies[0][1].agent()
     rng = np.random.default_rng(0)
@@ -915,7 +917,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
     spread = wanted.max() - wanted.min()
     assert mirrored.any() and inside.sum() > 50
     assert np.abs(found - wanted)[inside].max() < (0.05 if problem.targets else 1e-5) * spread
-    if env == "PivotedBarFree-v0":
+    if env == pivoted_bar.SwingUpFree.id:
         theta, theta_dot = rng.uniform(-3.0, 3.0, (2, 200))
         seen = np.stack([np.cos(theta), np.sin(theta), theta_dot / 8.0], axis=1)
         ours, theirs = agent.predict(seen)[0], Optimal(env, solution=solution).predict(seen)[0]
@@ -925,7 +927,7 @@ def test_optimal_table_is_the_value_function(env, tmp_path):
 def test_all_agents_are_submitted(runs, tmp_path, monkeypatch, capsys):
     pytest.importorskip("tqdm")
     from agents.submit import main
-    from lag_envs.controllers import CONTROLLERS
+    from lag_envs.controllers import controllers
 
     shutil.copytree(runs, tmp_path / "runs" / ENV / "ppo")
     (tmp_path / "runs" / ENV / "sac" / "seed0").mkdir(parents=True)
@@ -934,7 +936,7 @@ def test_all_agents_are_submitted(runs, tmp_path, monkeypatch, capsys):
     assert main(["out", "--envs", ENV]) == 0
     assert "left out, it has 1 finished" in capsys.readouterr().out
     found = {load(folder).name for folder in (tmp_path / "out").iterdir()}
-    assert found == {*CONTROLLERS[ENV], "PPO"}
+    assert found == {*controllers(TASKS[ENV]), "PPO"}
     assert main(["out", "--envs", ENV]) == 0
     assert main(["out", "--envs", "Nothing"]) == 2
 

@@ -8,9 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from mpmath import mp, mpf
-from rollouts import IDS, actions, make
+from rollouts import actions, make
 
-each_id = pytest.mark.parametrize("env_id", IDS)
+from lag_envs import scenes
+from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
+
 PI = math.pi
 
 
@@ -33,6 +35,7 @@ class Row:
 
 
 class PivotedBar(Row):
+    task = pivoted_bar.SwingUp
     start = ((0, 0.05), (0, 0.02), (0, 0.1), (0, 0.1))
     largest, track = 5.0, 0.5
 
@@ -47,6 +50,7 @@ class PivotedBar(Row):
 
 
 class PivotedBarFree(Row):
+    task = pivoted_bar.SwingUpFree
     start = ((0, 0.1), (0, 0.1))
     largest = 5.0
 
@@ -58,6 +62,7 @@ class PivotedBarFree(Row):
 
 
 class PivotedBarBalance(Row):
+    task = pivoted_bar.Balance
     start = ((0, 0.2), (0, 0.2), (PI, 0.15), (0, 0.3))
     largest = 3.0
 
@@ -75,6 +80,7 @@ class PivotedBarBalance(Row):
 
 
 class InclineTilt(Row):
+    task = incline.Tilt
     dt, steps = 0.05, 200
     start = ((0, 0.4), (0, 0.3), (0, 0.05))
     largest, target = 0.3, 0.3
@@ -93,6 +99,7 @@ class InclineTilt(Row):
 
 
 class InclineBrake(Row):
+    task = incline.Brake
     start = ((-2, 1.0), (0.5, 0.5))
 
     def control(self, a, y):
@@ -109,6 +116,7 @@ class InclineBrake(Row):
 
 
 class CylinderInCylinderTilt(Row):
+    task = cylinder_in_cylinder.Tilt
     dt, steps = 0.05, 200
     start = ((0, 0.1), (0, 0.2), (0, 0.0))
     largest, target, fastest, highest = 15.0, 0.3, 6.0, 1.05
@@ -127,6 +135,7 @@ class CylinderInCylinderTilt(Row):
 
 
 class CylinderInCylinderPump(CylinderInCylinderTilt):
+    task = cylinder_in_cylinder.Pump
     largest, target, fastest, highest = 4.0, 0.0, 3.0, 1.3
 
     def reward(self, y, u, target):
@@ -140,6 +149,7 @@ class CylinderInCylinderPump(CylinderInCylinderTilt):
 
 
 class CylinderInCylinderDamping(Row):
+    task = cylinder_in_cylinder.Damping
     start = ((0, 0.8), (0, 1.0))
 
     def control(self, a, y):
@@ -161,7 +171,7 @@ class CylinderInCylinderDamping(Row):
 
 
 ROWS = {
-    cls.__name__ + "-v0": cls()
+    cls.task.id: cls()
     for cls in (
         PivotedBar,
         PivotedBarFree,
@@ -173,6 +183,7 @@ ROWS = {
         CylinderInCylinderDamping,
     )
 }
+each_id = pytest.mark.parametrize("env_id", ROWS)
 
 
 def nearest_safe(s, s_dot, wanted, top, track, dt):
@@ -206,18 +217,15 @@ def test_parameters_and_time(env_id):
     env, row = make(env_id), ROWS[env_id]
     assert (env.task.dt, env.task.limit) == (row.dt, row.steps)
     scene = env.scene
-    if env_id.startswith("PivotedBar"):
-        assert (scene.mass, scene.com_distance, scene.damping) == (
-            0.2,
-            0.3,
-            0.001 if "Balance" not in env_id else scene.damping,
-        )
+    kind = type(env.task)
+    if issubclass(kind.scene, scenes.PivotedBar):
+        assert (scene.mass, scene.com_distance, scene.damping) == (0.2, 0.3, 0.001)
         assert scene.inertia == pytest.approx(0.006, rel=1e-15)
-        assert scene.track == (None if "Free" in env_id else 0.5)
-    elif env_id.startswith("Incline"):
+        assert scene.track == (None if kind is pivoted_bar.SwingUpFree else 0.5)
+    elif issubclass(kind.scene, scenes.Incline):
         assert (scene.mass, scene.radius, scene.inertia) == (1.0, 0.05, pytest.approx(0.5 * 0.05**2))
-        assert scene.damping == (0.03 if "Tilt" in env_id else 0.0)
-        assert "Tilt" in env_id or scene.tilt == pytest.approx(PI / 12)
+        assert scene.damping == (0.03 if kind is incline.Tilt else 0.0)
+        assert kind is incline.Tilt or scene.tilt == pytest.approx(PI / 12)
     else:
         assert (scene.mass, scene.shell_radius, scene.radius, scene.inertia) == (
             1.0,
@@ -225,12 +233,8 @@ def test_parameters_and_time(env_id):
             0.1,
             pytest.approx(0.005),
         )
-        assert (
-            scene.damping
-            == {"Tilt-v0": 0.24, "Pump-v0": 0.024, "Damping-v0": 0.0}[
-                env_id.removeprefix("CylinderInCylinder")
-            ]
-        )
+        slow = {cylinder_in_cylinder.Tilt: 0.24, cylinder_in_cylinder.Pump: 0.024}
+        assert scene.damping == slow.get(kind, 0.0)
     assert scene.gravity == 9.81
 
 
@@ -256,7 +260,7 @@ def test_every_step_is_as_the_table_says(env_id):
             jump[-1] = 0.0
         np.testing.assert_allclose(jump, 0.0, atol=1e-13)
         # Reward and ending look at the state before the kick, the observation at the one after it.
-        if not (terminated and env_id == "InclineBrake-v0"):
+        if not (terminated and env_id == incline.Brake.id):
             assert reward == pytest.approx(row.reward(after, u, target), rel=1e-12, abs=1e-14)
         assert terminated == row.ended(after)
         np.testing.assert_allclose(
@@ -267,9 +271,9 @@ def test_every_step_is_as_the_table_says(env_id):
         if terminated or truncated:
             env.reset()
             n = 0
-    if env_id in ("PivotedBar-v0", "PivotedBarFree-v0"):
+    if env_id in ("PivotedBar-v0", pivoted_bar.SwingUpFree.id):
         assert ends == 0 and cuts > 0
-    elif "Pump" not in env_id and "Damping" not in env_id:
+    elif type(env.task) not in (cylinder_in_cylinder.Pump, cylinder_in_cylinder.Damping):
         assert ends > 0
     assert (kicks > 0) == hasattr(row, "kicked")
 
@@ -311,7 +315,7 @@ def rolled(env_id, y, u, dt):
     """Return the angle's rate after a step, by classical Runge-Kutta steps for all environments at once."""
 
     def rate(y):
-        if env_id == "PivotedBarBalance-v0":
+        if env_id == pivoted_bar.Balance.id:
             about_pivot = 0.006 + 0.2 * 0.3**2
             return np.array(
                 [y[1], -(0.06 * (u * np.cos(y[0]) + 9.81 * np.sin(y[0])) + 0.001 * y[1]) / about_pivot]
@@ -328,7 +332,7 @@ def rolled(env_id, y, u, dt):
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.2, 0.005])
-@pytest.mark.parametrize("env_id", ["PivotedBarBalance-v0", "CylinderInCylinderDamping-v0"])
+@pytest.mark.parametrize("env_id", [pivoted_bar.Balance.id, cylinder_in_cylinder.Damping.id])
 def test_kicks(env_id, dt):
     n, steps = 4000, 20
     envs = gym.make_vec(env_id, num_envs=n, dt=dt, autoreset_mode="Disabled")
@@ -346,7 +350,7 @@ def test_kicks(env_id, dt):
     kicks = sizes[np.abs(sizes) > 1e-7]
     chance = 1 - 0.99 ** (dt / 0.02)
     assert abs(len(kicks) - chance * len(sizes)) < 5 * math.sqrt(chance * len(sizes))
-    if env_id == "PivotedBarBalance-v0":
+    if env_id == pivoted_bar.Balance.id:
         assert_uniform((np.sort(kicks) + 1) / 2)
     else:
         counts = [np.sum(np.abs(kicks - size) < 1e-7) for size in (-3.0, -1.5, 1.5, 3.0)]
@@ -354,7 +358,7 @@ def test_kicks(env_id, dt):
         assert np.abs(np.array(counts) - len(kicks) / 4).max() < 5 * math.sqrt(len(kicks) / 4)
 
 
-@pytest.mark.parametrize("env_id", [i for i in IDS if i != "InclineBrake-v0"])
+@pytest.mark.parametrize("env_id", [i for i in ROWS if i != incline.Brake.id])
 def test_running_rewards_with_another_interval(env_id):
     env, row = make(env_id, dt=0.03), ROWS[env_id]
     env.reset(seed=3)
@@ -428,9 +432,9 @@ def test_an_endless_track_has_no_guard():
 @pytest.mark.parametrize(
     ("env_id", "entry", "limit"),
     [
-        ("InclineTilt-v0", 2, 0.1),
-        ("CylinderInCylinderTilt-v0", 2, 6.0),
-        ("CylinderInCylinderPump-v0", 2, 3.0),
+        (incline.Tilt.id, 2, 0.1),
+        (cylinder_in_cylinder.Tilt.id, 2, 6.0),
+        (cylinder_in_cylinder.Pump.id, 2, 3.0),
     ],
 )
 @pytest.mark.parametrize("dt", [None, 0.013, 0.7])
@@ -451,7 +455,7 @@ def test_limits_are_met_at_the_end_of_a_step(env_id, entry, limit, dt):
 
 
 def test_quasi_static_tilt():
-    env = make("InclineTilt-v0", control="tilt")
+    env = make(incline.Tilt.id, control="tilt")
     assert env.scene.state_names == ("x", "x_dot")
     observation, _ = env.reset(seed=1)
     assert observation.shape == (3,)
@@ -518,7 +522,7 @@ CROSSINGS = [
 
 @pytest.mark.parametrize(("distance", "speed", "action", "options"), CROSSINGS)
 def test_crossing_time(distance, speed, action, options):
-    env = make("InclineBrake-v0", duration=10.0, **options)
+    env = make(incline.Brake.id, duration=10.0, **options)
     env.reset(seed=1, options={"state": [-distance, speed]})
     _, reward, terminated, _, _ = env.step(np.array([action]))
     assert terminated
@@ -539,7 +543,7 @@ def test_crossing_time(distance, speed, action, options):
 
 def test_the_way_to_the_line_is_paid_by_the_second():
     for dt in (0.01, 0.02, 0.05):
-        env = make("InclineBrake-v0", dt=dt)
+        env = make(incline.Brake.id, dt=dt)
         env.reset(seed=1, options={"state": [-1.0, 0.0]})
         rewards = []
         terminated = False
@@ -573,24 +577,24 @@ def returns(env_id, policy, n=500, **options):
 @pytest.mark.parametrize(
     ("env_id", "policy", "options", "known"),
     [
-        ("PivotedBarFree-v0", None, {}, -2.9),
-        ("PivotedBarFree-v0", 0.0, {}, 0.0),
+        (pivoted_bar.SwingUpFree.id, None, {}, -2.9),
+        (pivoted_bar.SwingUpFree.id, 0.0, {}, 0.0),
         ("PivotedBar-v0", None, {}, 0.6),
         ("PivotedBar-v0", 0.0, {}, 0.0),
-        ("PivotedBarBalance-v0", None, {}, 21.0),
-        ("PivotedBarBalance-v0", 0.0, {}, 21.0),
-        ("InclineTilt-v0", None, {"target": 0.0}, 9.0),
-        ("InclineTilt-v0", None, {"target": 0.3}, 6.0),
-        ("InclineTilt-v0", 0.0, {"target": 0.0}, 14.0),
-        ("InclineTilt-v0", 0.0, {"target": 0.3}, 9.0),
-        ("InclineBrake-v0", None, {}, -4.27),
-        ("InclineBrake-v0", -1.0, {}, -12.0),
-        ("InclineBrake-v0", 1.0, {}, -4.66),
-        ("CylinderInCylinderTilt-v0", None, {"target": 0.3}, 32.0),
-        ("CylinderInCylinderTilt-v0", 0.0, {"target": 0.3}, 0.0),
-        ("CylinderInCylinderDamping-v0", None, {}, 283.0),
-        ("CylinderInCylinderDamping-v0", -1.0, {}, 9.0),
-        ("CylinderInCylinderDamping-v0", 1.0, {}, 295.0),
+        (pivoted_bar.Balance.id, None, {}, 21.0),
+        (pivoted_bar.Balance.id, 0.0, {}, 21.0),
+        (incline.Tilt.id, None, {"target": 0.0}, 9.0),
+        (incline.Tilt.id, None, {"target": 0.3}, 6.0),
+        (incline.Tilt.id, 0.0, {"target": 0.0}, 14.0),
+        (incline.Tilt.id, 0.0, {"target": 0.3}, 9.0),
+        (incline.Brake.id, None, {}, -4.27),
+        (incline.Brake.id, -1.0, {}, -12.0),
+        (incline.Brake.id, 1.0, {}, -4.66),
+        (cylinder_in_cylinder.Tilt.id, None, {"target": 0.3}, 32.0),
+        (cylinder_in_cylinder.Tilt.id, 0.0, {"target": 0.3}, 0.0),
+        (cylinder_in_cylinder.Damping.id, None, {}, 283.0),
+        (cylinder_in_cylinder.Damping.id, -1.0, {}, 9.0),
+        (cylinder_in_cylinder.Damping.id, 1.0, {}, 295.0),
     ],
 )
 def test_known_returns(env_id, policy, options, known):

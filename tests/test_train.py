@@ -20,12 +20,12 @@ from agents.evaluate import evaluate, evaluate_batch
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
 from agents.run import Run, UserError
 from lag_envs import cli
-from lag_envs.hyperparams import HYPERPARAMS
+from lag_envs.hyperparams import as_yaml
 from lag_envs.leaderboard.policies import bin_centres
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, incline
 
 ROOT = Path(__file__).parents[1]
-ENV = "InclineTilt-v0"
+ENV = incline.Tilt.id
 #: Hyperparameters for a training that takes a second.
 SHORT = {
     "ppo": {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 2},
@@ -123,10 +123,11 @@ def test_normalised_observations_belong_to_the_policy(tmp_path):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_hyperparameters_are_there_for_every_environment(algo):
-    entries = yaml.safe_load((HYPERPARAMS / f"{algo}.yml").read_text())
-    assert set(TASKS) <= set(entries)
+    entries = yaml.safe_load(printed(algo))
+    assert list(TASKS) == list(entries)
     for env_id in TASKS:
         entry = hyperparameters(algo, env_id)
+        assert entries[env_id] == entry  # in the Zoo's form they are the same
         assert entry["n_timesteps"] >= 1e4 and entry["policy"] == "MlpPolicy"
 
 
@@ -163,7 +164,7 @@ def test_checkpoints_of_others_and_damaged_ones_are_refused(tmp_path):
     for other, message in (
         (make_run(tmp_path, steps=500), "steps 400, not 500"),
         (make_run(tmp_path, gamma=0.9), r"other hyperparameters \(gamma\)"),
-        (make_run(tmp_path, env_id="InclineBrake-v0"), "env 'InclineTilt-v0', not"),
+        (make_run(tmp_path, env_id=incline.Brake.id), f"env '{ENV}', not"),
     ):
         with pytest.raises(UserError, match=message):
             go(other)
@@ -258,7 +259,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
         process.send_signal(number)
         output = process.communicate(timeout=60)[0]
     assert process.returncode == 130, output
-    assert "To go on:" in output and "agents.train InclineTilt-v0" in output
+    assert "To go on:" in output and f"agents.train {ENV}" in output
     content = Run(tmp_path / ENV / "ppo" / "seed0", ENV, "ppo", 0, 30000, hyperparameters("ppo", ENV, config))
     assert content.load_checkpoint() is not None and content.trained >= 3700 and len(content.curve) >= 3
 
@@ -266,7 +267,7 @@ def test_killed_and_interrupted_runs_go_on(config, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["InclineTlt-v0"], "did you mean InclineTilt-v0"),
+        (["PivotedBra-v0"], "did you mean PivotedBar-v0"),
         ([ENV, "--algo", "sacc"], "did you mean sac"),
         ([ENV, "--seeds", "0"], "--seeds must lie between 1"),
         ([ENV, "--steps", "-5"], "--steps must lie between 1"),
@@ -315,18 +316,22 @@ def test_ray_that_is_not_there(command, config):
 # --- the RL Zoo ---
 
 
-def test_hyperparams_prints_the_file(capsys):
+def printed(algo):
+    return as_yaml(algo, {env_id: task() for env_id, task in TASKS.items()})
+
+
+def test_hyperparams_prints_a_file_of_the_zoo(capsys):
     for algo in ALGORITHMS:
         assert cli.main(["hyperparams", algo]) == 0
-        assert capsys.readouterr().out == (HYPERPARAMS / f"{algo}.yml").read_text()
+        assert capsys.readouterr().out == printed(algo)
     assert cli.main(["hyperparams", "pppo"]) == 2
     assert "did you mean ppo?" in capsys.readouterr().err
 
 
 def test_hyperparameters_name_what_the_package_brings():
     """The Zoo imports the wrappers by name, where there is no clone."""
-    for file in HYPERPARAMS.glob("*.yml"):
-        for entry in yaml.safe_load(file.read_text()).values():
+    for algo in ALGORITHMS:
+        for entry in yaml.safe_load(printed(algo)).values():
             for wrapper in entry.get("env_wrapper", []) + entry.get("vec_env_wrapper", []):
                 module, _, name = next(iter(wrapper)).rpartition(".")
                 assert module in ("gymnasium.wrappers", "lag_envs.sb3")
@@ -368,7 +373,7 @@ def test_the_zoo_trains_shows_and_films(algo, tmp_path):
         return done.stdout
 
     config = tmp_path / "config.yml"
-    config.write_text((HYPERPARAMS / f"{algo}.yml").read_text())
+    config.write_text(printed(algo))
     packages = ["--gym-packages", "lag_envs"]
     train = ["--conf-file", "config.yml", "-n", "200", "--eval-freq", "-1", "-P"]
     zoo(["rl_zoo3.train"], *packages, *train)
@@ -376,3 +381,58 @@ def test_the_zoo_trains_shows_and_films(algo, tmp_path):
     assert "Episode Reward" in zoo(["rl_zoo3.enjoy"], *packages, "-n", "600")
     zoo(["lag_envs.zoo", "record_video"], *packages, "-n", "20")
     assert list(tmp_path.glob(f"logs/{algo}/{ENV}_1/videos/*.mp4"))
+
+
+# --- environments of one's own ---
+
+BALL, SEVERAL = ROOT / "examples" / "ball_on_beam.py", ROOT / "tests" / "own_tasks.py"
+
+
+@pytest.fixture
+def beside_the_example(monkeypatch):
+    """Have the example's folder on the path, here and in the workers, and forget what it registers."""
+    monkeypatch.syspath_prepend(str(BALL.parent))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BALL.parent), *filter(None, sys.path)]))
+    yield
+    for name in ("ball_on_beam", "own_ball_on_beam", "own_own_tasks"):
+        sys.modules.pop(name, None)
+    for env_id in ("BallOnBeam-v0", "OwnSwitched-v0", "OwnCrane-v0"):
+        gym.registry.pop(env_id, None)
+
+
+@pytest.mark.parametrize(
+    ("given", "env_id"),
+    [
+        (str(BALL), "BallOnBeam-v0"),
+        ("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0"),
+        (f"{SEVERAL}:Switched", "OwnSwitched-v0"),  # chooses among three actions
+        (f"{SEVERAL}:Deliver", "OwnCrane-v0"),  # two controls, two targets
+    ],
+)
+def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_example, tmp_path):
+    arguments = [given, "--steps", "4096", "--output", str(tmp_path)]
+    assert train.main(arguments) == 0
+    result = json.loads((tmp_path / env_id / "ppo" / "seed0" / "result.json").read_text())
+    assert result["env"] == env_id and result["trained"] == 4096 and result["score"] is None
+    assert ("use_sde" in result["hyperparameters"]) == (env_id != "OwnSwitched-v0")
+    policy = load_policy(tmp_path / env_id / "ppo" / "seed0")
+    returns = evaluate_batch(env_id, policy, run.FIRST_FRESH_SEED, 100)
+    np.testing.assert_allclose(returns.mean(), result["mean_return"], rtol=1e-6)
+    assert train.main(arguments) == 0  # finished before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([str(SEVERAL)], "has several tasks: name one"),
+        (["nowhere.py"], "there is no file nowhere.py"),
+        (["no_module:Id-v0"], "there is no environment 'no_module:Id-v0': No module named 'no_module'"),
+        (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
+        ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
+        ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
+        ([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn numbers the actions of one control"),
+    ],
+)
+def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
+    status = train.main([*arguments, "--steps", "100", "--output", str(tmp_path)])
+    assert status in (1, 2) and message in "".join(capsys.readouterr())

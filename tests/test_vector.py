@@ -14,49 +14,15 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from rollouts import ANY_BAR, IDS, actions, make
+from rollouts import ANY_BAR, IDS, SINGLE, actions, make
 
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 each_id = pytest.mark.parametrize("env_id", IDS)
+each_single = pytest.mark.parametrize("env_id", SINGLE)
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
-
-#: Parameters, one per environment, that need one substep, many, and the treatment of stiff damping.
-MIXED = {
-    "PivotedBar-v0": {
-        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
-        "gravity": [9.81, 0.0, 1e3, 9.81, 9.81, 50.0, 1.6],
-    },
-    "PivotedBarFree-v0": {
-        "com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0],
-        "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0],
-    },
-    "PivotedBarBalance-v0": {
-        "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
-        "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5],
-    },
-    "InclineTilt-v0": {
-        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
-        "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3],
-    },
-    "InclineBrake-v0": {
-        "tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5],
-        "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderTilt-v0": {
-        "radius": [0.1, 0.4, 0.49, 0.499, 1e-3, 0.1, 0.2],
-        "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderPump-v0": {
-        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
-        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-    "CylinderInCylinderDamping-v0": {
-        "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
-        "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
-    },
-}
 
 
 def pair(env_id, n, mode="NextStep", **options):
@@ -72,13 +38,15 @@ def mixed_pair(env_id, mode="NextStep", **options):
     """Return the native environment with different parameters, and Gymnasium's of seven single ones."""
 
     def one(i):
-        own = {name: values[i] for name, values in MIXED[env_id].items()}
+        own = {name: values[i] for name, values in TASKS[env_id].examples.batch.items()}
         return lambda: gym.make(env_id, disable_env_checker=True, **own, **options)
 
     sync = SyncVectorEnv(
         [one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different"
     )
-    return gym.make_vec(env_id, num_envs=7, autoreset_mode=mode, **MIXED[env_id], **options), sync
+    return gym.make_vec(
+        env_id, num_envs=7, autoreset_mode=mode, **TASKS[env_id].examples.batch, **options
+    ), sync
 
 
 def assert_same(a, b):
@@ -110,7 +78,7 @@ def assert_alike(native, sync, steps, seed=0):
     n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     stray = 0.5 / native.task.limit
     rng = np.random.default_rng(seed)
-    given = actions(steps, n, 1, seed=seed)
+    given = actions(steps, *native.action_space.shape, seed=seed)
     ends = 0
     for action in given:
         mine, theirs = native.step(action), sync.step(action)
@@ -166,8 +134,8 @@ def test_same_bits_where_parameters_differ(env_id, mode):
     assert assert_alike(native, sync, 600) > 0
     for i, env in enumerate(sync.envs):
         assert env.unwrapped.state.tobytes() == native.state[i].tobytes()
-        assert native.control[i] == env.unwrapped.control
-        assert native.target is None or native.target[i] == env.unwrapped.target
+        assert np.array_equal(native.control[i], env.unwrapped.control)
+        assert native.target is None or np.array_equal(native.target[i], env.unwrapped.target)
         space = native.single_observation_space
         assert (space.high >= env.observation_space.high).all() and (
             space.low <= env.observation_space.low
@@ -203,7 +171,7 @@ def test_a_sub_environment_is_the_single_one(env_id):
     native.reset(seed=40)
     env = make(env_id)
     env.reset(seed=43)
-    for action in actions(30, 5, 1):
+    for action in actions(30, *native.action_space.shape):
         mine = native.step(action)
         theirs = env.step(action[3])
         assert mine[0][3].tobytes() == theirs[0].tobytes() and mine[1][3] == theirs[1]
@@ -211,7 +179,7 @@ def test_a_sub_environment_is_the_single_one(env_id):
             break
 
 
-@each_id
+@each_single
 def test_states_and_targets_by_hand(env_id):
     single = make(env_id)
     starts = []
@@ -224,7 +192,7 @@ def test_states_and_targets_by_hand(env_id):
     native = gym.make_vec(env_id, num_envs=6)
     observations, _ = native.reset(seed=0, options=options)
     assert native.state.tobytes() == options["state"].tobytes()
-    given = actions(1, 6, 1)[0]
+    given = actions(1, *native.action_space.shape)[0]
     stepped = native.step(given)[0]
     for i in range(6):
         own = {name: values[i] for name, values in options.items()}
@@ -294,7 +262,7 @@ def test_the_mask_is_read_only():
 
 
 def test_masked_rows_are_not_looked_at():
-    envs = gym.make_vec("InclineTilt-v0", num_envs=3)
+    envs = gym.make_vec(incline.Tilt.id, num_envs=3)
     first, _ = envs.reset(seed=1)
     kept = envs.state
     mask = np.array([False, True, False])
@@ -353,7 +321,7 @@ def test_nothing_is_shared(env_id, mode):
     kept = []
     for _ in range(2):
         arrays = [envs.reset(seed=1)[0]]
-        for action in actions(40, 3, 1):
+        for action in actions(40, *envs.action_space.shape):
             *out, info = envs.step(action)
             over = out[2] | out[3]
             arrays += [
@@ -393,7 +361,7 @@ def test_spaces_and_types(env_id):
 def test_observations_stay_in_the_space(env_id):
     envs = gym.make_vec(env_id, num_envs=100, autoreset_mode="SameStep")
     observations, _ = envs.reset(seed=1)
-    for action in actions(400, 100, 1, seed=5):
+    for action in actions(400, *envs.action_space.shape, seed=5):
         assert observations in envs.observation_space
         observations, *_, infos = envs.step(action)
         for last in infos.get("final_obs", ()):
@@ -408,13 +376,13 @@ def test_observations_stay_in_the_space(env_id):
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
 def test_copies_go_on_alike(env_id, clone):
-    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **MIXED[env_id])
+    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **TASKS[env_id].examples.batch)
     envs.reset(seed=2)
-    for action in actions(37, 7, 1):
+    for action in actions(37, *envs.action_space.shape):
         envs.step(action)
     twin = clone(envs)
     before = twin.state
-    for action in actions(60, 7, 1, seed=1):
+    for action in actions(60, *envs.action_space.shape, seed=1):
         mine = envs.step(action)
         assert (twin.state == before).all()  # nothing in common
         assert_same(mine, twin.step(action))
@@ -424,13 +392,15 @@ def test_copies_go_on_alike(env_id, clone):
 
 @each_id
 def test_spec_survives_json(env_id):
-    envs = gym.make_vec(env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **MIXED[env_id])
+    envs = gym.make_vec(
+        env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **TASKS[env_id].examples.batch
+    )
     spec = EnvSpec.from_json(envs.spec.to_json())
     assert spec == envs.spec
     twin = gym.make_vec(spec)
     assert twin.num_envs == 7 and twin.metadata == envs.metadata
     assert_same(envs.reset(seed=1), twin.reset(seed=1))
-    for action in actions(40, 7, 1):
+    for action in actions(40, *envs.action_space.shape):
         assert_same(envs.step(action), twin.step(action))
 
 
@@ -453,7 +423,7 @@ def test_autoreset_mode_stands_where_gymnasiums_own_have_it(mode):
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_record_episode_statistics(mode):
     envs = RecordEpisodeStatistics(
-        gym.make_vec("InclineBrake-v0", num_envs=4, autoreset_mode=mode, duration=1.0)
+        gym.make_vec(incline.Brake.id, num_envs=4, autoreset_mode=mode, duration=1.0)
     )
     envs.reset(seed=1)
     returns, recorded = np.zeros(4), 0
@@ -563,7 +533,7 @@ def test_bad_options_reset_nothing(options, error, match):
     with pytest.raises(error, match=match):
         envs.reset(seed=5, options=options)
     assert (envs.state == twin.state).all()
-    for action in actions(20, 3, 1):
+    for action in actions(20, *envs.action_space.shape):
         assert_same(envs.step(action), twin.step(action))
 
 
@@ -583,9 +553,9 @@ def test_bad_number_of_environments(n):
         ("PivotedBar-v0", {"duration": [1.0, 2.0, 3.0]}, "duration must be the same"),
         ("PivotedBar-v0", {"track": [None, 0.5, 0.5]}, "track"),
         ("PivotedBar-v0", {"track": [0.5, math.inf, 0.5]}, "track"),
-        ("InclineTilt-v0", {"control": ["tilt", "tilt", "tilt_rate"]}, "control must be the same"),
-        ("InclineTilt-v0", {"target": [0.1, 0.2, 0.7]}, "target"),
-        ("InclineTilt-v0", {"target": [0.1, 0.2, None]}, "target"),
+        (incline.Tilt.id, {"control": ["tilt", "tilt", "tilt_rate"]}, "control must be the same"),
+        (incline.Tilt.id, {"target": [0.1, 0.2, 0.7]}, "target"),
+        (incline.Tilt.id, {"target": [0.1, 0.2, None]}, "target"),
         ("PivotedBar-v0", {"max_episode_steps": 0}, "max_episode_steps"),
         ("PivotedBar-v0", {"max_episode_steps": True}, "max_episode_steps"),
     ],
@@ -610,8 +580,8 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
         "damping": 0.0,
     }
     mild = {"com_distance": [0.3, 0.4], "gravity": 1e3, "dt": 1.0, "damping": 0.0}
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=3, autoreset_mode=mode, **extreme, **ANY_BAR)
-    twin = gym.make_vec("PivotedBarFree-v0", num_envs=2, autoreset_mode=mode, **mild)
+    envs = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=3, autoreset_mode=mode, **extreme, **ANY_BAR)
+    twin = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=2, autoreset_mode=mode, **mild)
     envs.reset(seed=[1, 2, 3])
     twin.reset(seed=[1, 3])
     stuck = envs.state[1]
@@ -632,7 +602,7 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
 
 @each_mode
 def test_a_fixed_target_returns_after_one_given_by_hand(mode):
-    native, sync = pair("InclineTilt-v0", 3, mode, target=0.2, duration=0.3)
+    native, sync = pair(incline.Tilt.id, 3, mode, target=0.2, duration=0.3)
     given = {"target": np.array([0.1, 0.1, 0.1])}
     native.reset(seed=1, options=given)
     assert native.target.tolist() == [0.1] * 3
@@ -642,7 +612,7 @@ def test_a_fixed_target_returns_after_one_given_by_hand(mode):
 
 
 def test_a_restarting_environment_ignores_its_action():
-    envs = gym.make_vec("InclineTilt-v0", num_envs=2, duration=0.1)
+    envs = gym.make_vec(incline.Tilt.id, num_envs=2, duration=0.1)
     envs.reset(seed=1)
     for _ in range(2):
         _, _, _, truncations, _ = envs.step(np.zeros((2, 1), np.float32))
@@ -655,7 +625,7 @@ def test_a_restarting_environment_ignores_its_action():
 
 def test_a_refusal_carries_what_the_others_did():
     lengths = {"com_distance": [0.3, 1e-30], "damping": 0.0}
-    envs = gym.make_vec("PivotedBarFree-v0", num_envs=2, **lengths, **ANY_BAR)
+    envs = gym.make_vec(pivoted_bar.SwingUpFree.id, num_envs=2, **lengths, **ANY_BAR)
     envs.reset(seed=1)
     with pytest.raises(StepRefused) as error:
         envs.step(np.zeros((2, 1), np.float32))

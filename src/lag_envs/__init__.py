@@ -9,5 +9,5 @@ from lag_envs.tasks.registration import register
 __version__ = "0.2.0"
 __all__ = ["TASKS", "__version__", "register"]
 
-for _id, (_task, _fixed) in TASKS.items():
-    register(_task, id=_id, **_fixed)
+for _id, _place in TASKS.data.items():
+    register(_place, id=_id)

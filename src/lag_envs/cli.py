@@ -375,11 +375,11 @@ def declare_hyperparams(parser: argparse.ArgumentParser) -> None:
 
 def run_hyperparams(args: argparse.Namespace) -> int:
     """Print the hyperparameters of a learner."""
-    from lag_envs.hyperparams import HYPERPARAMS, learners
+    from lag_envs.hyperparams import as_yaml, learners
 
     if args.learner not in learners():
         raise UserError(f"there is no learner {args.learner!r}; {hint(args.learner, learners())}")
-    print((HYPERPARAMS / f"{args.learner}.yml").read_text(encoding="utf-8"), end="")
+    print(as_yaml(args.learner, {id: task() for id, task in TASKS.items()}), end="")
     return 0
 
 
@@ -459,7 +459,6 @@ COMMANDS: tuple[Command, ...] = (
 
 examples:
   lag-envs info PivotedBar-v0
-  lag-envs info InclineTilt-v0
   lag-envs info ball_on_beam.py              a task of your own; this runs the file
   lag-envs info mine.py:Balance              one of several""",
         declare_info,
@@ -476,7 +475,7 @@ examples:
   lag-envs bench --quick                             one environment, under a minute
   lag-envs bench --output speed.json                 everything, a few minutes
   lag-envs bench --checkout .                        the same, into the documentation of a clone
-  lag-envs bench PivotedBar-v0 InclineTilt-v0 --sizes 64,16384
+  lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
@@ -665,10 +664,7 @@ def _known(id: str) -> str:
 
 
 def _task(id: str) -> Task:
-    from lag_envs.tasks import load_task
-
-    place, fixed = TASKS[id]
-    return load_task(place)(**fixed)
+    return TASKS[id]()
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:

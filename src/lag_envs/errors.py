@@ -22,7 +22,7 @@ def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
 
     Examples
     --------
-    >>> hint("PivotedBra-v0", ["PivotedBar-v0", "InclineTilt-v0"])
+    >>> hint("PivotedBra-v0", ["PivotedBar-v0", "Acrobot-v1"])
     'did you mean PivotedBar-v0?'
     """
     names = {k.lower(): k for k in known}

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from lag_envs.tasks.measured import measured
+
 
 class Known(NamedTuple):
     """Mean returns that are known of an environment with its default parameters.
 
     The first two are the scale, set once: what is measured later, and more precisely, does not change them.
-    In a clone, ``python -m agents.scale`` measures all of them anew; ``agents/results/scale.json`` has what
-    came out.
+    In a clone, ``python -m agents.scale`` measures all of them anew; ``lag_envs/tasks/measured.json`` has
+    both.
 
     Parameters
     ----------
@@ -37,16 +39,10 @@ class Known(NamedTuple):
     optimum: float | None = None
 
 
-KNOWN_RETURNS = {
-    "PivotedBar-v0": Known(-0.72, 419.01, 0.012, "iLQR"),
-    "PivotedBarFree-v0": Known(-2.41, 422.49, 0.013, "iLQR"),
-    "PivotedBarBalance-v0": Known(21.4, 452.7, 0.14, "LQR"),
-    "InclineTilt-v0": Known(9.41, 181.57, 0.026, "iLQR"),
-    "InclineBrake-v0": Known(-4.325, -1.724, 0.0004, "switching line", optimum=-1.7238),
-    "CylinderInCylinderTilt-v0": Known(41.9, 197.67, 0.003, "iLQR"),
-    "CylinderInCylinderPump-v0": Known(6.25, 145.70, 0.014, "optimal"),
-    "CylinderInCylinderDamping-v0": Known(293.3, 367.1, 0.06, "optimal"),
-}
+def known_returns(env_id: str) -> Known | None:
+    """Return what is known of an environment; None where nothing was measured."""
+    scale = measured(env_id).get("scale")
+    return scale and Known(**scale)
 
 
 def score(env_id: str, mean_return: float) -> float | None:
@@ -67,8 +63,8 @@ def score(env_id: str, mean_return: float) -> float | None:
 
     Examples
     --------
-    >>> score("PivotedBarFree-v0", 422.49)
+    >>> score("PivotedBar-v0", 419.01)
     1.0
     """
-    known = KNOWN_RETURNS.get(env_id)
+    known = known_returns(env_id)
     return None if known is None else (mean_return - known.random) / (known.best - known.random)

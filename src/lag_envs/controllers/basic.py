@@ -7,8 +7,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.envs.actions import Actions
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -19,24 +20,79 @@ class Constant:
 
     Parameters
     ----------
-    action : float
-        The action in [-1, 1].
+    action : float or sequence of float
+        The action: in [-1, 1], for each control, or the number of a choice.
     """
 
-    def __init__(self, action: float) -> None:
+    def __init__(self, action: Any) -> None:
         self.action = action
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action, for each observation."""
+        own: NDArray = np.atleast_1d(np.asarray(self.action, np.float32))
+        return np.tile(own, (*np.shape(observation)[:-1], 1)), state
+
+
+def constant(task: Task, *, action: float) -> Constant:
+    """Return the agent that always takes one action."""
+    return Constant(action)
+
+
+class Feedback:
+    """Actions that are linear in the observation, clipped.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    gain : array_like, shape (n_actions, n_observation)
+        What each entry of the observation is multiplied by.
+    """
+
+    def __init__(self, task: Task, *, gain: ArrayLike) -> None:
+        self.gain = np.atleast_2d(np.asarray(gain, np.float64))
+        if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
+            raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action, for each observation."""
-        return np.full((*np.shape(observation)[:-1], 1), self.action, np.float32), state
+        return np.clip(observation @ self.gain.T, -1.0, 1.0).astype(np.float32), state
 
 
-def do_nothing(of: gym.Env | Task) -> Constant:
+def do_nothing(of: gym.Env | Task) -> Constant | Choice:
     """Return the agent of zero control: where the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
-    return Constant(task.rest_action)
+    return Choice(task) if task.formulas.choices else Constant(task.rest_action)
+
+
+class Choice:
+    """In tasks whose actions are numbers of choices, always that of the least control.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    rng : Generator, optional
+        Choose at random, by these random numbers.
+    """
+
+    def __init__(self, task: Task, rng: np.random.Generator | None = None) -> None:
+        self.task, self.rng = task, rng
+        self.shape = Actions(task.formulas.actions, task.formulas.choices).shape
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the choice, for each observation."""
+        shape = (*np.shape(observation)[:-1], *self.shape)
+        if self.rng is None:
+            return np.broadcast_to(np.asarray(self.task.rest_action, np.int64), shape).copy(), state
+        choices = self.task.formulas.choices
+        return self.rng.integers(choices if self.shape else choices[0], size=shape), state
 
 
 class Random:
@@ -46,16 +102,26 @@ class Random:
     ----------
     seed : int
         Seed of the actions.
+    count : int
+        How many controls an action has.
     """
 
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
+    def __init__(self, seed: int, count: int = 1) -> None:
+        self.rng, self.count = np.random.default_rng(seed), count
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return an action for each observation."""
-        return self.rng.uniform(-1.0, 1.0, (*np.shape(observation)[:-1], 1)).astype(np.float32), state
+        shape = (*np.shape(observation)[:-1], self.count)
+        return self.rng.uniform(-1.0, 1.0, shape).astype(np.float32), state
+
+
+def at_random(task: Task, seed: int = 0) -> Random | Choice:
+    """Return the agent of random actions."""
+    if task.formulas.choices:
+        return Choice(task, np.random.default_rng(seed))
+    return Random(seed, task.formulas.actions)
 
 
 class Law:
@@ -103,6 +169,8 @@ class Reader:
 
     def __init__(self, task: Task) -> None:
         formulas, form = task.formulas, task.scene._form
+        if formulas.targets > 1:
+            raise ValueError(f"{type(task).__name__} has {formulas.targets} targets; one at most can be read")
         k, angle = SimpleNamespace(**formulas.constants()), form.angle if form else None
         self.task, self._n = task, len(task.scene.state_names)
         self._width = form.width if form else self._n

@@ -53,10 +53,10 @@ class Model:
     --------
     >>> import gymnasium as gym, lag_envs
     >>> from lag_envs.envs.model import Model
-    >>> model = Model(gym.make("PivotedBarFree-v0").unwrapped.task)
-    >>> states, rewards, ended = model([[0.0, 0.0], [3.0, 0.1]], [1.0, 0.0])
+    >>> model = Model(gym.make("PivotedBar-v0").unwrapped.task)
+    >>> states, rewards, ended = model([[0.0, 0.0, 0.0, 0.0], [0.1, 0.0, 3.0, 0.1]], [1.0, 0.0])
     >>> states.shape, ended
-    ((2, 2), array([False, False]))
+    ((2, 4), array([False, False]))
     """
 
     def __init__(self, task: Task) -> None:

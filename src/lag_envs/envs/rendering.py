@@ -486,7 +486,11 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -
         env.reset(seed=seed)
         task: Task = env.unwrapped.task  # type: ignore[attr-defined]
         for i in range(round(seconds / task.dt)):
-            if any(env.step(np.array([0.8 * math.cos(7.0 * i * task.dt)]))[2:4]):
+            swing = np.float32(0.8 * math.cos(7.0 * i * task.dt))
+            action = (
+                task.rest_action if task.formulas.choices else np.full(env.action_space.shape or (), swing)
+            )
+            if any(env.step(action)[2:4]):
                 break
         picture: Any = env.render()
         files.append(Path(directory) / f"{env_id}.png")

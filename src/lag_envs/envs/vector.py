@@ -367,7 +367,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(over):
             final[i] = observations[i].copy()
-        last = {k: v if k.startswith("_") else np.where(over, v, 0) for k, v in infos.items()}
+        rows = over[:, None]
+        last = {
+            k: v if k.startswith("_") else np.where(rows if v.ndim > 1 else over, v, 0)
+            for k, v in infos.items()
+        }
         last |= {k: over & v for k, v in last.items() if k.startswith("_")}
         self._start(observations, over, False, False, False)
         self._over = 0

@@ -59,7 +59,7 @@ class Track:
         The policy.
     observations : ndarray, shape (steps, episodes, n)
         What it saw.
-    actions : ndarray, shape (steps, episodes)
+    actions : ndarray, shape (steps, episodes, n_actions)
         What it did.
     running : ndarray of bool, shape (steps, episodes)
         Which episodes had not ended.
@@ -83,23 +83,25 @@ class Track:
         try:
             if other.quick:
                 return self._asked_at_once(agent)
-            action, state = act(agent, self.observations[0], None, start)
-            total = float(np.sum((action[:, 0] - self.actions[0]) ** 2))
+            shape = self.actions.shape[1:]
+            action, state = act(agent, self.observations[0], None, start, shape)
+            total = float(np.sum((action - self.actions[0]) ** 2))
             for step in range(1, len(self.actions)):
-                action, state = act(agent, self.observations[step], state, np.zeros_like(start))
-                off = np.where(self.running[step], action[:, 0] - self.actions[step], 0.0)
+                action, state = act(agent, self.observations[step], state, np.zeros_like(start), shape)
+                off = np.where(self.running[step][:, None], action - self.actions[step], 0.0)
                 total += float(np.sum(off * off))
         except Refused:
             return FAR.actions**2
-        return total / float(self.running.sum())
+        return total / float(self.running.sum()) / shape[1]
 
     def _asked_at_once(self, agent: Any) -> float:
         where = np.flatnonzero(self.running.ravel())
         # Evenly over all times and episodes; which episodes these are follows from the nonce.
         where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
         seen = self.observations.reshape(-1, self.observations.shape[-1])[where]
-        action, _ = act(agent, seen, None, np.ones(len(seen), np.bool_))
-        off = action[:, 0].astype(np.float64) - self.actions.ravel()[where]
+        did = self.actions.reshape(-1, self.actions.shape[-1])[where]
+        action, _ = act(agent, seen, None, np.ones(len(seen), np.bool_), did.shape)
+        off = action.astype(np.float64) - did
         return float(np.mean(off * off))
 
 
@@ -125,7 +127,7 @@ class _Watched:
         action, state = self.agent.predict(observation, state, start, deterministic=deterministic)
         self.quick &= state is None
         self.seen.append(np.array(observation))
-        self.done.append(action[:, 0].copy())
+        self.done.append(action.copy())
         return action, state
 
     def watch(self, bare: Any, action: Array, reward: Array, *ends: Array) -> None:

@@ -23,6 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import Field, TypeAdapter
 
 from lag_envs.leaderboard import protocol
@@ -562,9 +563,12 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
     if any(kept[name] != made[name] for name in ("seed", "reset_seed", "dt", "target")):
         return False
     rows = [*zip(kept["states"], made["states"], strict=True)]
-    rows += [(kept[name], made[name]) for name in ("actions", "rewards")]
-    rows.append(([kept["return"]], [made["return"]]))
-    return all(abs(x - y) <= 1e-3 * max(1.0, abs(y)) for a, b in rows for x, y in zip(a, b, strict=True))
+    rows += [(kept[name], made[name]) for name in ("actions", "rewards", "return")]
+    pairs = [(np.array(a, np.float64), np.array(b, np.float64)) for a, b in rows]
+    return all(
+        a.shape == b.shape and bool((np.abs(a - b) <= 1e-3 * np.maximum(1.0, np.abs(b))).all())
+        for a, b in pairs
+    )
 
 
 def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:

@@ -165,16 +165,17 @@ class Board:
             return self._open(state, append)
 
     def _open(self, state: State, append: Callable[..., None]) -> int:
-        from lag_envs.scores import KNOWN_RETURNS
+        from lag_envs.scores import known_returns
 
         known = state.number in state.protocols
         number = state.number + 1 if known or not state.number else state.number
         scales = {
             env_id: {name: getattr(scale, name) for name in ("random", "best", "policy")}
-            for env_id, scale in KNOWN_RETURNS.items()
-            if env_id in protocol.GOALS and not closed(env_id, number, number)
+            for env_id in protocol.boards()
+            if (scale := known_returns(env_id)) and not closed(env_id, number, number)
         }
-        references = {env_id: reference._asdict() for env_id, reference in protocol.REFERENCES.items()}
+        found = {env_id: protocol.reference(env_id) for env_id in protocol.boards()}
+        references = {env_id: reference._asdict() for env_id, reference in found.items() if reference}
         append("protocol", number=number, rules=protocol.rules(), scales=scales, references=references)
         return number
 
@@ -677,9 +678,10 @@ def _environment(
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
-    from lag_envs.scores import KNOWN_RETURNS, Known
+    from lag_envs.scores import Known, known_returns
 
-    known = KNOWN_RETURNS[env_id]._asdict() if env_id in KNOWN_RETURNS else None
+    found = known_returns(env_id)
+    known = found and found._asdict()
     if scale is None:
         return known
     return (known or dict.fromkeys(Known._fields)) | scale.model_dump()

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.board import Board, board_data
-from lag_envs.leaderboard.protocol import GOALS
+from lag_envs.leaderboard.protocol import boards
 from lag_envs.report.docs import replaced
+from lag_envs.tasks import TASKS
 
 #: Rows of each board that README shows.
 TOP = 3
@@ -62,7 +63,8 @@ def _line(environment: str, row: dict[str, Any]) -> list[str]:
 
 def goals() -> str:
     """Return a table of what counts as success."""
-    rows = [(env_id, goal.text[0].upper() + goal.text[1:]) for env_id, goal in GOALS.items()]
+    texts = {env_id: TASKS[env_id].goal.text for env_id in boards()}
+    rows = [(env_id, text[0].upper() + text[1:]) for env_id, text in texts.items()]
     return "\n".join(map(_row, [("environment", "success and time"), ("---", "---"), *rows]))
 
 

@@ -157,8 +157,9 @@ def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str
     policy, space = model.policy, model.action_space
     table: dict[str, Any] = {"architecture": "mlp"}
     discrete = isinstance(space, spaces.Discrete)
-    if not discrete and (space.shape != (1,) or (space.low, space.high) != (-1.0, 1.0)):
-        raise ExportError(f"the action space must be one number in [-1, 1], or Discrete, got {space}")
+    numbers = isinstance(space, spaces.Box) and len(space.shape) == 1
+    if not discrete and not (numbers and (space.low == -1.0).all() and (space.high == 1.0).all()):
+        raise ExportError(f"the action space must be numbers in [-1, 1], or Discrete, got {space}")
     if hasattr(policy, "mlp_extractor"):  # PPO, A2C
         owner, parts = policy, [policy.mlp_extractor.policy_net, policy.action_net]
         squash = "tanh" if policy.squash_output else "clip"
@@ -237,17 +238,17 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     for _ in range(int(protocol.make_task(env_id).limit)):
         seen.append(observation)
         action = act(observation)
-        action[48:] = rng.uniform(-1.0, 1.0, (16, 1))
+        action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))
         observation = envs.step(action)[0]
     envs.close()
     path = rng.permutation(np.concatenate(seen))[:8192]
     far = np.abs(path).max(axis=0)
     both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
-    theirs, ours = act(both)[:, 0], agent.predict(both)[0][:, 0]
-    off = np.abs(theirs.astype(np.float64) - ours)
+    theirs, ours = act(both), agent.predict(both)[0]
+    off = np.abs(theirs.astype(np.float64) - ours).max(axis=1)
     if agent_centres is not None:
         worth = agent.outputs(both.astype(np.float64))
-        chosen = np.abs(agent_centres - theirs[:, None]).argmin(axis=1)
+        chosen = np.abs(agent_centres - theirs).argmin(axis=1)
         lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
         off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
     return float(off.max()), len(both)
@@ -303,8 +304,8 @@ def export(
     """
     known = [s.result for s in sources if s.result]
     env = env or _same("environment", [r.get("env") for r in known], "--env")
-    if env not in protocol.GOALS:
-        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.GOALS)}")
+    if env not in protocol.boards():
+        raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
     if os.path.lexists(folder):
         raise ExportError(f"{folder} is there already; remove it, or choose another place")
     if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):

@@ -22,6 +22,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Fields, shown
 from lag_envs.leaderboard.protocol import Refused
+from lag_envs.tasks import resolve
 
 Array = NDArray[np.float64]
 #: Lengths of an array's axes; a name stands for any length of at least 2, the same wherever it occurs.
@@ -103,7 +105,7 @@ class Agent(ABC):
 
     @abstractmethod
     def act(self, observations: Array) -> Array:
-        """Return actions (n,), not clipped yet, for observations (n, n_observation)."""
+        """Return actions (n, n_actions), not clipped yet, for observations (n, n_observation)."""
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -113,7 +115,7 @@ class Agent(ABC):
         # Whatever overflows ends in an action that is no number, which the verification refuses.
         with np.errstate(all="ignore"):
             actions = np.clip(self.act(np.atleast_2d(values)), -1.0, 1.0)
-        return actions.astype(np.float32).reshape(*values.shape[:-1], 1), state
+        return actions.astype(np.float32).reshape(*values.shape[:-1], -1), state
 
 
 # --- networks -----------------------------------------------------------------------------------------------
@@ -161,7 +163,8 @@ class MLP(Architecture):
         self.squash = "clip" if self.bins else table.choice("squash", ("clip", "tanh"))
         self.mean_limit = 0.0 if self.bins else table.number("mean_limit", 0.0, 1e6, 0.0)
         self.normalise = None
-        widths = [wide, *hidden, self.bins or 1]
+        self.controls = protocol.make_task(env_id).formulas.actions
+        widths = [wide, *hidden, self.controls * (self.bins or 1)]
         self.arrays = {}
         for k, (rows, columns) in enumerate(zip(widths[1:], widths[:-1], strict=True)):
             self.arrays |= {f"weight_{k}": (rows, columns), f"bias_{k}": (rows,)}
@@ -210,8 +213,8 @@ class _Network(Agent):
     def act(self, observations: Array) -> Array:
         x = self.outputs(observations)
         if self.centres is not None:
-            return np.where(np.isfinite(x).all(axis=1), self.centres[x.argmax(axis=1)], math.nan)
-        x = x[:, 0]
+            worth = x.reshape(len(x), self.mlp.controls, -1)
+            return np.where(np.isfinite(worth).all(axis=2), self.centres[worth.argmax(axis=2)], math.nan)
         if self.mlp.mean_limit:
             x = np.clip(x, -self.mlp.mean_limit, self.mlp.mean_limit)
         return np.tanh(x) if self.mlp.squash == "tanh" else x
@@ -220,11 +223,14 @@ class _Network(Agent):
 class Linear(Architecture):
     """Action = gain · observation + offset, clipped to [-1, 1].
 
-    Arrays: ``gain`` (n_observation,) and ``offset`` (1,). `lag-envs info ID` lists the observation.
+    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), or (n_observation, n_actions)
+    and (n_actions,) where an action has several numbers. `lag-envs info ID` lists the observation.
     """
 
     def __init__(self, env_id: str, table: Fields) -> None:
-        self.arrays = {"gain": (len(protocol.make_task(env_id).observation),), "offset": (1,)}
+        task = protocol.make_task(env_id)
+        wide, count = len(task.observation), task.formulas.actions
+        self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
     def agent(self, arrays: Mapping[str, Array]) -> _Feedback:
         """Return the feedback."""
@@ -233,12 +239,13 @@ class Linear(Architecture):
 
 class _Feedback(Agent):
     def __init__(self, gain: Array, offset: Array) -> None:
-        self.gain, self.offset = np.ascontiguousarray(gain[:, None]), np.ascontiguousarray(offset)
+        self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))
+        self.offset = np.ascontiguousarray(offset)
 
     def act(self, observations: Array) -> Array:
         from lag_envs.leaderboard.kernels import affine
 
-        return affine(np.ascontiguousarray(observations), self.gain, self.offset)[:, 0]
+        return affine(np.ascontiguousarray(observations), self.gain, self.offset)
 
 
 # --- tables -------------------------------------------------------------------------------------------------
@@ -266,6 +273,8 @@ class Table(Architecture):
 
     def __init__(self, env_id: str, table: Fields) -> None:
         self.task = protocol.make_task(env_id)
+        if self.task.formulas.actions != 1 or self.task.formulas.targets > 1:
+            raise Refused(f"{table.where}: tables are for tasks with one control and at most one target")
         names = list(self.task.scene.state_names)
         has_target = self.task.target_range is not None
         known = [*names, "time"]
@@ -391,22 +400,24 @@ PLANS = ("opening", "periods")
 class Controller(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
-    In the table: `name`, one of ``lag_envs.controllers.CONTROLLERS[env]``, and the table ``numbers`` of its
+    In the table: `name`, one of the controllers of the task, and the table ``numbers`` of its
     keyword arguments that are numbers, optional. There are no arrays.
     """
 
     def __init__(self, env_id: str, table: Fields) -> None:
-        from lag_envs.controllers import CONTROLLERS
+        from lag_envs.controllers import build, controllers
 
-        makers = CONTROLLERS[env_id]
-        name = table.choice("name", makers)
-        self.maker, self.plans = makers[name], name == "iLQR"
         self.task = protocol.make_task(env_id)
+        known = controllers(self.task)
+        chosen = table.choice("name", known)
+        found = known[chosen]
+        self.build, self.plans = partial(build, self.task, chosen), found.plans
         numbers = table.table("numbers", {})
         self.numbers = {
             name: numbers.number(name, -1e6, 10.0 if name in PLANS else 1e6)
-            for name, parameter in inspect.signature(self.maker).parameters.items()
+            for name, parameter in inspect.signature(resolve(found.place)).parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY
+            and name not in found.numbers
             and re.fullmatch(r"float( \| None)?", str(parameter.annotation))
             and name in numbers
         }
@@ -418,7 +429,7 @@ class Controller(Architecture):
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                return self.maker(self.task, **self.numbers)
+                return self.build(**self.numbers)
         except Exception as error:  # whatever senseless numbers lead to
             reason = shown(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error

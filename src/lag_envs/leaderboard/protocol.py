@@ -9,16 +9,11 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
-
-Array = NDArray[np.float64]
+from lag_envs.tasks.measured import measured
 
 #: Version of ``submission.toml``.
 SCHEMA = 1
@@ -88,7 +83,7 @@ class Reference(NamedTuple):
     Parameters
     ----------
     controller : str
-        One of ``lag_envs.controllers.CONTROLLERS``.
+        Name of the task's controller.
     mean, error : float
         Its mean return in other episodes, and the standard error of that.
     episodes : int
@@ -101,95 +96,15 @@ class Reference(NamedTuple):
     episodes: int
 
 
-#: For each environment in which episodes differ much. ``python -m agents.scale`` measures them anew.
-REFERENCES: dict[str, Reference] = {
-    "PivotedBarBalance-v0": Reference("LQR", 452.49, 0.139, 524_288),
-    "InclineTilt-v0": Reference("cascade", 181.307, 0.025, 524_288),
-    "CylinderInCylinderDamping-v0": Reference("switching line", 366.76, 0.063, 524_288),
-    "InclineBrake-v0": Reference("switching line", -1.72433, 0.00043, 524_288),
-    "CylinderInCylinderTilt-v0": Reference("LQR", 197.634, 0.0025, 524_288),
-    "CylinderInCylinderPump-v0": Reference("energy pump", 141.934, 0.0041, 524_288),
-}
-
-# --- success ------------------------------------------------------------------------------------------------
+def reference(env_id: str) -> Reference | None:
+    """Return an environment's reference; None where episodes differ little, or nobody measured it."""
+    name, found = TASKS[env_id].reference, measured(env_id).get("reference")
+    return Reference(name, **found) if name and found else None
 
 
-class Goal(NamedTuple):
-    """When an episode counts as a success, and when its goal is reached.
-
-    Parameters
-    ----------
-    text : str
-        Both, in words.
-    inside : callable
-        From the task, states (n, n_state) at a step's end and targets (n,) to whether the goal holds, (n,).
-    hold : float or None
-        Seconds before the episode's end from which on the goal must hold without a break. None: it need not.
-    terminated : bool or None
-        Whether the episode must have terminated. None: must not, and reaching the goal does not matter.
-    """
-
-    text: str
-    inside: Callable[[Task, Array, Array], NDArray[np.bool_]]
-    hold: float | None = 1.0
-    terminated: bool | None = False
-
-
-def _upright(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
-    off = np.remainder(states[:, -2], 2.0 * math.pi) - math.pi
-    return np.abs(off) <= 0.2
-
-
-def _near(distance: float) -> Callable[[Task, Array, Array], NDArray[np.bool_]]:
-    return lambda task, states, targets: np.abs(states[:, 0] - targets) <= distance
-
-
-def _gently_across(task: Task, states: Array, targets: Array) -> NDArray[np.bool_]:
-    return (states[:, 0] >= 0.0) & (states[:, 1] <= 0.55)
-
-
-def _swinging(task: Any, states: Array, targets: Array) -> NDArray[np.bool_]:
-    energy, wanted = task.energies(states.T, np)
-    return np.abs(energy - wanted) <= 0.2 * wanted
-
-
-def _at_rest(task: Any, states: Array, targets: Array) -> NDArray[np.bool_]:
-    return states[:, 0] ** 2 + states[:, 1] ** 2 / task.weight() <= 0.1**2
-
-
-_SWING_UP = Goal(
-    "success: within 0.2 rad of upright throughout the last second; time: until it is so for good", _upright
-)
-#: The environments that have a board.
-GOALS: dict[str, Goal] = {
-    "PivotedBar-v0": _SWING_UP,
-    "PivotedBarFree-v0": _SWING_UP,
-    "PivotedBarBalance-v0": Goal(
-        "success: neither the bar nor the support leaves its limits in 10 s; there is no time",
-        lambda task, states, targets: np.zeros(len(states), np.bool_), None, None,
-    ),
-    "InclineTilt-v0": Goal(
-        "success: within 5 cm of the mark throughout the last second; time: until it is so for good",
-        _near(0.05),
-    ),
-    "InclineBrake-v0": Goal(
-        "success: across the line, at 0.55 m/s at most at the end of that step; time: until then",
-        _gently_across, None, True,
-    ),
-    "CylinderInCylinderTilt-v0": Goal(
-        "success: within 0.05 rad of the target throughout the last second; time: until it is so for good",
-        _near(0.05),
-    ),
-    "CylinderInCylinderPump-v0": Goal(
-        "success: energy within 20 % of the wanted one throughout the last second; time: until it is so for "
-        "good",
-        _swinging,
-    ),
-    "CylinderInCylinderDamping-v0": Goal(
-        "success: never loses contact in 10 s; time: until it comes to rest first, √(θ² + θ'²/ω₀²) <= 0.1",
-        _at_rest, None, None,
-    ),
-}  # fmt: skip
+def boards() -> list[str]:
+    """Return the ids that have a board: those whose task has a goal."""
+    return [env_id for env_id, task in TASKS.items() if task.goal is not None]
 
 
 # --- disturbances -------------------------------------------------------------------------------------------
@@ -197,8 +112,7 @@ GOALS: dict[str, Goal] = {
 
 def make_task(env_id: str, **options: Any) -> Task:
     """Return the task of an environment, with parameters that differ from its own."""
-    place, fixed = TASKS[env_id]
-    return load_task(place)(**(fixed | options))
+    return TASKS[env_id](**options)
 
 
 def often(env_id: str) -> dict[str, Any]:
@@ -226,5 +140,5 @@ def rules() -> dict[str, Any]:
         "episodes": EPISODES,
         "disturbed_episodes": DISTURBED_EPISODES,
         "learned_policies": LEARNED_POLICIES,
-        "success": {env_id: goal.text for env_id, goal in GOALS.items()},
+        "success": {env_id: TASKS[env_id].goal.text for env_id in boards()},
     }

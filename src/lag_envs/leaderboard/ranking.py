@@ -105,8 +105,8 @@ def normalised(scale: Scale, returns: ArrayLike) -> Array:
 
     Examples
     --------
-    >>> from lag_envs.scores import KNOWN_RETURNS
-    >>> known = KNOWN_RETURNS["PivotedBarFree-v0"]
+    >>> from lag_envs.scores import known_returns
+    >>> known = known_returns("PivotedBar-v0")
     >>> normalised(known, [known.random, known.best]).tolist()
     [0.0, 1.0]
     """

@@ -43,9 +43,9 @@ class Replay(Strict):
     return_: Number = Field(alias="return")
     dt: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
     states: Annotated[list[list[Number]], Field(min_length=1, max_length=100_000)]
-    actions: list[Number]
+    actions: list[Number] | list[list[Number]]
     rewards: list[Number]
-    target: Number | None
+    target: Number | list[Number] | None
 
     @model_validator(mode="after")
     def _fit(self) -> Self:

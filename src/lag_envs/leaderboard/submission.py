@@ -153,7 +153,7 @@ def about(files: Mapping[str, bytes]) -> About:
         )
     # The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
     top.whole("protocol", 1, 10**6, 1)
-    env = top.choice("env", protocol.GOALS)
+    env = top.choice("env", protocol.boards())
     told: dict[str, Any] = {
         "name": top.text("name", 60, pattern=r".*[A-Za-z0-9].*"),
         "authors": top.texts("authors", 1, 20, 80),

@@ -26,6 +26,7 @@ from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import load_json
 from lag_envs.leaderboard.results import UNPACKED, build, check, compare
 from lag_envs.leaderboard.submission import Refused, Submission, load
+from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
 #: Libraries on which the bits of a trajectory depend.
@@ -114,7 +115,7 @@ def verify(
                 robustness[name].append(mean)
                 skip()
             agent = policy.agent()
-            able = hasattr(agent, "pace") or type(agent).__name__ != "ILQR"
+            able = hasattr(agent, "pace") or not policy.architecture.plans
             often.append(float(play(env, agent, seeds[:more], tick=tick, **faster).mean()) if able else None)
             skip()
         except Refused as error:
@@ -170,11 +171,11 @@ def play(
         watch(bare, returns[:0], returns[:0], running[:0], running[:0], running[:0])
     start = running.copy()
     while running.any():
-        action, state = act(agent, observation, state, start)
+        action, state = act(agent, observation, state, start, envs.action_space.shape)
         observation, reward, terminated, truncated, _ = envs.step(action)
         returns += np.where(running, reward, 0.0)
         if watch is not None:
-            watch(bare, action[:, 0], reward, terminated, truncated, running)
+            watch(bare, action, reward, terminated, truncated, running)
         running &= ~(terminated | truncated)
         start = np.zeros(episodes, np.bool_)
         tick(episodes)
@@ -184,22 +185,25 @@ def play(
 
 def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
     """Return the returns of the environment's reference in the same episodes; nothing where there is none."""
-    if env_id not in protocol.REFERENCES:
+    reference = protocol.reference(env_id)
+    if reference is None:
         return {}
-    from lag_envs.controllers import make_controller
+    from lag_envs.controllers import build
 
-    agent = make_controller(env_id, protocol.REFERENCES[env_id].controller)
+    agent = build(protocol.make_task(env_id), reference.controller)
     return {"reference": play(env_id, agent, seeds).tolist()}
 
 
-def act(agent: Any, observation: Any, state: Any, start: NDArray[np.bool_]) -> tuple[Any, Any]:
+def act(
+    agent: Any, observation: Any, state: Any, start: NDArray[np.bool_], shape: tuple[int, ...] | None = None
+) -> tuple[Any, Any]:
     """Return actions and what the agent remembers; raise Refused where it fails, or acts out of bounds."""
     try:
         with np.errstate(all="ignore"):
             action, state = agent.predict(observation, state, start, deterministic=True)
     except Exception as error:  # whatever senseless numbers lead to
         raise Refused(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
-    if action.shape != (len(observation), 1) or not np.isfinite(action).all():
+    if action.shape != (shape or (len(observation), 1)) or not np.isfinite(action).all():
         raise Refused("it returned an action that is not a finite number")
     return action, state
 
@@ -208,7 +212,9 @@ class _Record:
     """Watches episodes: when the goal is reached, the effort, and a hash of all that happens."""
 
     def __init__(self, env_id: str, episodes: int) -> None:
-        self.goal = protocol.GOALS[env_id]
+        goal = TASKS[env_id].goal
+        assert goal is not None
+        self.goal = goal
         self.hash = hashlib.sha256()
         self.effort, self.steps = np.zeros(episodes), np.zeros(episodes)
         #: Step after which the goal holds for the first time, and without a break; 0 and inf: never.
@@ -218,20 +224,21 @@ class _Record:
     def __call__(
         self, bare: Any, action: Array, reward: Array, terminated: Any, truncated: Any, running: Any
     ) -> None:
-        self.task, targets = bare.task, bare.target
-        states = bare.state
-        inside = self.goal.inside(self.task, states, np.zeros(len(states)) if targets is None else targets)
+        self.task = bare.task
+        inside = self.task.goal_holds(bare.state, bare.target)
         if len(running) == 0:  # the start
             self.first[inside] = 0.0
             self.last[~inside] = 1.0
             return
         self.steps += running
-        self.effort += np.where(running, (bare.control / self.task.limit_control) ** 2, 0.0)
+        self.effort += np.where(running, self.task.effort(bare.control), 0.0)
         self.first = np.where(running & inside, np.minimum(self.first, self.steps), self.first)
         self.last = np.where(running & ~inside, self.steps + 1.0, self.last)
         self.ended |= running & terminated
         for array in (np.asarray(action, "<f4"), np.asarray(reward, "<f8"), terminated, truncated):
-            self.hash.update(np.where(running, array, array.dtype.type(0)).tobytes())
+            # One row for each environment.
+            rows = running.reshape(-1, *(1 for _ in array.shape[1:]))
+            self.hash.update(np.where(rows, array, array.dtype.type(0)).tobytes())
 
     def result(self) -> dict[str, Any]:
         """Return success, time, effort and the hash."""
@@ -320,7 +327,9 @@ def replay(
     ]  # fmt: skip
 
 
-def _rounded(x: Any) -> float:
+def _rounded(x: Any) -> Any:
+    if np.ndim(x):
+        return _rounded(x[0]) if len(x) == 1 else [_rounded(each) for each in x]
     return float(f"{x:.6g}")
 
 
@@ -397,12 +406,13 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:
     """Tell how a result compares with an earlier one; return whether it is too far from it."""
-    from lag_envs.scores import KNOWN_RETURNS
+    from lag_envs.scores import known_returns
 
     if other is None:
         print(f"  {file} has nothing about it")
         return False
-    known = KNOWN_RETURNS[result["env"]]
+    known = known_returns(result["env"])
+    assert known is not None
     try:
         tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
         found = compare(result, other, known.best - known.random, tolerance)
@@ -448,7 +458,6 @@ def _with_bar(folder: Path, nonce: str, episodes: int) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> list[str]:
     """Return a result as lines of text."""
-    from lag_envs.leaderboard.protocol import REFERENCES
     from lag_envs.leaderboard.ranking import corrected, policy_error
     from lag_envs.scores import score
 
@@ -460,7 +469,7 @@ def table(result: dict[str, Any]) -> list[str]:
         f"  {'seed':>6}  {'return':>12}  {'±':>7}  {'score':>7}  {'success':>7}  {'time':>7}  {'effort':>6}",
     ]
     for policy in result["policies"]:
-        reference = REFERENCES.get(env)
+        reference = protocol.reference(env)
         mean = float(corrected(reference, [policy]).mean())
         error = policy_error(reference, [policy])
         times = [t for t in policy["settle"] if t is not None]

@@ -32,6 +32,7 @@ from lag_envs.report.episodes import (
 from lag_envs.report.gymnasium_peers import PEERS, measure, random_episode, watch
 from lag_envs.report.runner import Job, Row
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.pivoted_bar import SwingUpFree
 
 __all__ = ["content", "jobs", "ours", "theirs", "undriven"]
 
@@ -143,13 +144,13 @@ def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
     ``gain`` is the share by which energy above rest grows in 100 s.
     """
     if not id:
-        env: Any = gym.make("PivotedBarFree-v0", disable_env_checker=True, **TWIN, dt=dt)
+        env: Any = gym.make(SwingUpFree.id, disable_env_checker=True, **TWIN, dt=dt)
         env.reset(seed=0, options={"state": [RELEASED, 0.0]})
         episode = play(env, itertools.repeat(np.zeros(1, np.float32)))
         scene = env.unwrapped.scene
         row = against_exact(env.unwrapped.task, first(episode, dt), seed=0)
         energy = scene.energy(episode.states)["total"] - scene.energy([0.0, 0.0])["total"]
-        case = "PivotedBarFree-v0 with Pendulum-v1's equation, undriven"
+        case = f"{SwingUpFree.id} with Pendulum-v1's equation, undriven"
     else:
         peer, (changes, action) = PEERS[id], UNDRIVEN[id]
         env = gym.make(id, disable_env_checker=True).unwrapped

@@ -20,7 +20,6 @@ from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import Flow, pendulum_flow
-from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
 if TYPE_CHECKING:
@@ -95,8 +94,8 @@ def jobs(quick: bool) -> list[Job]:
 
 def terms() -> Iterator[Row]:
     """Yield what the compiled step of every environment carries."""
-    for id, (place, fixed) in TASKS.items():
-        yield {"kind": "terms", "id": id} | carried(load_task(place)(**fixed))
+    for id, task in TASKS.items():
+        yield {"kind": "terms", "id": id} | carried(task())
 
 
 def carried(task: Task) -> Row:

@@ -27,6 +27,7 @@ from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.stepping.series import check_order
+from lag_envs.tasks.record import Controller, Examples, Goal, Optimum, ValueIteration
 
 if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
@@ -81,6 +82,22 @@ class Task:
         Ranges of parameters in which the task can be used, where they are not those that the scene declares.
         Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
         gives finite observations within their space, and every step is taken.
+    controllers : mapping
+        A `record.Controller` for each of its controllers, by name; all have "zero" and "random" too.
+    reference : str
+        A quick controller among them, which takes the luck out of episodes that differ much.
+    hyperparameters : mapping
+        For a learner ("ppo", "sac", "td3", "tqc", "dqn") what differs from `lag_envs.hyperparams.DEFAULTS`.
+    goal : record.Goal, optional
+        When it is solved; tasks of the package that say so have a board.
+    value_iteration : record.ValueIteration, optional
+        The grid on which ``python -m agents.optimum`` solves it.
+    optimum : record.Optimum, optional
+        The largest return from given starts, where it is known.
+    examples : record.Examples
+        Cases for tests and pictures.
+    note : str
+        What docs/agents.md says of its agents, without numbers: the tables have those.
 
     Parameters
     ----------
@@ -106,6 +123,14 @@ class Task:
     scaled: ClassVar[bool] = True
     order: ClassVar[int | None] = None
     usable: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
+    controllers: ClassVar[Mapping[str, Controller]] = MappingProxyType({})
+    reference: ClassVar[str] = ""
+    hyperparameters: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
+    goal: ClassVar[Goal | None] = None
+    value_iteration: ClassVar[ValueIteration | None] = None
+    optimum: ClassVar[Optimum | None] = None
+    examples: ClassVar[Examples] = Examples()
+    note: ClassVar[str] = ""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -178,6 +203,14 @@ class Task:
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
         """Return what a random disturbance adds to entries of the state; draws lie in [0, 1)."""
+        return {}
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the `goal` holds at a step's end."""
+        return False
+
+    def behaviour(self, played: Any) -> Mapping[str, float]:
+        """Return what docs/agents.md tells of episodes (`agents.behaviour.Played`), besides the arrival."""
         return {}
 
     def check(self) -> None:
@@ -349,6 +382,19 @@ class Task:
             if not math.isfinite(value):
                 raise ValueError(f"target {name} must be finite, got {value}")
         return float(array[0]) if len(names) == 1 else array
+
+    def effort(self, control: Any) -> NDArray[np.float64]:
+        """Return the mean square of the controls that actions set, as shares; for (n,) or (n, n_controls)."""
+        columns = [self.scene.control_names.index(a.control) for a in self.formulas.acting]
+        shares = np.reshape(control, (len(control), -1))[:, columns] / np.atleast_1d(self.limit_control)
+        return np.mean(shares**2, axis=1)
+
+    def goal_holds(self, states: ArrayLike, targets: ArrayLike | None = None) -> NDArray[np.bool_]:
+        """Return whether the goal holds at states (n, n_state) with targets (n,) or (n, n_targets)."""
+        array, count = np.asarray(states), self.formulas.targets
+        goals = np.zeros((len(array), count)) if targets is None else np.reshape(targets, (len(array), -1))
+        holds = self.reached(self.formulas._state([*array.T]), self.formulas._targets([*goals.T][:count]), np)
+        return np.broadcast_to(np.asarray(holds, np.bool_), len(array))
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "formulas"}

@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 
+from lag_envs.tasks import load_task
+
 
 def register(task: str | type[Any], *, id: str | None = None, **options: Any) -> str:
     """Register a task with Gymnasium, so that `gym.make` and `gym.make_vec` make it.
@@ -51,6 +53,12 @@ def register(task: str | type[Any], *, id: str | None = None, **options: Any) ->
         kwargs={"task": task, **options},
     )
     return id
+
+
+def make_task(env_id: str, **options: Any) -> Any:
+    """Return the task of an environment that is registered, with parameters that differ from its own."""
+    keywords = gym.spec(env_id).kwargs | options
+    return load_task(keywords.pop("task"))(**keywords)
 
 
 def _place(task: type[Any]) -> str | type[Any]:

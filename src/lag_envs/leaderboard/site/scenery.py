@@ -9,7 +9,7 @@ from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
 from lag_envs.scenes.incline import Incline
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.shapes import Moment
-from lag_envs.tasks import TASKS, load_task
+from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
 
@@ -24,24 +24,22 @@ def describe(env_id: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``title``, ``scene``, ``geometry`` (metres, radians), ``state_names``, ``state_units``, ``start`` (the
-        middle of where episodes start), ``dt`` [s] and ``control`` (name, unit, value at action -1 and 1, and
-        the limit that an arrow is a share of).
+        ``title``, ``scene``, ``geometry`` (metres, radians; None for a scene that the page cannot draw),
+        ``state_names``, ``state_units``, ``start`` (the middle of where episodes start), ``dt`` [s] and
+        ``control`` (name, unit, value at action -1 and 1, and the limit that an arrow is a share of; None
+        where there are several).
         Empty for an id that this version does not have, such as that of a frozen board.
 
     Examples
     --------
-    >>> describe("PivotedBarFree-v0")["state_names"]
-    ['theta', 'theta_dot']
+    >>> describe("PivotedBar-v0")["state_names"]
+    ['s', 's_dot', 'theta', 'theta_dot']
     >>> describe("Gone-v0")
     {}
     """
     if env_id not in TASKS:
         return {}
-    place, fixed = TASKS[env_id]
-    task = load_task(place)(**fixed)
-    (acting,) = task.formulas.acting
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    task = TASKS[env_id]()
     return {
         "title": (inspect.getdoc(type(task)) or env_id).partition("\n")[0],
         "scene": type(task.scene).__name__,
@@ -50,23 +48,23 @@ def describe(env_id: str) -> dict[str, Any]:
         "state_units": list(task.scene.state_units),
         "start": [float(x) for x in task.centre],
         "dt": task.dt,
-        "control": {
-            "name": acting.control,
-            "unit": units[acting.control],
-            "low": acting.low,
-            "high": acting.high,
-            "limit": task.limit_control,
-        },
+        "control": _control(task),
     }
 
 
-def geometry(task: Task) -> dict[str, Any]:
+def _control(task: Task) -> dict[str, Any] | None:
+    if len(task.formulas.acting) != 1:
+        return None
+    (acting,) = task.formulas.acting
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    ends = {"low": acting.low, "high": acting.high, "limit": task.limit_control}
+    return {"name": acting.control, "unit": units[acting.control], **ends}
+
+
+def geometry(task: Task) -> dict[str, Any] | None:
     """Return the numbers from which ``site.js`` draws what `Task.shapes` draws [m, rad].
 
-    Raises
-    ------
-    TypeError
-        For a scene that the page cannot draw.
+    None for another scene: its page has curves, but no picture.
     """
     scene = task.scene
     own: dict[str, Any]
@@ -103,6 +101,6 @@ def geometry(task: Task) -> dict[str, Any]:
             else ([0.0] if amplitude is None else [-amplitude, amplitude]),
         }
     else:
-        raise TypeError(f"the page cannot draw {type(scene).__name__}; add it to scenery.py and site.js")
+        return None
     start = [float(x) for x in task.centre]
     return own | {"window": list(task.window(Moment(start)))}

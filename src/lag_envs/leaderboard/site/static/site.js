@@ -531,7 +531,7 @@
       const over = now.frame >= side.replay.end;
       fill(side, [
         ["Time", `${text(now.time, 2)} s${over ? ", end" : ""}`],
-        ["Action", text(now.action)],
+        ["Action", [now.action].flat().map((v) => text(v)).join(", ")],
         ["Reward", text(now.reward)],
         ["Return", text(now.total, 2)],
         ...board.state_names.map((name, i) => {
@@ -565,7 +565,7 @@
           const now = momentOf(side);
           const states = board.state_names.map((n, i) => `${n.replace("_", " ")} ${text(now.state[i], 2)}`);
           const words = `${"AB"[side.index]}, ${board.rows[side.row].name}, at ${text(now.time, 2)} seconds: ` +
-            `action ${text(now.action, 2)}, reward ${text(now.reward, 2)}, return ${text(now.total, 1)}, ` +
+            `action ${[now.action].flat().map((v) => text(v, 2)).join(", ")}, reward ${text(now.reward, 2)}, return ${text(now.total, 1)}, ` +
             states.join(", ");
           side.canvas.setAttribute("aria-label", words);
           return words;
@@ -723,7 +723,7 @@
     const lane = (height - gap) / 2;
     pen.font = `12px ${getComputedStyle(canvas).fontFamily}`;
     ["actions", "rewards"].forEach((what, i) => {
-      const values = sides.flatMap((side) => (side.replay ? side.replay[what] : [])).filter(isNumber);
+      const values = sides.flatMap((side) => (side.replay ? side.replay[what].flat() : [])).filter(isNumber);
       let [low, high] = what === "actions" ? [-1, 1] : [0, 0];
       for (const v of values) [low, high] = [Math.min(low, v), Math.max(high, v)];
       // One large last reward, such as a penalty, must not flatten all others.
@@ -753,15 +753,20 @@
       pen.clip();
       for (const side of sides) {
         if (!side.replay) continue;
-        const points = [];
-        side.replay[what].forEach((v, j) => {
-          if (isNumber(v)) points.push([x(j * side.replay.dt), y(v)], [x((j + 1) * side.replay.dt), y(v)]);
-        });
+        const rows = side.replay[what].map((v) => [v].flat());
         pen.strokeStyle = ink.series[side.row % COLOURS];
         pen.lineWidth = 1.4;
         pen.setLineDash(side.index ? [4, 2] : []);
-        trace(pen, points, false);
-        pen.stroke();
+        // A line for each number of an action.
+        (rows[0] ?? []).forEach((_, k) => {
+          const points = [];
+          rows.forEach((row, j) => {
+            const v = row[k];
+            if (isNumber(v)) points.push([x(j * side.replay.dt), y(v)], [x((j + 1) * side.replay.dt), y(v)]);
+          });
+          trace(pen, points, false);
+          pen.stroke();
+        });
       }
       pen.restore();
     });
@@ -781,7 +786,7 @@
       const j = names.indexOf(name === "x" && !names.includes("x_dot") ? "w" : `${name}_dot`);
       if (j >= 0) found.push([i, j]);
     });
-    // InclineTilt's plane and the shell's rate: what is left is drawn against the first coordinate.
+    // The tilt of a plane and the shell's rate: what is left is drawn against the first coordinate.
     const labels = (value?.axes ?? []).map((axis) => String(axis.label).replace(/\s*[[(].*$/, ""));
     const own = labels.map((label) => names.findIndex((name) => name === label || symbol(name) === label));
     if (own.length === 2 && own.every((i) => i >= 0) && !found.some(([i, j]) => i === own[0] && j === own[1])) {

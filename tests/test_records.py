@@ -1,0 +1,97 @@
+"""One record per environment: its id stands in one file, and nothing is told of it anywhere else."""
+
+import re
+import subprocess
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from lag_envs import scenes
+from lag_envs.controllers import build, controllers
+from lag_envs.hyperparams import DEFAULTS, learners
+from lag_envs.tasks import TASKS, find
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.measured import measured
+
+ROOT = Path(__file__).parents[1]
+#: The example of help texts, and of tests of what has nothing to do with an environment.
+EXAMPLE = "PivotedBar-v0"
+BY_HAND = (".py", ".toml", ".yml", ".yaml", ".js", ".html", ".cpp", "Makefile")
+#: What commands write, and submissions.
+GENERATED = ("leaderboard/submissions/", "leaderboard/results/", "agents/results/", "docs/", "tests/golden/")
+
+each_task = pytest.mark.parametrize("env_id", TASKS)
+
+
+def files():
+    """Return the files that somebody wrote."""
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    found = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
+    return [
+        name
+        for name in found
+        if name.endswith(BY_HAND) and not name.startswith(GENERATED) and (ROOT / name).is_file()
+    ]
+
+
+def test_an_id_stands_in_two_files_at_most():
+    named = defaultdict(set)
+    for name in files():
+        for env_id in re.findall(r"[A-Za-z]+-v\d+", (ROOT / name).read_text(encoding="utf-8")):
+            named[env_id].add(name)
+    for env_id, task in TASKS.items():
+        assert f"src/{task.__module__.replace('.', '/')}.py" in named[env_id]
+        assert len(named[env_id]) <= 2 or env_id == EXAMPLE, named[env_id]
+
+
+def test_no_id_is_put_together():
+    """No string is what comes before the version; only a class without an id gets one made of its name."""
+    stems = "|".join({re.sub(r"-v\d+$", "", env_id) for env_id in TASKS} - set(scenes.__all__))
+    made = {"src/lag_envs/own_files.py", "src/lag_envs/tasks/registration.py", "tests/test_own_files.py"}
+    made.add("tools/libraries/minari_replay.py")  # a data set
+    for name in files():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert not re.search(rf"[\"'](?:{stems})[\"']", text), name
+        assert name in made or not re.search(r"\}-v\d+[\"']|[\"']-v\d+[\"']", text), name
+
+
+def test_tasks_are_found():
+    """Reading the files finds what importing them would: every task with an id, in its module."""
+    places = find(Path(ROOT, "src/lag_envs/tasks"), "lag_envs.tasks.")
+    assert places == TASKS.data
+    assert next(iter(TASKS)) == EXAMPLE
+    for env_id, task in TASKS.items():
+        assert task.id == env_id and issubclass(task, Task)
+
+    def below(kind):
+        return {kind, *(one for sub in kind.__subclasses__() for one in below(sub))}
+
+    own = {kind for kind in below(Task) if kind.__module__.startswith("lag_envs.tasks.")}
+    assert {kind.id for kind in own if "id" in vars(kind) and kind.id} == set(TASKS)
+
+
+@each_task
+def test_records_are_whole(env_id):
+    task = TASKS[env_id]
+    assert task.goal and task.goal.text.startswith("success: ") and "time" in task.goal.text
+    assert task.value_iteration and task.note and task.examples.start and task.examples.batch
+    assert set(task.hyperparameters) <= set(learners())
+    for learner, own in task.hyperparameters.items():
+        common = {name for name in own if own[name] == DEFAULTS[learner].get(name)}
+        assert not common, f"{learner}: {common} are the general ones"
+    known = controllers(task)
+    assert not task.reference or not known[task.reference].plans
+    for name, found in known.items():
+        assert build(task(), name) is not None
+        assert all(low < high for low, high in found.tune.values())
+
+
+@each_task
+def test_what_was_measured_is_there(env_id):
+    found = measured(env_id)
+    assert {"random", "zero", found["scale"]["policy"]} <= set(found["measured"])
+    assert ("reference" in found) == bool(TASKS[env_id].reference)
+    assert ("optimum" in found["scale"]) == ("optimum" in found["measured"]) == bool(TASKS[env_id].optimum)
+    for row in found["measured"].values():
+        assert row["episodes"] >= 1000 and row["error"] >= 0.0
