@@ -52,7 +52,7 @@ from lag_envs.leaderboard.log import (
 from lag_envs.leaderboard.results import apart, build, compare
 
 if TYPE_CHECKING:
-    from lag_envs.leaderboard.submission import About, Submission
+    from lag_envs.leaderboard.submission import About
 
 #: What a release knows of the repository's board.
 PIN = Path(__file__).with_name("pin.json")
@@ -504,11 +504,6 @@ def _load(board: Board, entry: Entry) -> Any:
     return submission if submission.digest == entry.digest else None  # otherwise that is told already
 
 
-def _tolerance(submission: Submission) -> float:
-    """Return how far its episodes may lie apart on another build, relative to the way."""
-    return protocol.PLANNED if submission.architecture.plans else protocol.TOLERANCE
-
-
 def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
     """Play some episodes of each policy again, which nobody can foresee, and those that were recorded."""
     from lag_envs.leaderboard.submission import Refused
@@ -523,7 +518,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
         odd: list[str] = []
         # On another build, one of so few may be another episode altogether.
         tolerated = int(result.get("build") != build())
-        tolerance = _tolerance(submission)
+        plans = submission.architecture.plans
         for number, policy in enumerate(result["policies"]):
             chosen = draw.sample(range(result["episodes"]), min(SAMPLE, result["episodes"]))
             if number == middle:
@@ -540,10 +535,10 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
             }
             odd += [
                 f"other {name} than episodes {chosen} of seed {policy['seed']} have"
-                for name, share in apart(kept, again, way, tolerance).items()
+                for name, share in apart(kept, again, way, plans).items()
                 if round(share * len(chosen)) > tolerated
             ]
-            if number == middle and result.get("build") is not None and tolerance == protocol.TOLERANCE:
+            if number == middle and result.get("build") is not None and not plans:
                 made = {episode["reset_seed"]: episode for episode in episodes}
                 odd += [
                     f"another recorded episode ({told['label']}) than is played"
@@ -583,7 +578,7 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
             continue
         try:
             again = verify(submission, entry.nonce, result["episodes"])
-            compared = compare(result, again, way, _tolerance(submission))
+            compared = compare(result, again, way, submission.architecture.plans)
         except (Refused, ValueError) as error:
             finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
             continue

@@ -195,7 +195,7 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    result: Mapping[str, Any], other: Mapping[str, Any], way: float, tolerance: float = protocol.TOLERANCE
+    result: Mapping[str, Any], other: Mapping[str, Any], way: float, plans: bool = False
 ) -> Comparison:
     """Compare two verifications of the same submission with the same nonce and number of episodes.
 
@@ -205,8 +205,8 @@ def compare(
         What `verify` returned.
     way : float
         From the mean return of random actions to that of the best policy known.
-    tolerance : float
-        How far episodes may lie apart, relative to the way.
+    plans : bool
+        Whether it searches for a plan in each episode, see `protocol.PLANNED`.
 
     Raises
     ------
@@ -224,10 +224,11 @@ def compare(
     if difference > protocol.TOLERANCE:
         far.append(f"mean returns by {difference:.1e} of the scale")
     for a, b in pairs:
-        for name, share in apart(a, b, way, tolerance).items():
+        for name, share in apart(a, b, way, plans).items():
             if share > protocol.APART:
                 far.append(f"the {name} of {share:.1%} of the episodes of seed {a['seed']}")
     # One episode of a hundred may be another one altogether.
+    tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
     few = tolerance * max(1.0, result["episodes"] / protocol.DISTURBED_EPISODES)
     conditions = {**result["robustness"], "acting often": result["often"]}
     others = {**other["robustness"], "acting often": other["often"]}
@@ -249,9 +250,14 @@ def compare(
 
 
 def apart(
-    policy: Mapping[str, Any], other: Mapping[str, Any], way: float, tolerance: float = protocol.TOLERANCE
+    policy: Mapping[str, Any], other: Mapping[str, Any], way: float, plans: bool = False
 ) -> dict[str, float]:
-    """Return the share of episodes that differ in their returns, success, times and efforts."""
+    """Return the share of episodes that differ in their returns, success, times and efforts.
+
+    Another plan that is as good takes another time and effort: of one who plans the means are compared, and
+    the share is 0 or 1.
+    """
+    tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
 
     def share(name: str, most: float) -> float:
         a, b = policy.get(name), other.get(name)
@@ -259,12 +265,21 @@ def apart(
             return float(a is not b)
         return float(np.mean(~_close(a, b, most)))
 
+    def taken(name: str, most: float) -> float:
+        a, b = policy.get(name), other.get(name)
+        if not plans or a is None or b is None or len(a) != len(b):
+            return share(name, most)
+        differences = [x - y for x, y in zip(a, b, strict=True) if x is not None and y is not None]
+        # Of few episodes one may be another one altogether.
+        most *= max(1.0, protocol.DISTURBED_EPISODES / max(1, len(differences)))
+        return float(bool(differences) and abs(np.mean(differences)) > most)
+
     return {
         "returns": share("returns", tolerance * way),
         "reference's returns": share("reference", protocol.TOLERANCE * way),
         "successes": share("success", 0.0),
-        "times": share("settle", 0.1),
-        "efforts": share("effort", tolerance),
+        "times": taken("settle", 0.1),
+        "efforts": taken("effort", tolerance),
     }
 
 

@@ -414,8 +414,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
     known = known_returns(result["env"])
     assert known is not None
     try:
-        tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
-        found = compare(result, other, known.best - known.random, tolerance)
+        found = compare(result, other, known.best - known.random, plans)
     except ValueError as error:
         raise UserError(f"--against: {file}: {error}") from error
     if found.same:
