@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, Neighbours, claimed, others, shown_episodes
-from lag_envs.leaderboard.fields import plain, shown
+from lag_envs.leaderboard.fields import Strict, checked, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     COMMIT,
@@ -42,8 +42,6 @@ from lag_envs.leaderboard.log import (
     Line,
     Protocol,
     State,
-    Strict,
-    checked,
     fold,
     load_json,
     parse,
@@ -179,7 +177,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     found = Finding("pin")
     path = file or PIN
     try:
-        pin = checked(TypeAdapter(Pin), load_json(read_plain(path, MOST)))
+        pin = checked(Pin, load_json(read_plain(path, MOST)))
     except FileNotFoundError:
         if file is not None:
             found.wrong.append(f"{path} is missing")
