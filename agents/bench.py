@@ -23,7 +23,6 @@ from lag_envs.benchmark import (
     Contestant,
     Run,
     batch,
-    columns,
     machine,
     measure,
     quartiles,
@@ -31,6 +30,7 @@ from lag_envs.benchmark import (
     ratios,
     short,
 )
+from lag_envs.tables import columns
 
 ENV = "PivotedBar-v0"
 SIZES = (1, 16, 64, 256)

@@ -28,6 +28,7 @@ from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError,
 from lag_envs import TASKS
 from lag_envs.leaderboard.spread import SpreadError, check_address
 from lag_envs.own_files import is_file
+from lag_envs.tables import columns
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -391,11 +392,12 @@ def summarise(runs: Sequence[Run]) -> None:
         if not results:
             continue
         print(f"\n{env}, {algo}, {EPISODES} fresh episodes each")
-        print(f"{'seed':>6}{'steps':>12}{'seconds':>9}{'return':>10}{'score':>8}")
+        rows = [("seed", "steps", "seconds", "return", "score")]
         for run, result in results:
-            tail = "" if result["score"] is None else f"{result['score']:8.3f}"
+            tail = "" if result["score"] is None else f"{result['score']:.3f}"
             trained, seconds, mean = result["trained"], result["wall_seconds"], result["mean_return"]
-            print(f"{run.seed:6}{trained:12,}{seconds:9.1f}{mean:10.2f}{tail}")
+            rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", f"{mean:.2f}", tail))
+        print("\n".join(columns(rows)))
         print(f"Written to {results[0][0].folder.parent}/")
 
 

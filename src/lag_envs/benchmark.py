@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 import lag_envs
 from lag_envs.own_files import registered
+from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -751,24 +752,6 @@ def to_json(report: dict[str, Any]) -> str:
     """Return a report as JSON, with lists of numbers on a line."""
     text = json.dumps(report, indent=1, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
-
-
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align the rows' cells; what looks like a number goes to the right.
-
-    Examples
-    --------
-    >>> columns([("a", "1"), ("bc", "23")])
-    ['a    1', 'bc  23']
-    """
-    widths = [max(len(row[j]) for row in rows if j < len(row)) for j in range(max(map(len, rows)))]
-    return [
-        "  ".join(
-            cell.rjust(width) if re.fullmatch(r"[\d.,]+( [kMG])?", cell) else cell.ljust(width)
-            for cell, width in zip(row, widths, strict=False)
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def short(value: float) -> str:

@@ -11,9 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lag_envs.benchmark import columns, machine
+from lag_envs.benchmark import machine
 from lag_envs.report.content import Content
 from lag_envs.report.runner import Result, module, run_jobs, versions
+from lag_envs.tables import columns
 
 #: Modules of this package, in the order of the page.
 SECTIONS = ("environments", "work_precision", "general", "bound", "stability", "conservation", "leave_out")
