@@ -17,7 +17,6 @@ from typing import Any
 
 from agents.analysis import rounded
 from agents.results import to_json
-from agents.run import write
 from lag_envs.benchmark import (
     ONE_THREAD,
     Contestant,
@@ -30,6 +29,7 @@ from lag_envs.benchmark import (
     ratios,
     short,
 )
+from lag_envs.store import write
 from lag_envs.tables import columns
 
 ENV = "PivotedBar-v0"

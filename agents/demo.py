@@ -20,9 +20,11 @@ import numpy as np
 
 from agents.evaluate import evaluate
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
-from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env, write
+from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env
 from agents.train import command, follow, processes
 from lag_envs.scores import known_returns, score
+from lag_envs.store import write
+from lag_envs.tables import columns
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
@@ -114,7 +116,6 @@ def open_run(args: argparse.Namespace) -> Run:
 def report(run: Run, video: bool) -> None:
     """Compare the policy with other agents; write results, picture and video, print a table."""
     from lag_envs.controllers import build, controllers
-from lag_envs.tables import columns
 
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())

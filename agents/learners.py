@@ -32,11 +32,11 @@ from agents.run import (
     UserError,
     check_name,
     read_result,
-    write,
 )
 from lag_envs import __version__
 from lag_envs.hyperparams import DISCRETISE
 from lag_envs.scores import known_returns, score
+from lag_envs.store import write
 from lag_envs.tasks.registration import make_task
 
 #: Where each learner's class is.

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
 from agents.evaluate import observation_spread
 from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, write
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env
 from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
 from lag_envs.scores import known_returns
+from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"

@@ -8,7 +8,6 @@ folder.
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import Any
 
 from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
+from lag_envs.store import write
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
@@ -121,8 +121,8 @@ class Run:
 
     def foreign(self) -> bool:
         """Tell whether the folder holds files that are not the run's."""
-        ours = ("tensorboard", CHECKPOINT + ".part")
-        return self.folder.exists() and any(f.name not in ours for f in self.folder.iterdir())
+        found = self.folder.iterdir() if self.folder.exists() else ()
+        return any(f.name != "tensorboard" and not f.name.endswith(".part") for f in found)
 
     def remove(self) -> None:
         """Remove the run's files, and no others."""
@@ -151,18 +151,6 @@ def read_result(file: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} cannot be read ({error}); remove it, or start anew with --new") from error
     return content
-
-
-def write(file: Path, data: bytes | str) -> None:
-    """Write a file whole or not at all."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(file.name + ".part")
-    try:
-        part.write_bytes(data.encode() if isinstance(data, str) else data)
-        os.replace(part, file)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def check_env(env_id: str) -> str:

@@ -24,10 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
-from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_name, own_env, write
+from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_name, own_env
 from lag_envs import TASKS
 from lag_envs.leaderboard.spread import SpreadError, check_address
 from lag_envs.own_files import is_file
+from lag_envs.store import write
 from lag_envs.tables import columns
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:

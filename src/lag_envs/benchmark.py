@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 
 import lag_envs
 from lag_envs.own_files import registered
+from lag_envs.store import write
 from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 
@@ -742,10 +743,10 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
     from lag_envs.report.docs import replaced
 
-    (checkout / "docs" / "speed.json").write_text(to_json(report), encoding="utf-8")
+    write(checkout / "docs" / "speed.json", to_json(report))
     readme = checkout / "README.md"
     text = replaced(readme.read_text(encoding="utf-8"), "bench", markdown(report))
-    readme.write_text(replaced(text, "fast", claim(report)), encoding="utf-8")
+    write(readme, replaced(text, "fast", claim(report)))
 
 
 def to_json(report: dict[str, Any]) -> str:

@@ -362,13 +362,13 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
 
     def call(given: Any) -> Any:
         for package in (
-            "confusable_homoglyphs", "jinja2", "pydantic", "safetensors", "scipy", "sympy", "tqdm",
+            "confusable_homoglyphs", "jinja2", "pebble", "pydantic", "safetensors", "scipy", "sympy", "tomli_w", "tqdm",
         ):  # fmt: skip
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
         from lag_envs.leaderboard.board import BoardError
-        from lag_envs.leaderboard.spread import SpreadError
         from lag_envs.leaderboard.submission import Refused
+        from lag_envs.workers import SpreadError
 
         try:
             return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)

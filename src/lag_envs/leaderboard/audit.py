@@ -48,6 +48,7 @@ from lag_envs.leaderboard.log import (
     read_log,
 )
 from lag_envs.leaderboard.results import apart, build, compare
+from lag_envs.store import write
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About, Submission
@@ -168,7 +169,7 @@ def write_pin(board: Board, file: Path) -> Pin:
     if not log:
         raise BoardError(f"{board.log} is empty; there is nothing to pin")
     pin = pin_of(log)
-    file.write_text(json.dumps(pin.model_dump(), indent=2) + "\n", encoding="utf-8")
+    write(file, json.dumps(pin.model_dump(), indent=2) + "\n")
     return pin
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from types import SimpleNamespace
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from lag_envs.mechanics.recording import Values, twin
 from lag_envs.report import reference
 from lag_envs.scenes.base import Scene
+from lag_envs.store import write
 
 Array = NDArray[np.float64]
 #: Bits of the arithmetic, coefficients of a series, and digits to which two computations have to agree.
@@ -371,7 +371,5 @@ def ends(scene: Scene, states: Array, controls: Array, dt: float) -> tuple[Array
     high = np.array([[float(x) for x in row] for row in found]).reshape(states.shape)
     low = np.array([[float(x - float(x)) for x in row] for row in found]).reshape(states.shape)
     if file:
-        part = file.with_suffix(f".{os.getpid()}")
-        part.write_text(json.dumps([high.tolist(), low.tolist()]), encoding="utf-8")
-        part.replace(file)
+        write(file, json.dumps([high.tolist(), low.tolist()]))
     return high, low

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from math import ceil, log10
@@ -33,6 +32,7 @@ from lag_envs.mechanics.recording import parameter
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum as pendulum_stepping
 from lag_envs.stepping import slope as slope_stepping
+from lag_envs.store import write
 
 MAX_STEPS = 20_000
 
@@ -349,9 +349,7 @@ def remembered(scene: Scene, state: Sequence[float], control: float, dt: float) 
             return [mpf(text) for text in json.loads(file.read_text(encoding="utf-8"))]
         end = flow(scene, state, control, dt)
         if file:
-            part = file.with_suffix(f".{os.getpid()}")
-            part.write_text(json.dumps([mp.nstr(x, 40) for x in end]), encoding="utf-8")
-            part.replace(file)
+            write(file, json.dumps([mp.nstr(x, 40) for x in end]))
         return end
 
 
