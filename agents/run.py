@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Iterable
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -191,3 +194,20 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     if name in known:
         return name
     raise UserError(f"there is no {kind} {name!r}; {hint(name, known)}")
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

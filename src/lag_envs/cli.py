@@ -362,7 +362,8 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
 
     def call(given: Any) -> Any:
         for package in (
-            "confusable_homoglyphs", "jinja2", "pebble", "pydantic", "safetensors", "scipy", "sympy", "tomli_w", "tqdm",
+            "confusable_homoglyphs", "jinja2", "pebble", "pydantic", "safetensors", "scipy", "sympy",
+            "tomli_w", "tqdm",
         ):  # fmt: skip
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
