@@ -392,7 +392,7 @@ class Check:
         if submission.digest != digest:
             raise Refused("its files are not those that were added")
         check_twins(submission, nonce)
-        result = verify(submission, nonce, progress=progress)
+        result = verify(submission, nonce, protocol.EPISODES, progress)
         # What the board cannot keep fails here, and costs nobody else.
         return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
 
