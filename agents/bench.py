@@ -17,13 +17,11 @@ from typing import Any
 
 from agents.analysis import rounded
 from agents.results import to_json
-from agents.run import write
 from lag_envs.benchmark import (
     ONE_THREAD,
     Contestant,
     Run,
     batch,
-    columns,
     machine,
     measure,
     quartiles,
@@ -31,6 +29,8 @@ from lag_envs.benchmark import (
     ratios,
     short,
 )
+from lag_envs.store import write
+from lag_envs.tables import columns
 
 ENV = "PivotedBar-v0"
 SIZES = (1, 16, 64, 256)

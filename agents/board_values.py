@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from agents.optimum import DEFAULT_FOLDER, Solution, solvable
-from agents.run import UserError, check_env, write
+from agents.run import UserError, check_env
 from lag_envs import TASKS
+from lag_envs.store import write
 
 POINTS = 61  #: along each axis
 

@@ -20,9 +20,11 @@ import numpy as np
 
 from agents.evaluate import evaluate
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
-from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env, write
+from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env
 from agents.train import command, follow, processes
 from lag_envs.scores import known_returns, score
+from lag_envs.store import write
+from lag_envs.tables import columns
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
@@ -140,11 +142,12 @@ def report(run: Run, video: bool) -> None:
     write(run.path("comparison.json"), json.dumps(comparison, indent=1) + "\n")
 
     print(f"\nReturns over {EPISODES} fresh episodes of {run.env}")
-    print(f"{'':22}{'mean':>9}{'lowest':>9}{'highest':>9}{'score':>8}")
+    rows = [("", "mean", "lowest", "highest", "score")]
     for name, r in sorted(returns.items(), key=lambda item: -item[1].mean()):
         part = score(run.env, r.mean())
-        tail = "" if part is None else f"{part:8.3f}"
-        print(f"{name:22}{r.mean():9.2f}{r.min():9.2f}{r.max():9.2f}{tail}")
+        tail = "" if part is None else f"{part:.3f}"
+        rows.append((name, f"{r.mean():.2f}", f"{r.min():.2f}", f"{r.max():.2f}", tail))
+    print("\n".join(columns(rows)))
     if known := known_returns(run.env):
         ends = f"0 for the random policy ({known.random:g}), 1 for the best known ({known.best:g})"
         print(f"The score is {ends}.")

@@ -1,4 +1,4 @@
-"""Learners of Stable-Baselines3: hyperparameters, environments, training that can be broken off, policies."""
+"""Learners of Stable-Baselines3: hyperparameters, environments, interruptible training, policies."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import math
 import os
 import pickle
 import platform
-import random
 import time
 from collections.abc import Callable
 from copy import deepcopy
@@ -32,11 +31,11 @@ from agents.run import (
     UserError,
     check_name,
     read_result,
-    write,
 )
 from lag_envs import __version__
 from lag_envs.hyperparams import DISCRETISE
 from lag_envs.scores import known_returns, score
+from lag_envs.store import write
 from lag_envs.tasks.registration import make_task
 
 #: Where each learner's class is.
@@ -175,84 +174,43 @@ def make_model(run: Run, envs: Any) -> Any:
 # --- checkpoints --------------------------------------------------------------------------------------------
 
 
-def freeze(model: Any) -> dict[str, Any]:
-    """Return all that decides how training goes on: learner, environments, memory, random numbers."""
-    import torch
-
+def freeze(model: Any) -> dict[str, bytes]:
+    """Return what Stable-Baselines3 keeps of a training: learner, normalisation, replay buffer."""
     file = io.BytesIO()
     model.save(file)
-    return {
-        "model": file.getvalue(),
-        "envs": pickle.dumps([_own(layer) for layer in _layers(model.get_env())]),
-        "buffer": pickle.dumps(getattr(model, "replay_buffer", None)),
-        "noise": [(d.exploration_mat, d.exploration_matrices) for d in _explorers(model.policy)],
-        "random": (random.getstate(), np.random.get_state(), torch.get_rng_state()),  # noqa: NPY002
-        "actions": model.action_space.np_random.bit_generator.state,
-    }
+    parts = model.get_vec_normalize_env(), getattr(model, "replay_buffer", None)
+    return {"model": file.getvalue(), "rest": pickle.dumps(parts)}
 
 
-def thaw(run: Run, content: dict[str, Any]) -> Any:
-    """Return the learner of a checkpoint; `restore` puts back what the beginning of training changes."""
+def thaw(run: Run, content: dict[str, bytes]) -> Any:
+    """Return the learner of a checkpoint, in new environments."""
     import torch
 
     torch.set_num_threads(1)
     envs = make_envs(run)
     try:
-        for layer, state in zip(_layers(envs), pickle.loads(content["envs"]), strict=True):
-            vars(layer).update(state)
+        normalise, buffer = pickle.loads(content["rest"])
+        if normalise is not None:
+            normalise.set_venv(envs.venv)
+            envs = normalise
         log = str(run.path("tensorboard"))
         model = learner(run.algo).load(
-            io.BytesIO(content["model"]), env=envs, device="cpu", force_reset=False, tensorboard_log=log
+            io.BytesIO(content["model"]), env=envs, device="cpu", tensorboard_log=log
         )
-        buffer = pickle.loads(content["buffer"])
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
         raise UserError(f"{run.path(CHECKPOINT)} cannot be read ({reason}); --new starts anew") from error
     if buffer is not None:
         model.replay_buffer = buffer
+    model.set_random_seed(run.seed + run.trained)
     return model
-
-
-def restore(model: Any, content: dict[str, Any]) -> None:
-    """Put the random numbers back to where they were, as the last thing before training goes on."""
-    import torch
-
-    for d, (one, many) in zip(_explorers(model.policy), content["noise"], strict=True):
-        d.exploration_mat, d.exploration_matrices = one, many
-    ours, numpys, torchs = content["random"]
-    random.setstate(ours)
-    np.random.set_state(numpys)  # noqa: NPY002
-    torch.set_rng_state(torchs)
-    model.action_space.np_random.bit_generator.state = content["actions"]
-
-
-def _layers(envs: Any) -> list[Any]:
-    """Return the vector environment and its wrappers, the outermost first."""
-    layers = [envs]
-    while hasattr(layers[-1], "venv"):
-        layers.append(layers[-1].venv)
-    return layers
-
-
-def _own(layer: Any) -> dict[str, Any]:
-    """Return a wrapper's own attributes, without the class's that Stable-Baselines3 keeps there too."""
-    return {k: v for k, v in vars(layer).items() if k not in ("venv", "class_attributes")}
-
-
-def _explorers(policy: Any) -> list[Any]:
-    """Return the distributions whose exploration noise is kept for some steps (gSDE)."""
-    owners = (policy, getattr(policy, "actor", None))
-    found = [getattr(owner, "action_dist", None) for owner in owners]
-    return [d for d in found if hasattr(d, "exploration_mat")]
 
 
 # --- training -----------------------------------------------------------------------------------------------
 
 
-def train(
-    run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None], stop: Callable[[], bool]
-) -> bool:
-    """Train a run as far as it has not been trained; return whether it is finished.
+def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
+    """Train a run as far as it has not been trained, and write its result.
 
     Parameters
     ----------
@@ -262,40 +220,31 @@ def train(
         Called often, with the run.
     tested : callable
         Called when the policy was tested and a checkpoint written.
-    stop : callable
-        Tells whether to write a checkpoint and end.
     """
     from stable_baselines3.common.callbacks import BaseCallback
 
     content = run.load_checkpoint()
-    if content is None:
-        model = make_model(run, make_envs(run))
-        model.get_env().reset()  # compiles
-        # Another seed has other episodes from the first to the last.
-        model.get_env().seed(1_000_000 * run.seed % FIRST_FRESH_SEED)
-    else:
-        model = thaw(run, content)
+    model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
+    model.get_env().reset()  # compiles
+    # Another seed has other episodes from the first to the last, and so has one that goes on.
+    model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
     started, before = time.perf_counter(), run.seconds
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
-        """Test and save now and then, and end the training when asked to."""
+        """Test and save now and then."""
 
-        frozen = content
         last = run.trained
 
         def _on_step(self) -> bool:
             run.trained = self.num_timesteps
             run.seconds = before + time.perf_counter() - started
             show(run)
-            return not stop()
+            return True
 
         def _on_rollout_start(self) -> None:
             # Here the roll-out before has been learnt from.
-            if self.frozen is not None:
-                restore(self.model, self.frozen)
-                self.frozen = None
-            elif not run.curve or self.num_timesteps - self.last >= every:
+            if not run.curve or self.num_timesteps - self.last >= every:
                 self.keep()
 
         def keep(self) -> None:
@@ -315,11 +264,8 @@ def train(
         model.learn(
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
         )
-        if stop() and run.trained < run.steps:
-            return False  # what was learnt since the last checkpoint is learnt again
         watch.keep()
     finish(run, model)
-    return True
 
 
 def finish(run: Run, model: Any) -> None:

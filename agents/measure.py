@@ -7,6 +7,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from agents.analysis import NOMINAL, OFTEN, Data, rounded
 from agents.evaluate import Sensor, evaluate_batch
 from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
-from lag_envs import TASKS, __version__, controllers
+from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.leaderboard import protocol
 
 AGENTS = Path(__file__).parent
@@ -216,24 +217,14 @@ class Store:
     def __init__(self, file: Path) -> None:
         self.file = file
         self.returns: dict[str, list[float]] = {}
-        lines = file.read_bytes().splitlines() if file.exists() else []
-        for line in lines:
-            try:
-                row = json.loads(line)
+        for row in store.rows(file):
+            with suppress(ValueError, KeyError, TypeError):  # damaged
                 self.returns[row["key"]] = [float(x) for x in row["returns"]]
-            except (ValueError, KeyError, TypeError):  # broken off, or damaged
-                continue
 
     def add(self, key: str, about: Data, returns: NDArray) -> None:
         """Keep a measurement."""
         row = {"key": key, **about, "returns": rounded(returns.tolist())}
-        self.file.parent.mkdir(parents=True, exist_ok=True)
-        with self.file.open("ab+") as out:
-            if out.tell():
-                out.seek(-1, 2)
-                broken = out.read(1) != b"\n"
-                out.write(b"\n" * broken)
-            out.write(json.dumps(row).encode() + b"\n")
+        store.append(self.file, row)
         self.returns[key] = row["returns"]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agents.evaluate import evaluate_batch
-from agents.run import FIRST_FRESH_SEED, UserError, check_env, write
+from agents.run import FIRST_FRESH_SEED, UserError, check_env
 from agents.value_iteration import (
     CacheError,
     Grid,
@@ -36,6 +36,7 @@ from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
 from lag_envs.controllers.basic import Reader
 from lag_envs.envs.model import Model
+from lag_envs.store import write
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Axis, ValueIteration

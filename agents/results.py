@@ -10,24 +10,21 @@ import datetime
 import errno
 import json
 import re
-import signal
 import sys
-import threading
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import NDArray
 
 from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
 from agents.evaluate import observation_spread
 from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, write
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
 from lag_envs.benchmark import machine
 from lag_envs.scores import known_returns
+from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
@@ -84,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UserError(f"--episodes must lie between 1 and 1000000, got {episodes}")
         if not args.new:
             load_summary(output)  # better now than when all is measured
-        with _terminable():
+        with terminable():
             broken, parts = measure_all(envs, args.agents, args.runs, episodes)
             # Only now: another command may have written it meanwhile.
             data = summarise(*parts, usual, {} if args.new else load_summary(output))
@@ -103,23 +100,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nStopped. What was measured is kept; the same command goes on.", file=sys.stderr)
         return 130
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 # --- measuring ----------------------------------------------------------------------------------------------

@@ -8,9 +8,11 @@ folder.
 from __future__ import annotations
 
 import json
-import os
 import pickle
-from collections.abc import Iterable
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import Any
 
 from lag_envs import TASKS
 from lag_envs.errors import UserError, hint
+from lag_envs.store import write
 
 SCHEMA = 1
 #: Seeds of the episodes on which agents are compared, and of those on which a policy is tested while it is
@@ -121,8 +124,8 @@ class Run:
 
     def foreign(self) -> bool:
         """Tell whether the folder holds files that are not the run's."""
-        ours = ("tensorboard", CHECKPOINT + ".part")
-        return self.folder.exists() and any(f.name not in ours for f in self.folder.iterdir())
+        found = self.folder.iterdir() if self.folder.exists() else ()
+        return any(f.name != "tensorboard" and not f.name.endswith(".part") for f in found)
 
     def remove(self) -> None:
         """Remove the run's files, and no others."""
@@ -151,18 +154,6 @@ def read_result(file: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} cannot be read ({error}); remove it, or start anew with --new") from error
     return content
-
-
-def write(file: Path, data: bytes | str) -> None:
-    """Write a file whole or not at all."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(file.name + ".part")
-    try:
-        part.write_bytes(data.encode() if isinstance(data, str) else data)
-        os.replace(part, file)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def check_env(env_id: str) -> str:
@@ -203,3 +194,20 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     if name in known:
         return name
     raise UserError(f"there is no {kind} {name!r}; {hint(name, known)}")
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

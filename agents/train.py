@@ -10,24 +10,34 @@ import multiprocessing
 import os
 import queue
 import shlex
-import signal
 import sys
 import tempfile
-import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
 from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
-from agents.run import CHECKPOINT, MODEL, NORMALISATION, RESULT, Run, UserError, check_name, own_env, write
-from lag_envs import TASKS
-from lag_envs.leaderboard.spread import SpreadError, check_address
+from agents.run import (
+    CHECKPOINT,
+    MODEL,
+    NORMALISATION,
+    RESULT,
+    Run,
+    UserError,
+    check_name,
+    own_env,
+    terminable,
+)
+from lag_envs import TASKS, workers
 from lag_envs.own_files import is_file
+from lag_envs.store import write
+from lag_envs.tables import columns
+from lag_envs.workers import SpreadError, check_address, died
 
 EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   result.json          returns on 100 fresh episodes, score, learning curve, hyperparameters, versions, times
@@ -36,7 +46,7 @@ EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   {CHECKPOINT}       while the run is not finished: all that is needed to go on ({TESTS} times a run)
 
 The same command goes on where a run was broken off, by Ctrl-C or by a kill; seeds that are finished are left
-as they are. A run that goes on from its checkpoint gives the numbers that it would have given uninterrupted.
+as they are. A run goes on from its last checkpoint, in other episodes than without the interruption.
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
   python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
@@ -153,18 +163,15 @@ def plan(args: argparse.Namespace) -> list[Run]:
 # --- one seed, in a process or on another machine -----------------------------------------------------------
 
 
-def work(run: Run, tell: Callable[[tuple], None], stop: Callable[[], bool], ship: bool = False) -> None:
-    """Train one run and tell how it goes.
+def work(run: Run, tell: Callable[[tuple], None], ship: bool = False) -> str:
+    """Train one run and tell how it goes; return why it failed, nothing where all went well.
 
     Parameters
     ----------
     run : Run
         The run.
     tell : callable
-        Given ("steps", name, steps), ("tested", name, curve), ("file", name, file, bytes) and last ("end",
-        name, reason), with an empty reason where all went well.
-    stop : callable
-        Tells whether to end early.
+        Given ("steps", name, steps), ("tested", name, curve) and ("file", name, file, bytes).
     ship : bool
         Whether to tell the files too, for a run whose folder nobody else sees.
     """
@@ -188,137 +195,78 @@ def work(run: Run, tell: Callable[[tuple], None], stop: Callable[[], bool], ship
     try:
         if run.source:  # in this process it may not be registered yet
             own_env(run.source)
-        finished = train(run, show=show, tested=tested, stop=stop)
-        if finished:
-            send(MODEL, NORMALISATION, RESULT)
-        tell(("end", run.name, "" if finished else "stopped"))
+        train(run, show=show, tested=tested)
+        send(MODEL, NORMALISATION, RESULT)
     except UserError as error:
-        tell(("end", run.name, str(error)))
+        return str(error)
     except OSError as error:
-        tell(("end", run.name, f"{error}; what was saved before is kept"))
+        return f"{error}; what was saved before is kept"
     except Exception:
-        tell(("end", run.name, traceback.format_exc()))
+        return traceback.format_exc()
+    return ""
 
 
-def _in_process(run: Run, events: Any, stopped: Any) -> None:
-    """Work in a process of its own; the one that started it passes Ctrl-C on."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: stopped.set())
-    parent = multiprocessing.parent_process()
-
-    def stop() -> bool:
-        return stopped.is_set() or (parent is not None and not parent.is_alive())
-
-    work(run, events.put, stop)
+_events: Any = None
 
 
-@contextmanager
-def processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[tuple[Callable, Callable]]:
-    """Train runs in processes; give a function that returns the next event or None, and one that stops."""
-    context = multiprocessing.get_context("spawn")
-    events, stopped = context.Queue(), context.Event()
-    waiting = list(reversed(runs))
-    running: dict[str, Any] = {}
-    at_once = jobs or os.cpu_count() or 1
-
-    def poll() -> tuple | None:
-        while waiting and len(running) < at_once and not stopped.is_set():
-            run = waiting.pop()
-            running[run.name] = context.Process(target=_in_process, args=(run, events, stopped), daemon=True)
-            running[run.name].start()
-        try:
-            event = events.get(timeout=0.2)
-        except queue.Empty:
-            for name, process in running.items():
-                if process.exitcode is not None:  # without a word: it was killed
-                    del running[name]
-                    return "end", name, f"its process ended with status {process.exitcode}"
-            if stopped.is_set() and not running and waiting:
-                return "end", waiting.pop().name, "stopped"
-            return None
-        if event[0] == "end":
-            running.pop(event[1]).join()
-        return event
-
-    try:
-        yield poll, stopped.set
-    finally:
-        stopped.set()
-        for process in running.values():
-            process.join(10)
-            process.kill()
+def _begin(events: Any) -> None:
+    global _events
+    _events = events
 
 
-# --- on Ray -------------------------------------------------------------------------------------------------
+def _here(run: Run) -> str:
+    """Work in a process of its own."""
+    return work(run, _events.put)
 
 
-@contextmanager
-def on_ray(runs: Sequence[Run], address: str) -> Iterator[tuple[Callable, Callable]]:
-    """Train runs on a Ray cluster; otherwise like `processes`."""
-    try:
-        import ray
-        from ray.util.queue import Empty, Queue
-    except ImportError as error:
-        raise UserError("--ray needs Ray: pip install 'lag-envs[ray]'") from error
-
-    # The machines get our code from here; the libraries that it needs have to be installed there.
-    root = Path(__file__).parents[1]
-    modules = [str(root / "agents"), str(root / "src" / "lag_envs")]
-    options: dict[str, Any] = {"runtime_env": {"py_modules": modules}, "log_to_driver": False}
-    try:
-        ray.init(None if address == "local" else address, logging_level="error", **options)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise UserError(f"no Ray cluster at {address!r}: {error}") from error
-    events = Queue()
-    events.size()  # is there
-    task = ray.remote(num_cpus=1, max_retries=0)(_on_ray)
-    handles = {task.remote(_packed(run), events): run for run in runs}
-    by_name = {run.name: run for run in runs}
-    stopped = threading.Event()
-
-    def poll() -> tuple | None:
-        if stopped.is_set() and handles:
-            handle, run = handles.popitem()
-            ray.cancel(handle, force=True)
-            return "end", run.name, "stopped"
-        try:
-            event = events.get(timeout=0.2)
-        except Empty:
-            for handle in ray.wait(list(handles), num_returns=len(handles), timeout=0)[0]:
-                run = handles.pop(handle)
-                try:
-                    ray.get(handle)
-                except Exception as error:  # the worker, or its machine, is gone
-                    return "end", run.name, f"{type(error).__name__}: {str(error).splitlines()[0]}"
-            return None
-        if event[0] == "file":
-            write(by_name[event[1]].path(event[2]), event[3])
-            return None
-        if event[0] == "end":
-            handles.pop(next(h for h, run in handles.items() if run.name == event[1]), None)
-            if not event[2]:
-                by_name[event[1]].path(CHECKPOINT).unlink(missing_ok=True)
-        return event
-
-    try:
-        yield poll, stopped.set
-    finally:
-        ray.shutdown()
-
-
-def _packed(run: Run) -> tuple[dict[str, Any], bytes | None]:
-    checkpoint = run.path(CHECKPOINT)
-    return vars(run) | {"folder": None}, checkpoint.read_bytes() if checkpoint.exists() else None
-
-
-def _on_ray(packed: tuple[dict[str, Any], bytes | None], events: Any) -> None:
+def _there(settings: dict[str, Any], checkpoint: bytes | None, events: Any) -> str:
     """Work on a machine that does not see the run's folder."""
-    settings, checkpoint = packed
     with tempfile.TemporaryDirectory() as folder:
         run = Run(**settings | {"folder": Path(folder)})
         if checkpoint is not None:
             write(run.path(CHECKPOINT), checkpoint)
-        work(run, events.put, lambda: False, ship=True)
+        return work(run, events.put, ship=True)
+
+
+@contextmanager
+def processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable]:
+    """Train runs in processes; give a function that returns the next event, or None."""
+    events = multiprocessing.get_context("spawn").Queue()
+    with workers.processes(jobs or os.cpu_count() or 1, _begin, events) as submit:
+        yield partial(poll, events, {submit(_here, run): run for run in runs})
+
+
+@contextmanager
+def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
+    """Train runs on a Ray cluster; otherwise like `processes`."""
+    try:
+        with workers.cluster(address, [Path(__file__).parent]) as submit:
+            from ray.util.queue import Queue
+
+            events, futures = Queue(), {}
+            for run in runs:
+                file = run.path(CHECKPOINT)
+                checkpoint = file.read_bytes() if file.exists() else None
+                futures[submit(_there, vars(run) | {"folder": None}, checkpoint, events)] = run
+            yield partial(poll, events, futures)
+    except SpreadError as error:
+        raise UserError(str(error)) from error
+
+
+def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
+    """Return the next event, or ("end", name, reason), or None; write files that were told."""
+    ended = next((future for future in futures if future.done()), None)
+    try:
+        event = events.get(timeout=0.05 if ended else 0.2)
+    except queue.Empty:
+        if ended is None:
+            return None
+        run, error = futures.pop(ended), ended.exception()
+        return "end", run.name, ended.result() if error is None else died(error)
+    if event[0] == "file":
+        write(next(run for run in futures.values() if run.name == event[1]).path(event[2]), event[3])
+        return None
+    return event
 
 
 # --- progress -----------------------------------------------------------------------------------------------
@@ -330,52 +278,39 @@ def follow(runs: Sequence[Run], spread: Callable) -> tuple[dict[str, str], bool]
 
     failed: dict[str, str] = {}
     left = {run.name: run for run in runs}
-    interrupted = 0
-    steps = dict.fromkeys(left, 0)
-    with ExitStack() as stack:
-        poll, stop = stack.enter_context(spread(runs))
-
-        def handle(number: int, frame: Any) -> None:
-            nonlocal interrupted
-            if interrupted:
-                raise KeyboardInterrupt
-            interrupted = number
-            stop()
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if threading.current_thread() is threading.main_thread():
-                stack.callback(signal.signal, number, signal.signal(number, handle))
-        bar = stack.enter_context(
-            tqdm(
-                total=sum(run.steps for run in runs), unit=" steps", unit_scale=True, disable=None,
-                dynamic_ncols=True, initial=sum(run.trained for run in runs),
-            )
-        )  # fmt: skip
-        for run in runs:
-            steps[run.name] = run.trained
-        while left:
-            event = poll()
-            if event is None:
-                continue
-            kind, name, what = event
-            run = left[name]
-            if kind == "steps":
-                steps[name] = min(what, run.steps)
-                bar.update(sum(steps.values()) - bar.n)
-            elif kind == "tested":
-                run.curve = what
-                trained, seconds, mean = what[-1]
-                _say(bar, f"{run.name}: {trained:>9,} steps, {seconds:4.0f} s, return {mean:.2f}")
-            else:
-                del left[name]
-                if what and what != "stopped":
-                    failed[name] = what
-                elif not what:
+    steps = {run.name: run.trained for run in runs}
+    bar = tqdm(
+        total=sum(run.steps for run in runs), unit=" steps", unit_scale=True, disable=None,
+        dynamic_ncols=True, initial=sum(steps.values()),
+    )  # fmt: skip
+    try:
+        with terminable(), spread(runs) as poll, bar:
+            while left:
+                event = poll()
+                if event is None:
+                    continue
+                kind, name, what = event
+                run = left[name]
+                if kind == "steps":
+                    steps[name] = min(what, run.steps)
+                    bar.update(sum(steps.values()) - bar.n)
+                elif kind == "tested":
+                    run.curve = what
+                    trained, seconds, mean = what[-1]
+                    _say(bar, f"{run.name}: {trained:>9,} steps, {seconds:4.0f} s, return {mean:.2f}")
+                else:
+                    del left[name]
+                    if what:
+                        failed[name] = what
+                        continue
+                    run.path(CHECKPOINT).unlink(missing_ok=True)
                     steps[name] = run.steps
                     result = run.load_result() or {}
                     tail = "" if result.get("score") is None else f", score {result['score']:.3f}"
                     _say(bar, f"{run.name}: finished, return {result['mean_return']:.2f}{tail}")
-    return failed, bool(interrupted)
+    except KeyboardInterrupt:
+        return failed, True
+    return failed, False
 
 
 def _say(bar: Any, line: str) -> None:
@@ -391,11 +326,12 @@ def summarise(runs: Sequence[Run]) -> None:
         if not results:
             continue
         print(f"\n{env}, {algo}, {EPISODES} fresh episodes each")
-        print(f"{'seed':>6}{'steps':>12}{'seconds':>9}{'return':>10}{'score':>8}")
+        rows = [("seed", "steps", "seconds", "return", "score")]
         for run, result in results:
-            tail = "" if result["score"] is None else f"{result['score']:8.3f}"
+            tail = "" if result["score"] is None else f"{result['score']:.3f}"
             trained, seconds, mean = result["trained"], result["wall_seconds"], result["mean_return"]
-            print(f"{run.seed:6}{trained:12,}{seconds:9.1f}{mean:10.2f}{tail}")
+            rows.append((str(run.seed), f"{trained:,}", f"{seconds:.1f}", f"{mean:.2f}", tail))
+        print("\n".join(columns(rows)))
         print(f"Written to {results[0][0].folder.parent}/")
 
 

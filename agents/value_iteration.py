@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.stepping.cache import jit
+from lag_envs.store import write
 
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
@@ -461,6 +462,4 @@ class Cache:
             "parameters": self.parameters, "done": done, "seconds": round(seconds, 3),
             "check": zlib.crc32(self.values[done]),
         }  # fmt: skip
-        part = self.folder / (PROGRESS + ".part")
-        part.write_text(json.dumps(progress, indent=1) + "\n")
-        os.replace(part, self.folder / PROGRESS)
+        write(self.folder / PROGRESS, json.dumps(progress, indent=1) + "\n")

@@ -111,7 +111,7 @@ def table_of(submission):
     table |= {"bins": about.bins} if about.bins else {"squash": about.squash}
     table |= {"mean_limit": about.mean_limit} if about.mean_limit else {}
     if about.normalise:
-        table["normalise"] = dict(zip(("epsilon", "clip"), about.normalise, strict=True))
+        table["normalise"] = about.normalise.model_dump()
     return table
 
 

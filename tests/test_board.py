@@ -633,7 +633,7 @@ def test_map_submissions(tmp_path, jobs):
     assert [found[name] for name in "ab"] == ["a", "b"]  # whatever becomes of others
     assert isinstance(found["refused"], Refused) and str(found["refused"]) == "no"
     if jobs > 1:
-        assert type(found["dies"]).__name__ == "BrokenProcessPool"
+        assert type(found["dies"]).__name__ == "ProcessExpired"
 
 
 @pytest.mark.slow

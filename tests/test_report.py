@@ -43,14 +43,14 @@ def test_rows_in_the_order_of_the_jobs(tmp_path):
 def test_what_goes_wrong_costs_its_own_rows_only(tmp_path):
     told = []
     jobs = [
-        job("fails", "fails"), job("hangs", "hangs", timeout=3.0), job("crashes", "crashes"),
+        job("fails", "fails"), job("hangs", "hangs", timeout=8.0), job("crashes", "crashes"),
         job("misses", "misses"), job("works", count=1), job("unknown", "no_such_function"),
     ]  # fmt: skip
     results, complete = run_jobs(jobs, tmp_path, 2, told.append)
     found = {r.name: r for r in results}
     assert complete and len(found) == 6
     assert found["fails"].problem == "ValueError: no such thing"
-    assert found["hangs"].problem == "stopped after 3 s"
+    assert found["hangs"].problem == "stopped after 8 s"
     assert "exit status 7" in found["crashes"].problem
     assert found["misses"].problem == "a_package_that_is_missing is not installed"
     assert found["unknown"].problem.startswith("AttributeError")

@@ -6,19 +6,22 @@ import json
 import math
 import os
 import re
+import shutil
 import threading
+import time
 import warnings
 from functools import partial
 
 import numpy as np
 import pytest
+from playwright.sync_api import sync_playwright
 
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import describe
 from lag_envs.scenes.shapes import Arrow, Circle, Lens, Line, Moment, Polygon
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline
-from tests import board_pages, chromium
+from tests import board_pages
 
 HOSTILE = (
     "</script><script>window.hacked = 1</script>",
@@ -30,6 +33,7 @@ HOSTILE = (
     "Ω" * 300,
     "constructor",
 )
+CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium"))
 MISSING = (
     "THERE IS NO CHROMIUM, SO NO TEST OF THE LEADERBOARD'S PAGE IN A BROWSER WAS RUN: install chromium, or "
     "name one in the variable CHROMIUM"
@@ -70,35 +74,49 @@ def folder(data, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    binary = chromium.find()
-    if binary is None:
+def browser():
+    if CHROMIUM is None:
         warnings.warn(MISSING, stacklevel=1)
         pytest.skip(MISSING)
-    found = chromium.Browser(binary, tmp_path_factory.mktemp("profile"))
-    yield found
-    found.close()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM)
+        yield browser
+        browser.close()
 
 
 @pytest.fixture
 def open_page(browser, folder):
     """Open a page; in the end it must have met no error and asked nobody else for anything."""
-    pages = []
+    opened = []
 
     def open_it(name="PivotedBar-v0", root=None, **options):
         root = root or folder.as_uri()
-        page = browser.open(f"{root}/{name}.html", **options)
-        pages.append((page, root))
-        if options.get("script", True) and name != "index":
-            page.until("document.querySelectorAll('.episode option').length >= 2")
+        page = browser.new_page(**{"viewport": {"width": 1280, "height": 900}} | options)
+        wrong = []
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on(
+            "console", lambda said: said.type in ("error", "warning", "assert") and wrong.append(said.text)
+        )
+        page.on("request", lambda asked: asked.url.startswith((root, "data:")) or wrong.append(asked.url))
+        opened.append((page, wrong))
+        page.goto(f"{root}/{name}.html")
+        if options.get("java_script_enabled", True) and name != "index":
+            until(page, "document.querySelectorAll('.episode option').length >= 2")
         return page
 
     yield open_it
-    for page, root in pages:
-        errors, foreign = page.errors, [u for u in page.requests if not u.startswith((root, "data:"))]
+    for page, wrong in opened:
         page.close()
-        assert not errors
-        assert not foreign
+        assert not wrong
+
+
+def until(page, expression, wait=60.0):
+    """Wait until an expression is true; Playwright's own way is to eval, which the page's rules forbid."""
+    end = time.monotonic() + wait
+    while not (value := page.evaluate(expression)):
+        assert time.monotonic() < end, expression
+        page.wait_for_timeout(20)
+    return value
 
 
 def clean(text):
@@ -107,7 +125,7 @@ def clean(text):
 
 def colours(page, selector):
     """Return how many colours a canvas shows."""
-    return page.js(f"""(() => {{
+    return page.evaluate(f"""(() => {{
         const c = document.querySelector({json.dumps(selector)});
         const copy = new OffscreenCanvas(c.width, c.height);
         const pen = copy.getContext("2d", {{willReadFrequently: true}});
@@ -118,17 +136,17 @@ def colours(page, selector):
 
 def column(page, selector):
     """Return the texts of a column of the ranking, from top to bottom, of the rows that are shown."""
-    return page.js(
+    return page.evaluate(
         f"[...document.querySelectorAll('.ranking tbody tr:not([hidden]) {selector}')].map(e => e.innerText)"
     )
 
 
 def clock(page):
-    return float(page.js("document.querySelector('.clock').textContent").split(" /")[0])
+    return float(page.evaluate("document.querySelector('.clock').textContent").split(" /")[0])
 
 
 def reading(page, side, name):
-    return page.js(
+    return page.evaluate(
         f"[...document.querySelectorAll('.side')[{side}].querySelectorAll('.readout div')]"
         f".find(d => d.firstChild.textContent === {json.dumps(name)}).lastChild.textContent"
     ).replace("−", "-")
@@ -275,7 +293,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
             for name in re.findall(r"assets/[\w-]+\.(?:js|css)", text):
                 assert (out / name).exists(), (moment, page.name, name)
         build(other, out)
-        assert not list(out.rglob("*.new"))
+        assert not list(out.rglob("*.part"))
         assert len(list(out.rglob("*.js"))) == 1 + 2, "what a killed build left is removed by the next"
         if finished:
             break
@@ -320,14 +338,15 @@ def test_contrast(theme):
 
 def test_overview(open_page, data):
     page = open_page("index")
-    assert page.js("document.querySelectorAll('.card').length") == 3
-    assert page.js("document.querySelectorAll('.card .strip .dot').length") == 3 * len(board_pages.AGENTS)
+    assert page.evaluate("document.querySelectorAll('.card').length") == 3
+    assert page.evaluate("document.querySelectorAll('.card .strip .dot').length") == 3 * len(
+        board_pages.AGENTS
+    )
     for i in range(3):
         assert colours(page, f".card:nth-child({i + 1}) canvas") > 50
     page.click(".card:nth-child(2) .whole")
-    there = f"location.pathname.endsWith('{incline.Brake.id}.html')"
-    page.until(f"{there} && document.readyState === 'complete'")
-    assert page.js("document.querySelector('nav [aria-current]').textContent") == incline.Brake.id
+    page.wait_for_url(f"**/{incline.Brake.id}.html")
+    assert page.evaluate("document.querySelector('nav [aria-current]').textContent") == incline.Brake.id
 
 
 def flat(shape):
@@ -358,8 +377,10 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
             now = Moment(state, share * task.limit_control, share, target, turned)
             given = json.dumps({"state": state, "share": share, "target": target, "turned": turned})
             board_text = json.dumps(board)
-            assert page.js(f"lagEnvs.windowOf({board_text}, {given})") == pytest.approx(task.window(now))
-            found = page.js(f"lagEnvs.shapesOf({board_text}, {given})")
+            assert page.evaluate(f"lagEnvs.windowOf({board_text}, {given})") == pytest.approx(
+                task.window(now)
+            )
+            found = page.evaluate(f"lagEnvs.shapesOf({board_text}, {given})")
             wanted = [flat(shape) for shape in task.shapes(now)]
             assert [s[0] for s in found] == [w[0] for w in wanted], env_id
             for shape, (what, points, role) in zip(found, wanted, strict=True):
@@ -378,7 +399,7 @@ def test_sorting_by_mouse_and_keyboard(open_page, data):
         return [r["name"] for r in (*ordered, *(r for r in rows if r[key] is None))]
 
     def sorted_by():
-        return page.js(
+        return page.evaluate(
             "[...document.querySelectorAll('th[aria-sort]:not([aria-sort=none])')]"
             ".map(t => t.querySelector('button').textContent + ' ' + t.getAttribute('aria-sort'))"
         )
@@ -389,11 +410,11 @@ def test_sorting_by_mouse_and_keyboard(open_page, data):
     assert sorted_by() == ["Settle ascending"]
     page.click("[data-key=settle]")
     assert column(page, "summary bdi") == names("settle", False)
-    assert "descending" in page.js("document.querySelector('.status').textContent")
-    page.js("document.querySelector('[data-key=effort]').focus()")
-    page.key("Enter")
+    assert "descending" in page.evaluate("document.querySelector('.status').textContent")
+    page.evaluate("document.querySelector('[data-key=effort]').focus()")
+    page.keyboard.press("Enter")
     assert column(page, "summary bdi") == names("effort", True)
-    page.key(" ")
+    page.keyboard.press("Space")
     assert sorted_by() == ["Effort descending"]
     page.click("[data-key=name]")
     assert column(page, "summary bdi") == sorted((r["name"] for r in rows), key=str.casefold)
@@ -405,32 +426,32 @@ def test_filtering(open_page, data):
     page, rows = open_page(), data["environments"][0]["rows"]
     page.click(".filter [value=controller]")
     assert column(page, "summary bdi") == [r["name"] for r in rows if r["kind"] == "controller"]
-    assert page.js("document.querySelector('.status').textContent") == "3 of 10 agents"
-    page.key("ArrowRight")
+    assert page.evaluate("document.querySelector('.status').textContent") == "3 of 10 agents"
+    page.keyboard.press("ArrowRight")
     assert column(page, "summary bdi") == ["Value iteration, 81 nodes"]
     page.click(".filter [value='']")
     page.click(".find input")
-    page.type("pUmPing lqr")
+    page.keyboard.insert_text("pUmPing lqr")
     assert column(page, "summary bdi") == ["Energy pumping + LQR"]
-    page.type(" nothing like it")
+    page.keyboard.insert_text(" nothing like it")
     assert column(page, "summary bdi") == []
-    assert page.js("document.querySelector('.none').hidden") is False
-    page.js("document.querySelector('.find input').select()")
-    page.type(" ")
+    assert page.evaluate("document.querySelector('.none').hidden") is False
+    page.evaluate("document.querySelector('.find input').select()")
+    page.keyboard.insert_text(" ")
     assert len(column(page, "summary bdi")) == 10
 
 
 def test_intervals_as_pictures(open_page, data):
     page = open_page()
     place = "document.querySelectorAll('.ranking tbody tr')[4].querySelector('.interval')"
-    low, high = (float(page.js(f"{place}.getAttribute('{end}')").rstrip("%")) for end in ("x1", "x2"))
+    low, high = (float(page.evaluate(f"{place}.getAttribute('{end}')").rstrip("%")) for end in ("x1", "x2"))
     row = data["environments"][0]["rows"][4]
-    assert page.js("document.querySelectorAll('.ranking .picture .dot').length") == 10
+    assert page.evaluate("document.querySelectorAll('.ranking .picture .dot').length") == 10
     width = row["interval"][1] - row["interval"][0]
     assert high - low == pytest.approx(100 * width / 1.1, rel=0.15)
     page.click(".filter [value=near]")
-    wide = float(page.js(f"{place}.getAttribute('x2')").rstrip("%")) - float(
-        page.js(f"{place}.getAttribute('x1')").rstrip("%")
+    wide = float(page.evaluate(f"{place}.getAttribute('x2')").rstrip("%")) - float(
+        page.evaluate(f"{place}.getAttribute('x1')").rstrip("%")
     )
     assert wide > 5 * (high - low)
 
@@ -439,22 +460,22 @@ def test_player(open_page, data):
     page, rows = open_page(), data["environments"][0]["rows"]
     first, second = (rows[i]["replays"][0] for i in (0, 1))
     assert clock(page) == 0.0
-    before = page.js("document.querySelector('.scene').toDataURL()")
+    before = page.evaluate("document.querySelector('.scene').toDataURL()")
     page.click(".play")
-    assert page.js("document.querySelector('.play').getAttribute('aria-label')") == "Pause"
-    page.until("parseFloat(document.querySelector('.clock').textContent) > 0.3")
-    page.key(" ")  # the button has the focus
+    assert page.evaluate("document.querySelector('.play').getAttribute('aria-label')") == "Pause"
+    until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.3")
+    page.keyboard.press("Space")  # the button has the focus
     stopped = clock(page)
     assert (
         0.3 < stopped < 8.0
-        and page.js("document.querySelector('.play').getAttribute('aria-label')") == "Play"
+        and page.evaluate("document.querySelector('.play').getAttribute('aria-label')") == "Play"
     )
-    assert page.js("document.querySelector('.scene').toDataURL()") != before
+    assert page.evaluate("document.querySelector('.scene').toDataURL()") != before
 
     # Scrubbing sets the time, for both.
-    page.js("""(() => { const r = document.querySelector('.scrub input'); r.focus(); r.value = 120;
+    page.evaluate("""(() => { const r = document.querySelector('.scrub input'); r.focus(); r.value = 120;
         r.dispatchEvent(new Event('input', {bubbles: true})); })()""")
-    page.until("document.querySelector('.clock').textContent.startsWith('2.40 ')")
+    until(page, "document.querySelector('.clock').textContent.startsWith('2.40 ')")
     for side, replay in enumerate((first, second)):
         assert reading(page, side, "Time") == "2.40 s"
         assert float(reading(page, side, "Action")) == pytest.approx(replay["actions"][119], abs=1e-3)
@@ -463,99 +484,102 @@ def test_player(open_page, data):
         assert float(reading(page, side, "θ").split()[0]) == pytest.approx(replay["states"][120][2], abs=1e-2)
 
     # By keyboard.
-    for key, shift, time in (("ArrowRight", False, 2.42), ("ArrowLeft", True, 2.22), ("End", False, 10.0),
-                             ("ArrowRight", False, 10.0), ("Home", False, 0.0)):  # fmt: skip
-        page.key(key, shift)
-        page.until(f"document.querySelector('.clock').textContent.startsWith('{time:.2f} ')")
-    page.key(" ")
-    page.until("!!document.querySelector('.playing')")
-    page.key(" ")
-    assert not page.js("!!document.querySelector('.playing')")
-    page.until("document.querySelector('#said').textContent.includes('B, iLQR, at ')")
+    for key, then in (("ArrowRight", 2.42), ("Shift+ArrowLeft", 2.22), ("End", 10.0), ("ArrowRight", 10.0),
+                      ("Home", 0.0)):  # fmt: skip
+        page.keyboard.press(key)
+        until(page, f"document.querySelector('.clock').textContent.startsWith('{then:.2f} ')")
+    page.keyboard.press("Space")
+    until(page, "!!document.querySelector('.playing')")
+    page.keyboard.press("Space")
+    assert not page.evaluate("!!document.querySelector('.playing')")
+    until(page, "document.querySelector('#said').textContent.includes('B, iLQR, at ')")
 
     # Another agent on the right, another episode on the left.
     page.click("tr[data-row='5'] .pick[data-side='1']")
-    page.until("document.querySelector(\"tr[data-row='5'] .pick\").nextSibling.ariaPressed === 'true'")
-    pressed = page.js("[...document.querySelectorAll('.pick[aria-pressed=true]')].map(p => p.ariaLabel)")
+    until(page, "document.querySelector(\"tr[data-row='5'] .pick\").nextSibling.ariaPressed === 'true'")
+    pressed = page.evaluate(
+        "[...document.querySelectorAll('.pick[aria-pressed=true]')].map(p => p.ariaLabel)"
+    )
     assert pressed == ["Watch Value iteration, 81 nodes as A", "Watch Energy pumping + LQR as B"]
-    page.js("""(() => { const e = document.querySelector('.episode'); e.value = '1';
+    page.evaluate("""(() => { const e = document.querySelector('.episode'); e.value = '1';
         e.dispatchEvent(new Event('change')); })()""")
-    page.js("document.querySelector('.scrub input').focus()")
-    page.key("End")
+    page.evaluate("document.querySelector('.scrub input').focus()")
+    page.keyboard.press("End")
     total = f"{rows[0]['replays'][1]['return']:.2f}".replace("-", "−")
-    page.until(f"document.querySelector('.readout').textContent.includes('{total}')")
+    until(page, f"document.querySelector('.readout').textContent.includes('{total}')")
 
 
 def test_speed_and_loop(open_page):
     page = open_page(incline.Brake.id)
-    page.js("""(() => { const s = document.querySelector('.speed select'); s.value = '4';
+    page.evaluate("""(() => { const s = document.querySelector('.speed select'); s.value = '4';
         document.querySelector('.loop input').click(); })()""")
     page.click(".play")
-    page.until("parseFloat(document.querySelector('.clock').textContent) > 1.5")
-    page.until("parseFloat(document.querySelector('.clock').textContent) < 1.0")
-    assert page.js("!!document.querySelector('.playing')")
+    until(page, "parseFloat(document.querySelector('.clock').textContent) > 1.5")
+    until(page, "parseFloat(document.querySelector('.clock').textContent) < 1.0")
+    assert page.evaluate("!!document.querySelector('.playing')")
 
 
 def test_pictures_of_the_ranking(open_page):
     page = open_page()
-    assert page.js("document.querySelectorAll('#profile .curve').length") == 10
-    assert page.js("document.querySelectorAll('#profile .chosen').length") == 5
-    assert page.js("document.querySelectorAll('#curves .curve').length") == 6
-    assert "SAC, half of them above 0.96" in page.js("document.querySelector('#profile svg').ariaLabel")
+    assert page.evaluate("document.querySelectorAll('#profile .curve').length") == 10
+    assert page.evaluate("document.querySelectorAll('#profile .chosen').length") == 5
+    assert page.evaluate("document.querySelectorAll('#curves .curve').length") == 6
+    assert "SAC, half of them above 0.96" in page.evaluate("document.querySelector('#profile svg').ariaLabel")
     page.click(".legend button:nth-child(6)")
-    assert page.js("document.querySelectorAll('#profile .chosen').length") == 6
+    assert page.evaluate("document.querySelectorAll('#profile .chosen').length") == 6
     # The value function and the path over it, which another pair of coordinates does not have.
-    page.until("document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
+    until(page, "document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
     shaded = colours(page, ".phase")
-    page.js("""(() => { const s = document.querySelector('.pair select'); s.value = '1';
+    page.evaluate("""(() => { const s = document.querySelector('.pair select'); s.value = '1';
         s.dispatchEvent(new Event('change')); })()""")
-    page.until("document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
+    until(page, "document.querySelector('.phase').ariaLabel.startsWith('s [m] against ')")
     assert 100 < colours(page, ".phase") < shaded
 
 
 def test_hostile_names_stay_names(open_page, hostile, tmp_path):
     build(hostile, tmp_path)
     page = open_page(root=tmp_path.as_uri())
-    names = page.js("[...document.querySelectorAll('.ranking summary bdi')].map(e => e.textContent)")
+    names = page.evaluate("[...document.querySelectorAll('.ranking summary bdi')].map(e => e.textContent)")
     wanted = [clean(name) for name in HOSTILE]
     assert names == wanted
-    assert page.js("[...document.querySelectorAll('.legend bdi')].map(e => e.textContent)") == wanted
-    assert page.js("[...document.querySelectorAll('.agent')[0].options].map(e => e.text).length") == len(
-        HOSTILE
-    )
+    assert page.evaluate("[...document.querySelectorAll('.legend bdi')].map(e => e.textContent)") == wanted
+    assert page.evaluate(
+        "[...document.querySelectorAll('.agent')[0].options].map(e => e.text).length"
+    ) == len(HOSTILE)
     page.click(".play")
-    page.until("parseFloat(document.querySelector('.clock').textContent) > 0.1")
-    page.js("document.querySelectorAll('details').forEach(d => d.open = true)")
-    assert page.js("document.querySelectorAll('.more a, .ranking img').length") == 0
+    until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.1")
+    page.evaluate("document.querySelectorAll('details').forEach(d => d.open = true)")
+    assert page.evaluate("document.querySelectorAll('.more a, .ranking img').length") == 0
     for width in (320, 1280):
-        page.resize(width, 800)
-        assert page.js("document.documentElement.scrollWidth") <= width
-    assert page.js("window.hacked") is None
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.evaluate("window.hacked") is None
     page = open_page("index", root=tmp_path.as_uri())
-    assert page.js("window.hacked") is None
+    assert page.evaluate("window.hacked") is None
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_narrow_screen(open_page, scheme):
     for name in ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id):
-        page = open_page(name, width=320, height=640, media=[("prefers-color-scheme", scheme)])
-        assert page.js("document.documentElement.scrollWidth") == 320
+        page = open_page(name, viewport={"width": 320, "height": 640}, is_mobile=True, color_scheme=scheme)
+        assert page.evaluate("document.documentElement.scrollWidth") == 320
     # Cards instead of columns; what would be lost with the heads is sorted by a list.
-    page.js("""(() => { const s = document.querySelector('.order select'); s.value = 'effort';
+    page.evaluate("""(() => { const s = document.querySelector('.order select'); s.value = 'effort';
         s.dispatchEvent(new Event('change', {bubbles: true})); })()""")
     efforts = [float(x.split()[-1]) for x in column(page, "[data-label=Effort]")]
     assert efforts == sorted(efforts)
     for button in (".play", ".step", ".pick"):
-        size = page.js(f"Math.min(...['width', 'height'].map("
+        size = page.evaluate(f"Math.min(...['width', 'height'].map("
                        f"k => document.querySelector('{button}').getBoundingClientRect()[k]))")  # fmt: skip
         assert size >= 32, button
-    page.resize(1280, 800)
-    page.until("getComputedStyle(document.querySelector('.ranking thead')).display !== 'none'")
+    page.set_viewport_size({"width": 1280, "height": 800})
+    until(page, "getComputedStyle(document.querySelector('.ranking thead')).display !== 'none'")
 
 
 def test_what_a_screen_reader_meets(open_page):
     page = open_page()
-    nodes = [n for n in page.send("Accessibility.getFullAXTree")["nodes"] if not n["ignored"]]
+    tree = page.context.new_cdp_session(page)
+    nodes = [n for n in tree.send("Accessibility.getFullAXTree")["nodes"] if not n["ignored"]]
     roles = [n["role"]["value"] for n in nodes]
     for role in ("banner", "navigation", "main", "search", "contentinfo", "status", "slider"):
         assert role in roles, role
@@ -564,35 +588,40 @@ def test_what_a_screen_reader_meets(open_page):
         if role in NAMED:
             assert node["name"]["value"].strip(), node
     assert roles.count("row") == 11 + 3 and roles.count("columnheader") == 13 + 3
-    levels = [int(x) for x in page.js("[...document.querySelectorAll('h1, h2, h3')].map(e => e.tagName[1])")]
+    levels = [
+        int(x) for x in page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map(e => e.tagName[1])")
+    ]
     assert levels[0] == 1 and levels.count(1) == 1
     assert all(b - a <= 1 for a, b in itertools.pairwise(levels))
-    ids = page.js("[...document.querySelectorAll('[id]')].map(e => e.id)")
+    ids = page.evaluate("[...document.querySelectorAll('[id]')].map(e => e.id)")
     assert len(ids) == len(set(ids))
     # The first stop skips what is the same on all pages, and every stop is seen.
-    page.key("Tab")
-    assert page.js("document.activeElement.className") == "skip"
-    page.key("Enter")
-    page.until("location.hash === '#main'")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.className") == "skip"
+    page.keyboard.press("Enter")
+    until(page, "location.hash === '#main'")
     for _ in range(4):
-        page.key("Tab")
-        assert page.js("(e => (e.matches('.choice input') ? getComputedStyle(e.nextElementSibling) :"
+        page.keyboard.press("Tab")
+        assert page.evaluate("(e => (e.matches('.choice input') ? getComputedStyle(e.nextElementSibling) :"
                        "getComputedStyle(e)).outlineStyle)(document.activeElement)") != "none"  # fmt: skip
 
 
 def test_reduced_motion(open_page):
-    page = open_page(media=[("prefers-reduced-motion", "reduce")])
-    page.js("window.asked = []; Element.prototype.scrollIntoView = function (o) { asked.push(o.behavior); }")
-    page.js("document.querySelector(\"tr[data-row='2'] .pick\").click()")
-    assert page.until("window.asked.length && window.asked") == ["auto"]
-    assert page.js("getComputedStyle(document.querySelector('.legend button')).transitionDuration") == "0s"
-    assert not page.js("!!document.querySelector('.playing')"), "nothing moves that was not asked to"
+    page = open_page(reduced_motion="reduce")
+    page.evaluate("""(() => { window.asked = [];
+        Element.prototype.scrollIntoView = function (o) { asked.push(o.behavior); }; })()""")
+    page.evaluate("document.querySelector(\"tr[data-row='2'] .pick\").click()")
+    assert until(page, "window.asked.length && window.asked") == ["auto"]
+    assert (
+        page.evaluate("getComputedStyle(document.querySelector('.legend button')).transitionDuration") == "0s"
+    )
+    assert not page.evaluate("!!document.querySelector('.playing')"), "nothing moves that was not asked to"
 
 
 def test_without_script_the_tables_remain(open_page):
-    page = open_page(script=False)
-    assert page.js("document.querySelector('.ranking').innerText").count("\n") > 20
-    assert page.js("getComputedStyle(document.querySelector('#watch')).display") == "none"
+    page = open_page(java_script_enabled=False)
+    assert page.evaluate("document.querySelector('.ranking').innerText").count("\n") > 20
+    assert page.evaluate("getComputedStyle(document.querySelector('#watch')).display") == "none"
 
 
 def test_served(open_page, folder):
@@ -603,6 +632,5 @@ def test_served(open_page, folder):
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         page = open_page(root=f"http://127.0.0.1:{server.server_port}")
-        page.until("document.querySelectorAll('.readout dd').length > 6")
-        page.send("Page.stopLoading")
+        until(page, "document.querySelectorAll('.readout dd').length > 6")
         server.shutdown()

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -29,7 +30,7 @@ ENV = incline.Tilt.id
 #: Hyperparameters for a training that takes a second.
 SHORT = {
     "ppo": {"n_envs": 4, "n_steps": 32, "batch_size": 64, "n_epochs": 2},
-    "sac": {"n_envs": 4, "learning_starts": 40, "batch_size": 16, "gradient_steps": 1},
+    "sac": {"n_envs": 4, "learning_starts": 40, "batch_size": 16, "train_freq": 4, "gradient_steps": 1},
 }
 SHORT |= {name: SHORT["sac"] for name in ("td3", "tqc", "dqn")}
 
@@ -48,12 +49,16 @@ def make_run(folder, algo="ppo", env_id=ENV, steps=400, **more):
 
 def go(run, until=10**9):
     """Train until so many steps are done; return whether the run is finished."""
-    return learners.train(
-        run,
-        show=lambda r: None,
-        tested=lambda r: None,
-        stop=lambda: run.trained >= until and until < run.steps,
-    )
+
+    def show(run):
+        if until <= run.trained < run.steps:
+            raise KeyboardInterrupt
+
+    try:
+        learners.train(run, show=show, tested=lambda run: None)
+    except KeyboardInterrupt:
+        return False
+    return True
 
 
 @pytest.fixture
@@ -84,17 +89,32 @@ def config(tmp_path):
     # TQC is SAC with another critic, and the slowest.
     [pytest.param(a, marks=pytest.mark.slow) if a == "tqc" else a for a in ALGORITHMS],
 )
-def test_every_learner_goes_on_as_if_nothing_had_happened(algo, tmp_path):
-    whole, cut = make_run(tmp_path / "whole", algo), make_run(tmp_path / "cut", algo)
-    assert go(whole)
-    for until in (150, 270):
+def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
+    cut = make_run(tmp_path / "cut", algo, normalize=True)
+    curve, before = [], None
+    for until in (150, 300):
         assert not go(cut, until)
-        assert cut.path(run.CHECKPOINT).exists() and cut.load_result() is None
-        cut = make_run(tmp_path / "cut", algo)
+        assert cut.load_result() is None
+        cut = make_run(tmp_path / "cut", algo, normalize=True)
+        content = cut.load_checkpoint()
+        model = learners.thaw(cut, content)
+        # Weights, optimiser, normalisation and memory are those that were learnt, and learning goes on.
+        normalise, buffer = pickle.loads(content["rest"])
+        assert model.get_vec_normalize_env().obs_rms.mean.tolist() == normalise.obs_rms.mean.tolist()
+        assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained
+        if buffer is not None:
+            assert model.replay_buffer.size() == buffer.size() > 0
+            assert np.array_equal(model.replay_buffer.observations, buffer.observations)
+        weights = [w.detach().numpy().copy() for w in model.policy.parameters()]
+        assert before is None or not all(map(np.array_equal, before, weights))
+        assert len(cut.curve) > len(curve) and cut.curve[: len(curve)] == curve
+        curve, before = list(cut.curve), weights
     assert go(cut)
-    first, second = (json.loads((tmp_path / n / run.RESULT).read_text()) for n in ("whole", "cut"))
-    assert first["evaluation"] == second["evaluation"] and len(first["evaluation"]["returns"]) == 3
-    assert [c[0::2] for c in first["curve"]] == [c[0::2] for c in second["curve"]]
+    first = json.loads((tmp_path / "cut" / run.RESULT).read_text())
+    assert len(first["evaluation"]["returns"]) == 3
+    assert first["curve"][: len(curve)] == [list(point) for point in curve] and len(first["curve"]) > len(
+        curve
+    )
     assert (
         first["trained"] >= 400
         and first["versions"]["torch"]
@@ -206,8 +226,8 @@ def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
     events = []
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_bytes", full)
-        train.work(make_run(tmp_path), events.append, lambda: False)
-    assert events[-1][0] == "end" and "No space left on device" in events[-1][2]
+        reason = train.work(make_run(tmp_path), events.append)
+    assert "No space left on device" in reason and "what was saved before is kept" in reason
     assert going.path(run.CHECKPOINT).read_bytes() == saved
     assert go(make_run(tmp_path))
 

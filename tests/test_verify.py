@@ -452,19 +452,3 @@ def test_another_plan_as_good_is_no_difference():
     worse = kept | {"effort": [0.2, 0.4] * (n // 2), "settle": [2.2, None] * (n // 2)}
     found = apart(kept, worse, 100.0, plans=True)
     assert (found["efforts"], found["times"], found["returns"]) == (1.0, 1.0, 0.0)
-
-
-def test_another_plan_as_good_is_no_difference():
-    """Of one who plans the means of efforts and times count, of others each episode's."""
-    n = 1000
-    kept = {
-        "returns": [100.0] * n, "reference": None, "success": [True] * n,
-        "settle": [2.0, None] * (n // 2), "effort": [0.1, 0.3] * (n // 2),
-    }  # fmt: skip
-    other = kept | {"effort": [0.3, 0.1] * (n // 2), "settle": [2.2, None, 1.8, None] * (n // 4)}
-    assert set(apart(kept, other, 100.0, plans=True).values()) == {0.0}
-    assert apart(kept, other, 100.0)["efforts"] == 1.0
-    assert apart(kept, other, 100.0)["times"] == 0.5
-    worse = kept | {"effort": [0.2, 0.4] * (n // 2), "settle": [2.2, None] * (n // 2)}
-    found = apart(kept, worse, 100.0, plans=True)
-    assert (found["efforts"], found["times"], found["returns"]) == (1.0, 1.0, 0.0)

@@ -37,6 +37,8 @@ import lag_envs
 from lag_envs import benchmark_jacobians
 from lag_envs.benchmark_jacobians import jacobians
 from lag_envs.own_files import registered
+from lag_envs.store import write
+from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -748,34 +750,16 @@ def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
     from lag_envs.report.docs import replaced
 
-    (checkout / "docs" / "speed.json").write_text(to_json(report), encoding="utf-8")
+    write(checkout / "docs" / "speed.json", to_json(report))
     readme = checkout / "README.md"
     text = replaced(readme.read_text(encoding="utf-8"), "bench", markdown(report))
-    readme.write_text(replaced(text, "fast", claim(report)), encoding="utf-8")
+    write(readme, replaced(text, "fast", claim(report)))
 
 
 def to_json(report: dict[str, Any]) -> str:
     """Return a report as JSON, with lists of numbers on a line."""
     text = json.dumps(report, indent=1, allow_nan=False)
     return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
-
-
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align the rows' cells; what looks like a number goes to the right.
-
-    Examples
-    --------
-    >>> columns([("a", "1"), ("bc", "23")])
-    ['a    1', 'bc  23']
-    """
-    widths = [max(len(row[j]) for row in rows if j < len(row)) for j in range(max(map(len, rows)))]
-    return [
-        "  ".join(
-            cell.rjust(width) if re.fullmatch(r"[\d.,]+( [kMG])?", cell) else cell.ljust(width)
-            for cell, width in zip(row, widths, strict=False)
-        ).rstrip()
-        for row in rows
-    ]
 
 
 def short(value: float) -> str:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from lag_envs import TASKS, __version__
 from lag_envs.errors import UserError, hint
 from lag_envs.own_files import is_file
+from lag_envs.tables import columns
 
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
@@ -45,7 +46,7 @@ class Command(NamedTuple):
 def run_list(args: argparse.Namespace) -> int:
     """Print a line for every environment."""
     head = ("id", "observation", "control", "dt", "steps", "length")
-    print("\n".join(_columns([head, *(_line(id) for id in TASKS)])))
+    print("\n".join(columns([head, *(_line(id) for id in TASKS)])))
     print("\n`lag-envs info ID` tells more about one.")
     return 0
 
@@ -391,13 +392,14 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
 
     def call(given: Any) -> Any:
         for package in (
-            "confusable_homoglyphs", "jinja2", "pydantic", "safetensors", "scipy", "sympy", "tqdm",
+            "confusable_homoglyphs", "jinja2", "pebble", "pydantic", "safetensors", "scipy", "sympy",
+            "tomli_w", "tqdm",
         ):  # fmt: skip
             if find_spec(package) is None:
                 raise UserError(f'{package} is missing: pip install "lag-envs[leaderboard]"')
         from lag_envs.leaderboard.board import BoardError
-        from lag_envs.leaderboard.spread import SpreadError
         from lag_envs.leaderboard.submission import Refused
+        from lag_envs.workers import SpreadError
 
         try:
             return getattr(import_module(f"lag_envs.leaderboard.{module}"), function)(given)
@@ -438,7 +440,7 @@ def run_cache(args: argparse.Namespace) -> int:
     ]
     damaged = [(str(entry.path), why) for entry in kept if (why := cache.damage(entry.path))]
     rows += [("damaged", str(len(damaged)) + (", compiled anew when used next:" if damaged else ""))]
-    print("\n".join(_columns(rows) + _columns([("  " + path, why) for path, why in damaged])))
+    print("\n".join(columns(rows) + columns([("  " + path, why) for path, why in damaged])))
     return 0
 
 
@@ -665,15 +667,6 @@ def _known(id: str) -> str:
 
 def _task(id: str) -> Task:
     return TASKS[id]()
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    if not rows:
-        return []
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
 
 
 if __name__ == "__main__":

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.board import Board, Neighbours, claimed, others, shown_episodes
-from lag_envs.leaderboard.fields import plain, shown
+from lag_envs.leaderboard.fields import Strict, checked, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
     COMMIT,
@@ -42,14 +42,13 @@ from lag_envs.leaderboard.log import (
     Line,
     Protocol,
     State,
-    Strict,
-    checked,
     fold,
     load_json,
     parse,
     read_log,
 )
 from lag_envs.leaderboard.results import apart, build, compare
+from lag_envs.store import write
 
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About
@@ -170,7 +169,7 @@ def write_pin(board: Board, file: Path) -> Pin:
     if not log:
         raise BoardError(f"{board.log} is empty; there is nothing to pin")
     pin = pin_of(log)
-    file.write_text(json.dumps(pin.model_dump(), indent=2) + "\n", encoding="utf-8")
+    write(file, json.dumps(pin.model_dump(), indent=2) + "\n")
     return pin
 
 
@@ -179,7 +178,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
     found = Finding("pin")
     path = file or PIN
     try:
-        pin = checked(TypeAdapter(Pin), load_json(read_plain(path, MOST)))
+        pin = checked(Pin, load_json(read_plain(path, MOST)))
     except FileNotFoundError:
         if file is not None:
             found.wrong.append(f"{path} is missing")

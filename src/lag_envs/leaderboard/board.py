@@ -22,7 +22,6 @@ import json
 import os
 import re
 import shutil
-import sys
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -32,6 +31,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lag_envs import store
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import shown
 from lag_envs.leaderboard.files import read_plain
@@ -139,7 +139,7 @@ class Board:
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.log) as log:
             _remove(self.folder / "submissions" / ".new")
-            for left in (self.folder / "results").glob("**/.new"):
+            for left in (self.folder / "results").glob("**/.*.part"):
                 _remove(left)
             state = fold(parse(read_all(log))[0])
             last = state.last
@@ -223,11 +223,11 @@ class Board:
         if load(new).digest != submission.digest:
             raise BoardError(f"{submission.folder} changes while it is read; try again when it is finished")
         for path in new.iterdir():
-            _sync(path)
-        _sync(new)
+            store.to_disk(path)
+        store.to_disk(new)
         _remove(place)  # of no entry: its adding was broken off, or it was turned away
         os.rename(new, place)
-        _sync(place.parent)
+        store.to_disk(place.parent)
 
     def publish(self, nonce: str, source: str = "") -> None:
         """Publish a nonce, with which all that was added before can be verified.
@@ -287,12 +287,7 @@ class Board:
             if left := [other for other in others(state, entry) if other.id not in alike]:
                 return left
             path = self.result_file(entry)
-            new = path.parent / ".new"
-            new.parent.mkdir(parents=True, exist_ok=True)
-            new.write_bytes(content)
-            _sync(new)
-            os.replace(new, path)
-            _sync(path.parent)
+            store.write(path, content, sync=True)
             near = [found for found in alike.values() if found is not None]
             same = [
                 old.id for old in state.entries.values() if old.state == "verified" and same_agent(old, entry)
@@ -364,17 +359,6 @@ def id_of(submission: About) -> str:
     return f"{submission.env}-{slug}-{submission.digest[:8]}"
 
 
-def _sync(path: Path) -> None:
-    """See a file, or a folder's names, to the disk."""
-    if path.is_dir() and sys.platform == "win32":
-        return
-    file = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
-
-
 def _remove(path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
@@ -408,7 +392,7 @@ class Check:
         if submission.digest != digest:
             raise Refused("its files are not those that were added")
         check_twins(submission, nonce)
-        result = verify(submission, nonce, progress=progress)
+        result = verify(submission, nonce, protocol.EPISODES, progress)
         # What the board cannot keep fails here, and costs nobody else.
         return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish
 from lag_envs.leaderboard.log import COMMIT
+from lag_envs.tables import columns
 
 
 def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
@@ -226,7 +227,7 @@ def _list(args: argparse.Namespace) -> int:
             told = (row["kind"], _plain(row["name"]), row["id"] + _remark(row))
             rank = "-" if row["rank"] is None else str(row["rank"])
             lines.append((rank, f"{row['score']:.4f}", ends, success, *told))
-        print("\n".join("  " + line for line in _columns(lines)), end="\n" * bool(lines))
+        print("\n".join("  " + line for line in columns(lines)), end="\n" * bool(lines))
         for other in found["other"]:
             reason = f": {_plain(other['reason'])}" if other["reason"] else ""
             print(f"  {other['id']} {other['state']}{reason}")
@@ -301,7 +302,7 @@ def _show(args: argparse.Namespace) -> int:
         for key, value in (told | row).items()
         if value not in (None, "", False)
     ]
-    print("\n".join(_columns([(key, _plain(value)) for key, value in shown])))
+    print("\n".join(columns([(key, _plain(value)) for key, value in shown])))
     return 0
 
 
@@ -317,13 +318,6 @@ def _plain(value: Any) -> str:
     """Return text that does nothing to a terminal."""
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
     return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
 
 
 # --- audit, pin ---------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from typing import Any
 from lag_envs.leaderboard.board import Board, board_data
 from lag_envs.leaderboard.protocol import boards
 from lag_envs.report.docs import replaced
+from lag_envs.store import write
 from lag_envs.tasks import TASKS
 
 #: Rows of each board that README shows.
@@ -26,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Write the leaderboard's tables into a checkout.")
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     for path, text in generated(parser.parse_args(arguments).project).items():
-        path.write_text(text, encoding="utf-8")
+        write(path, text)
     return 0
 
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import Fields
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.submission import Refused, Submission, write
 
@@ -318,7 +317,7 @@ def export(
         model, normalise = _load(source, kind)
         table, content = convert(model, normalise)
         try:
-            made = architecture(env, Fields("[policy]", dict(table)))
+            made = architecture(env, table)
             shapes = {key: value.shape for key, value in content.items()}
             if shapes != made.arrays:
                 raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")

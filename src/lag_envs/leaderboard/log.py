@@ -19,19 +19,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, TypeAdapter, model_validator
 
-from lag_envs.leaderboard.fields import plain, shown
+from lag_envs.leaderboard import fields
+from lag_envs.leaderboard.fields import Strict, between, checked, shown
 from lag_envs.leaderboard.files import read_plain
-from lag_envs.leaderboard.names import unreadable
 
 LOG = "board.jsonl"
 #: Bytes of a log.
@@ -50,12 +42,6 @@ class BoardError(Exception):
 # --- events -------------------------------------------------------------------------------------------------
 
 
-def _readable(text: str) -> str:
-    if reason := unreadable(text):
-        raise ValueError(reason)
-    return text
-
-
 def _moment(text: str) -> str:
     if not re.fullmatch(TIME, text):
         raise ValueError("a time is needed such as 2026-01-31T12:00:00.000000+00:00, before the year 2200")
@@ -66,20 +52,14 @@ def _moment(text: str) -> str:
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+(-[A-Za-z0-9]+)*$", max_length=200)]
 EnvId = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+-v(0|[1-9][0-9]{0,3})$", max_length=80)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Name = Annotated[str, Field(min_length=1, max_length=80), AfterValidator(_readable)]
-Text = Annotated[str, Field(max_length=1_000), AfterValidator(_readable)]
+Name = Annotated[str, fields.line(80, least=1)]
+Text = Annotated[str, fields.line(1_000)]
 #: Far from where sums overflow.
-Number = Annotated[float, Field(ge=-1e15, le=1e15, allow_inf_nan=False)]
-Positive = Annotated[float, Field(ge=0.0, le=1e15, allow_inf_nan=False)]
+Number = Annotated[float, between(-1e15, 1e15)]
+Positive = Annotated[float, between(0.0, 1e15)]
 Moment = Annotated[str, AfterValidator(_moment)]
 #: What `nonce` names as its source where it is a commit of the repository in which the board lies.
 COMMIT = "commit"
-
-
-class Strict(BaseModel):
-    """Data of exactly these types, without anything besides."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
 class Event(Strict):
@@ -109,15 +89,15 @@ class Reference(Strict):
     controller: Name
     mean: Number
     error: Positive
-    episodes: Annotated[int, Field(ge=1, le=10**9)]
+    episodes: Annotated[int, between(1, 10**9)]
 
 
 class Rules(Strict):
     """What a verification is: how many episodes, how many policies of a learner, and what success means."""
 
-    episodes: Annotated[int, Field(ge=1, le=10**6)]
-    disturbed_episodes: Annotated[int, Field(ge=1, le=10**6)]
-    learned_policies: Annotated[int, Field(ge=1, le=1000)]
+    episodes: Annotated[int, between(1, 10**6)]
+    disturbed_episodes: Annotated[int, between(1, 10**6)]
+    learned_policies: Annotated[int, between(1, 1000)]
     success: dict[EnvId, Text]
 
 
@@ -125,7 +105,7 @@ class Protocol(Event):
     """A protocol begins: what a score means from here on. All that counts is to be verified anew."""
 
     event: Literal["protocol"]
-    number: Annotated[int, Field(ge=1, le=10**6)]
+    number: Annotated[int, between(1, 10**6)]
     rules: Rules
     scales: dict[EnvId, Scale]
     references: dict[EnvId, Reference]
@@ -137,7 +117,7 @@ class Added(Event):
     event: Literal["added"]
     id: Id
     env: EnvId
-    protocol: Annotated[int, Field(ge=1, le=10**6)]
+    protocol: Annotated[int, between(1, 10**6)]
     name: Name
     authors: Annotated[list[Name], Field(min_length=1, max_length=20)]
     kind: Literal["learned", "controller", "optimal"]
@@ -213,16 +193,6 @@ def load_json(content: bytes) -> Any:
         return json.loads(content.decode(), object_pairs_hook=once, parse_constant=constant)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
-
-
-def checked(adapter: TypeAdapter[Any], value: Any) -> Any:
-    """Return a value as its schema has it; raise a ValueError of one line otherwise."""
-    try:
-        return adapter.validate_python(value)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        place, what = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Value error, ")
-        raise ValueError(f"{plain(place)}: {what}, got {shown(first['input'])}".removeprefix(": ")) from None
 
 
 @dataclass(frozen=True)

@@ -23,19 +23,24 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, create_model, model_validator
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import Fields, shown
+from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, shown
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import resolve
 
 Array = NDArray[np.float64]
 #: Lengths of an array's axes; a name stands for any length of at least 2, the same wherever it occurs.
 Shape = tuple[int | str, ...]
+
+
+#: How messages call the table.
+POLICY = "[policy]"
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,12 @@ class Policy:
         return self.architecture.agent(self.arrays)
 
 
+class PolicyTable(Strict):
+    """The table ``[policy]``."""
+
+    architecture: str
+
+
 class Architecture(ABC):
     """One entry of the list, checked.
 
@@ -71,8 +82,8 @@ class Architecture(ABC):
     ----------
     env_id : str
         Id of the environment.
-    table : Fields
-        The table ``[policy]``, without ``architecture``.
+    table : Strict
+        The table ``[policy]``, as `table` describes it.
 
     Raises
     ------
@@ -80,24 +91,29 @@ class Architecture(ABC):
         For anything wrong in the table.
     """
 
+    #: What the table ``[policy]`` must be.
+    table: type[Strict] = PolicyTable
     #: Names and shapes of the arrays in each policy's file; nothing where there are no files.
     arrays: dict[str, Shape]
     #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
     plans = False
 
     @abstractmethod
-    def __init__(self, env_id: str, table: Fields) -> None: ...
+    def __init__(self, env_id: str, table: Any) -> None: ...
 
     @abstractmethod
     def agent(self, arrays: Mapping[str, Array]) -> Any:
         """Return what acts; raise Refused where values do not fit."""
 
 
-def architecture(env_id: str, table: Fields) -> Architecture:
+def architecture(env_id: str, table: Mapping[str, Any]) -> Architecture:
     """Return the architecture that the table ``[policy]`` describes."""
-    made = ARCHITECTURES[table.choice("architecture", ARCHITECTURES)](env_id, table)
-    table.done()
-    return made
+    name = table.get("architecture")
+    if not isinstance(name, str) or name not in ARCHITECTURES:
+        known = ", ".join(sorted(ARCHITECTURES))
+        raise Refused(f"{POLICY}: architecture must be one of {known}, got {shown(name)}")
+    kind = ARCHITECTURES[name]
+    return kind(env_id, accepted(kind.table, dict(table), POLICY))
 
 
 class Agent(ABC):
@@ -140,6 +156,33 @@ def bin_centres(bins: int) -> Array:
     return (2.0 * np.arange(bins) + 1.0) / bins - 1.0
 
 
+class Normalise(Strict):
+    """How a network's observations are normalised."""
+
+    epsilon: Annotated[float, between(1e-12, 1.0)] = 1e-8
+    clip: Annotated[float, between(1e-3, 1e9)] = 10.0
+
+
+class MLPTable(PolicyTable):
+    """The table of a network."""
+
+    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)]
+    activation: Literal["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"] = "tanh"
+    bins: Annotated[int, between(2, 1_001)] | None = None
+    squash: Literal["clip", "tanh"] | None = None
+    mean_limit: Annotated[float, between(0.0, 1e6)] = 0.0
+    normalise: Normalise | None = None
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        given = self.model_fields_set & {"squash", "mean_limit"}
+        if self.bins and given:
+            raise ValueError(f"{min(given)} means nothing beside bins; leave it out")
+        if not self.bins and self.squash is None:
+            raise ValueError("squash or bins is missing")
+        return self
+
+
 class MLP(Architecture):
     """A network of fully connected layers, evaluated in float64.
 
@@ -153,28 +196,21 @@ class MLP(Architecture):
     ``obs_var``.
     """
 
-    def __init__(self, env_id: str, table: Fields) -> None:
+    table = MLPTable
+
+    def __init__(self, env_id: str, table: MLPTable) -> None:
         wide = len(protocol.make_task(env_id).observation)
-        hidden = table.wholes("hidden", 0, protocol.LAYERS, 1, protocol.WIDTH)
-        self.activation = table.choice("activation", ACTIVATIONS, "tanh")
-        self.bins = table.whole("bins", 0, 1_001, 0)
-        if self.bins == 1:
-            raise Refused(f"{table.where}: bins must be at least 2, or left out, got 1")
-        self.squash = "clip" if self.bins else table.choice("squash", ("clip", "tanh"))
-        self.mean_limit = 0.0 if self.bins else table.number("mean_limit", 0.0, 1e6, 0.0)
-        self.normalise = None
+        self.activation, self.bins, self.squash = table.activation, table.bins, table.squash
+        self.mean_limit, self.normalise = table.mean_limit, table.normalise
         self.controls = protocol.make_task(env_id).formulas.actions
-        widths = [wide, *hidden, self.controls * (self.bins or 1)]
+        widths = [wide, *table.hidden, self.controls * (self.bins or 1)]
         self.arrays = {}
         for k, (rows, columns) in enumerate(zip(widths[1:], widths[:-1], strict=True)):
             self.arrays |= {f"weight_{k}": (rows, columns), f"bias_{k}": (rows,)}
         numbers = sum((columns + 1) * rows for rows, columns in zip(widths[1:], widths[:-1], strict=True))
         if numbers > protocol.NUMBERS:
             raise Refused(f"the network has {numbers} numbers, at most {protocol.NUMBERS} are accepted")
-        if (part := table.any("normalise", None)) is not None:
-            sub = Fields(f"{table.where}.normalise", part)
-            self.normalise = sub.number("epsilon", 1e-12, 1.0, 1e-8), sub.number("clip", 1e-3, 1e9, 10.0)
-            sub.done()
+        if self.normalise:
             self.arrays |= {"obs_mean": (wide,), "obs_var": (wide,)}
         self.layers = len(widths) - 1
 
@@ -194,8 +230,8 @@ class _Network(Agent):
         ]
         self.centres = bin_centres(mlp.bins) if mlp.bins else None
         if mlp.normalise:
-            epsilon, self.clip = mlp.normalise
-            self.mean, self.deviation = arrays["obs_mean"], np.sqrt(arrays["obs_var"] + epsilon)
+            self.clip, self.mean = mlp.normalise.clip, arrays["obs_mean"]
+            self.deviation = np.sqrt(arrays["obs_var"] + mlp.normalise.epsilon)
 
     def outputs(self, observations: Array) -> Array:
         """Return what the last layer puts out, shape (n, 1) or (n, bins)."""
@@ -223,11 +259,11 @@ class _Network(Agent):
 class Linear(Architecture):
     """Action = gain · observation + offset, clipped to [-1, 1].
 
-    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), or (n_observation, n_actions)
-    and (n_actions,) where an action has several numbers. `lag-envs info ID` lists the observation.
+    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), each with an axis for the numbers of an action
+    where these are several. `lag-envs info ID` lists the observation.
     """
 
-    def __init__(self, env_id: str, table: Fields) -> None:
+    def __init__(self, env_id: str, table: PolicyTable) -> None:
         task = protocol.make_task(env_id)
         wide, count = len(task.observation), task.formulas.actions
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
@@ -251,6 +287,25 @@ class _Feedback(Agent):
 # --- tables -------------------------------------------------------------------------------------------------
 
 
+class GridTable(PolicyTable):
+    """The table of numbers on a grid."""
+
+    axes: Annotated[list[Annotated[str, line(40)]], many(1, 5)]
+    kind: Literal["action", "value"]
+    actions: Annotated[int, between(3, 21)] = 11
+    mirror: str = ""
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if len(set(self.axes)) < len(self.axes):
+            raise ValueError("axes must differ")
+        if self.kind == "action" and "actions" in self.model_fields_set:
+            raise ValueError("actions means nothing in a table of actions; leave it out")
+        if self.mirror not in ("", *(set(self.axes) - {"time"})):
+            raise ValueError(f"mirror must be one of the axes and not time, not {shown(self.mirror)}")
+        return self
+
+
 class Table(Architecture):
     """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, as at the edge.
 
@@ -269,28 +324,22 @@ class Table(Architecture):
     Arrays: ``axis_0`` (n0,), ``axis_1`` (n1,) and so on, growing, and ``table`` (n0, n1, ...).
     """
 
-    MOST_AXES = 5
+    table = GridTable
 
-    def __init__(self, env_id: str, table: Fields) -> None:
+    def __init__(self, env_id: str, table: GridTable) -> None:
         self.task = protocol.make_task(env_id)
         if self.task.formulas.actions != 1 or self.task.formulas.targets > 1:
-            raise Refused(f"{table.where}: tables are for tasks with one control and at most one target")
+            raise Refused(f"{POLICY}: tables are for tasks with one control and at most one target")
         names = list(self.task.scene.state_names)
         has_target = self.task.target_range is not None
         known = [*names, "time"]
         if has_target:
             known += ["target", *(f"{name} - target" for name in names)]
-        self.axes = table.texts("axes", 1, self.MOST_AXES, 40)
+        self.axes = tuple(table.axes)
         for axis in self.axes:
             if axis not in known:
-                raise Refused(f"{table.where}: axes must be of {', '.join(known)}; got {shown(axis)}")
-        if len(set(self.axes)) < len(self.axes):
-            raise Refused(f"{table.where}: axes must differ")
-        self.kind = table.choice("kind", ("action", "value"))
-        self.actions = table.whole("actions", 3, 21, 11) if self.kind == "value" else 0
-        mirror = table.any("mirror", "")
-        if mirror not in ("", *(set(self.axes) - {"time"})):
-            raise Refused(f"{table.where}: mirror must be one of the axes and not time, got {shown(mirror)}")
+                raise Refused(f"{POLICY}: axes must be of {', '.join(known)}; got {shown(axis)}")
+        self.kind, self.actions, mirror = table.kind, table.actions, table.mirror
         #: For each axis the signs of (*states, target, time) of which it is the sum.
         self.sums = np.zeros((len(self.axes), len(names) + 2))
         for row, axis in zip(self.sums, self.axes, strict=True):
@@ -397,6 +446,13 @@ class _LookUp:
 PLANS = ("opening", "periods")
 
 
+class ControllerTable(PolicyTable):
+    """The table of a built-in controller."""
+
+    name: str
+    numbers: dict[str, Any] = Field(default={})
+
+
 class Controller(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
@@ -404,24 +460,26 @@ class Controller(Architecture):
     keyword arguments that are numbers, optional. There are no arrays.
     """
 
-    def __init__(self, env_id: str, table: Fields) -> None:
+    table = ControllerTable
+
+    def __init__(self, env_id: str, table: ControllerTable) -> None:
         from lag_envs.controllers import build, controllers
 
         self.task = protocol.make_task(env_id)
         known = controllers(self.task)
-        chosen = table.choice("name", known)
-        found = known[chosen]
-        self.build, self.plans = partial(build, self.task, chosen), found.plans
-        numbers = table.table("numbers", {})
-        self.numbers = {
-            name: numbers.number(name, -1e6, 10.0 if name in PLANS else 1e6)
+        if table.name not in known:
+            raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")
+        found = known[table.name]
+        self.build, self.plans = partial(build, self.task, table.name), found.plans
+        own: dict[str, Any] = {
+            name: (Annotated[float, between(-1e6, 10.0 if name in PLANS else 1e6)], 0.0)
             for name, parameter in inspect.signature(resolve(found.place)).parameters.items()
             if parameter.kind is parameter.KEYWORD_ONLY
             and name not in found.numbers
             and re.fullmatch(r"float( \| None)?", str(parameter.annotation))
-            and name in numbers
         }
-        numbers.done()
+        numbers = accepted(create_model("Numbers", __base__=Strict, **own), table.numbers, "[policy.numbers]")
+        self.numbers = numbers.model_dump(exclude_unset=True)
         self.arrays = {}
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:

@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import plain
-from lag_envs.leaderboard.log import EnvId, Hash, Number, Strict, Text, checked, load_json
+from lag_envs.leaderboard.fields import Strict, checked, plain
+from lag_envs.leaderboard.log import EnvId, Hash, Number, Text, load_json
 
 #: Bytes of a result, packed and unpacked.
 PACKED, UNPACKED = 2**25, 2**28
@@ -41,7 +41,7 @@ class Replay(Strict):
     seed: Count
     reset_seed: Count
     return_: Number = Field(alias="return")
-    dt: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+    dt: Annotated[float, Field(gt=0.0)]
     states: Annotated[list[list[Number]], Field(min_length=1, max_length=100_000)]
     actions: list[Number] | list[list[Number]]
     rewards: list[Number]

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
 import os
-import signal
-import socket
 import stat
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from lag_envs.leaderboard.protocol import FOLDER_BYTES
+from lag_envs.workers import cluster, outcomes, processes
 
 Work = Callable[[Path], Any]
-
-
-class SpreadError(Exception):
-    """The work cannot be spread; the text says why, and what to do."""
 
 
 def map_submissions(
@@ -53,14 +42,21 @@ def map_submissions(
     Raises
     ------
     SpreadError
-        Where Ray is missing, or its cluster.
+        Of `lag_envs.workers`, where Ray is missing, or its cluster.
     """
-    if not folders:
-        return
     if ray is not None:
-        yield from _on_ray(function, folders, ray)
+        with cluster(ray) as submit:
+            futures = {}
+            for folder in folders:
+                files = packed(folder)
+                if files is None:  # it will be refused, for which nobody else is needed
+                    yield folder, _caught(function, folder)
+                else:
+                    futures[submit(_unpacked, function, folder.name, files)] = folder
+            yield from outcomes(futures)
     elif jobs > 1 and len(folders) > 1:
-        yield from _in_processes(function, folders, jobs)
+        with processes(min(jobs, len(folders))) as submit:
+            yield from outcomes({submit(function, folder): folder for folder in folders})
     else:
         for folder in folders:
             yield folder, _caught(function, folder)
@@ -71,118 +67,6 @@ def _caught(function: Work, folder: Path) -> Any:
         return function(folder)
     except Exception as error:
         return error
-
-
-# --- processes ----------------------------------------------------------------------------------------------
-
-
-def _in_processes(function: Work, folders: Sequence[Path], jobs: int) -> Iterator[tuple[Path, Any]]:
-    """Work side by side; whom a dying process takes down with it gets a second try in one of its own."""
-    again: list[Path] = []
-    for folder, outcome in _in_pool(function, folders, jobs):
-        if isinstance(outcome, BrokenProcessPool):
-            again.append(folder)
-        else:
-            yield folder, outcome
-    for folder in again:
-        yield from _in_pool(function, [folder], 1)
-
-
-def _in_pool(function: Work, folders: Sequence[Path], jobs: int) -> Iterator[tuple[Path, Any]]:
-    with _pool(min(jobs, len(folders))) as pool:
-        futures: dict[Future, Path] = {pool.submit(_caught, function, f): f for f in folders}
-        for future in as_completed(futures):
-            try:
-                yield futures[future], future.result()
-            except Exception as error:  # it died, or what came of it cannot be pickled
-                yield futures[future], error
-
-
-@contextmanager
-def _pool(size: int) -> Iterator[ProcessPoolExecutor]:
-    """Give processes of one thread each, which end with this one even if it is killed."""
-    from lag_envs.benchmark import ONE_THREAD
-
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    others = multiprocessing.active_children()
-    os.environ.update(ONE_THREAD)  # a process inherits it when it starts
-    pool = ProcessPoolExecutor(size, multiprocessing.get_context("spawn"), _end_with_parent)
-    try:
-        yield pool
-    except BaseException:  # such as Ctrl-C: what they do would not be waited for
-        for child in multiprocessing.active_children():
-            if child not in others:
-                child.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _end_with_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets Ctrl-C too, and ends its processes
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-# --- Ray ----------------------------------------------------------------------------------------------------
-
-
-def _on_ray(function: Work, folders: Sequence[Path], address: str) -> Iterator[tuple[Path, Any]]:
-    try:
-        import ray
-    except ImportError as error:
-        raise SpreadError("--ray needs Ray: pip install 'lag-envs[leaderboard,ray]'") from error
-
-    import lag_envs
-
-    check_address(address)
-    packages = {"py_modules": [str(Path(lag_envs.__file__).parent)]}
-    try:
-        ray.init(
-            None if address == "local" else address, runtime_env=packages, logging_level=logging.ERROR,
-            log_to_driver=False,
-        )  # fmt: skip
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
-    try:
-        task = ray.remote(num_cpus=1, max_retries=1)(_unpacked)
-        running: dict[Any, Path] = {}
-        for folder in folders:
-            files = packed(folder)
-            if files is None:  # it will be refused, for which nobody else is needed
-                yield folder, _caught(function, folder)
-            else:
-                running[task.remote(function, folder.name, files)] = folder
-        while running:
-            for handle in ray.wait(list(running))[0]:
-                folder = running.pop(handle)
-                try:
-                    yield folder, ray.get(handle)
-                except Exception as error:  # the worker, or its machine, is gone
-                    yield folder, error
-    finally:
-        ray.shutdown()
-
-
-def check_address(address: str) -> None:
-    """Raise SpreadError where nobody listens: Ray itself would try for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host:
-        try:
-            socket.create_connection((host, int(port)), timeout=10.0).close()
-        except (OSError, ValueError, OverflowError) as error:
-            raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
 
 
 def packed(folder: Path) -> dict[str, bytes] | None:

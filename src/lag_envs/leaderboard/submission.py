@@ -17,13 +17,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, model_validator
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.fields import Fields, shown
+from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.names import wordless
 from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, Table, architecture
@@ -35,7 +36,6 @@ TOML = "submission.toml"
 #: Training seeds lie below this.
 MOST_SEED = 10**9
 POLICY = re.compile(r"policy_(0|[1-9][0-9]{0,8})\.safetensors")
-DTYPES = {"F32": 4, "F64": 8}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +92,68 @@ class Submission(About):
     folder: Path
 
 
+# --- what submission.toml must be ---------------------------------------------------------------------------
+
+
+Seed = Annotated[int, between(0, MOST_SEED - 1)]
+Steps = Annotated[list[Annotated[float, between(0.0, 1e15)]], many(1, protocol.CURVE)]
+Returns = Annotated[list[Annotated[float, between(-1e9, 1e9)]], many(1, protocol.CURVE)]
+
+
+def _named(name: str) -> str:
+    if wordless(name):
+        raise ValueError("there must be a letter or a digit")
+    return name
+
+
+def _on_a_board(env: str) -> str:
+    if env not in (known := protocol.boards()):
+        raise ValueError(f"must be one of {', '.join(known)}")
+    return env
+
+
+class Curve(Strict):
+    """A learning curve."""
+
+    seed: Seed
+    steps: Steps
+    returns: Returns
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if len(self.steps) != len(self.returns) or any(b <= a for a, b in pairwise(self.steps)):
+            raise ValueError("steps must grow, and be as many as the returns")
+        return self
+
+
+class Training(Strict):
+    """The table ``[training]``."""
+
+    seeds: Annotated[list[Seed], many(0, protocol.MOST_POLICIES)] = Field(default=[])
+    env_steps: Annotated[int, between(0, 10**15)]
+    seconds: Annotated[float, between(0.0, 1e12)]
+    hardware: Annotated[str, line(200)]
+    curves: Annotated[list[Curve], many(0, protocol.MOST_POLICIES)] = Field(default=[])
+
+
+class Toml(Strict):
+    """All of the file."""
+
+    version: Annotated[int, between(protocol.SCHEMA, protocol.SCHEMA)] = Field(alias="schema")
+    #: The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
+    stated: Annotated[int, between(1, 10**6)] = Field(default=1, alias="protocol")
+    env: Annotated[str, AfterValidator(_on_a_board)]
+    name: Annotated[str, line(60), Field(pattern="[A-Za-z0-9]")]
+    authors: Annotated[list[Annotated[str, line(80), AfterValidator(_named)]], many(1, 20)]
+    license: Annotated[str, line(60), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+() -]*$")]
+    code: Annotated[str, line(200), Field(pattern=r"^(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?$")] = ""
+    description: Annotated[str, line(500)] = ""
+    #: Follows from the architecture; may be stated.
+    kind: Any = None
+    policy: dict[str, Any]
+    training: Training | None = None
+
+
 # --- reading ------------------------------------------------------------------------------------------------
 
 
@@ -145,37 +207,19 @@ def about(files: Mapping[str, bytes]) -> About:
     Refused
         For anything in ``submission.toml`` that is not as it should be.
     """
-    top = Fields("", _parse(files[TOML]))
-    top.where = TOML
-    if (value := top.any("schema")) != protocol.SCHEMA or type(value) is not int:
-        raise Refused(
-            f"{TOML}: schema must be {protocol.SCHEMA}, the only one accepted here, got {shown(value)}"
-        )
-    # The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
-    top.whole("protocol", 1, 10**6, 1)
-    env = top.choice("env", protocol.boards())
-    told: dict[str, Any] = {
-        "name": top.text("name", 60, pattern=r".*[A-Za-z0-9].*"),
-        "authors": top.texts("authors", 1, 20, 80),
-        "license": top.text("license", 60, pattern=r"[A-Za-z0-9][A-Za-z0-9.+() -]*"),
-        "code": top.text("code", 200, "", r"(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?"),
-        "description": top.text("description", 500, ""),
-    }
-    for author in told["authors"]:
-        if wordless(author):
-            raise Refused(f"{TOML}: authors must have a letter or a digit each, got {shown(author)}")
-    made = architecture(env, top.table("policy"))
+    told = accepted(Toml, _parse(files[TOML]), TOML)
+    made = architecture(told.env, told.policy)
     found = sorted(int(match[1]) for name in files if (match := POLICY.fullmatch(name)))
-    training = _training(top, found)
-    kind = _kind(made, bool(training), top.any("kind", None))
-    top.done()
+    training = _training(told.training, found) if told.training else {}
+    kind = _kind(made, bool(training), told.kind)
     if not made.arrays and found:
         raise Refused(f"policy_{found[0]}.safetensors: a built-in controller has no arrays; remove it")
     least = protocol.LEARNED_POLICIES if kind == "learned" else 1
     if made.arrays and len(found) < least:
         raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")
     return About(
-        env=env, **told, kind=kind, digest=digest_of(files), seeds=tuple(found) if made.arrays else (0,),
+        **told.model_dump(include={"env", "name", "license", "code", "description"}), kind=kind,
+        authors=tuple(told.authors), digest=digest_of(files), seeds=tuple(found) if made.arrays else (0,),
         architecture=made, training=training,
     )  # fmt: skip
 
@@ -253,32 +297,18 @@ def _parse(content: bytes) -> dict[str, Any]:
         raise Refused(f"{TOML} is no TOML: {shown(str(error))}") from error
 
 
-def _training(top: Fields, found: list[int]) -> dict[str, Any]:
+def _training(told: Training, found: list[int]) -> dict[str, Any]:
     """Return the table ``[training]``; `found` are the seeds of which there are policies."""
-    if "training" not in top:
-        return {}
-    table = top.table("training")
-    seeds = table.wholes("seeds", 0, protocol.MOST_POLICIES, 0, MOST_SEED - 1, [])
-    if sorted(seeds) != found:
-        raise Refused(f"{table.where}: seeds must be those of the policy files, {found}; got {sorted(seeds)}")
-    result: dict[str, Any] = {
-        "env_steps": table.whole("env_steps", 0, 10**15),
-        "seconds": table.number("seconds", 0.0, 1e12),
-        "hardware": table.text("hardware", 200),
-        "curves": [],
-    }
-    for curve in table.tables("curves", protocol.MOST_POLICIES):
-        seed = curve.whole("seed", 0, MOST_SEED - 1)
-        steps = curve.numbers("steps", 1, protocol.CURVE, 0.0, 1e15)
-        returns = curve.numbers("returns", 1, protocol.CURVE, -1e9, 1e9)
-        curve.done()
-        if seed not in found or any(c["seed"] == seed for c in result["curves"]):
-            raise Refused(f"{curve.where}: seed must be one of {found}, each at most once, got {seed}")
-        if len(steps) != len(returns) or any(b <= a for a, b in pairwise(steps)):
-            raise Refused(f"{curve.where}: steps must grow, and be as many as the returns")
-        result["curves"].append({"seed": seed, "steps": list(steps), "returns": list(returns)})
-    table.done()
-    return result
+    if sorted(told.seeds) != found:
+        raise Refused(
+            f"{TOML}: training.seeds must be those of the policy files, {found}; got {sorted(told.seeds)}"
+        )
+    seeds = [curve.seed for curve in told.curves]
+    if odd := [seed for seed in seeds if seed not in found or seeds.count(seed) > 1]:
+        raise Refused(
+            f"{TOML}: training.curves: seed must be one of {found}, each at most once, got {odd[0]}"
+        )
+    return told.model_dump(exclude={"seeds"})
 
 
 def _kind(made: Architecture, trained: bool, stated: Any) -> str:
@@ -326,14 +356,15 @@ def digest_of(files: Mapping[str, bytes]) -> str:
 
 def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[np.float64]]:
     """Return the arrays of a file, which must be the ones that the architecture asks for."""
-    _check_shapes(name, _header(name, content), made)
     from safetensors import SafetensorError
     from safetensors.numpy import load as read
 
     try:
+        _check_header(content)
         found = read(content)
     except (SafetensorError, ValueError, KeyError) as error:
-        raise Refused(f"{name} is no safetensors file: {shown(str(error))}") from error
+        raise Refused(f"{name} is no safetensors file as needed here: {plain(error)[:200]}") from error
+    _check_shapes(name, {key: array.shape for key, array in found.items()}, made)
     arrays = {}
     for key, array in found.items():
         if not np.isfinite(array).all():
@@ -344,11 +375,8 @@ def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[
     return arrays
 
 
-def _header(name: str, content: bytes) -> dict[str, tuple[int, ...]]:
-    """Return the shapes that a safetensors file's header tells, checked against the file's size."""
-
-    def refuse(why: str) -> Refused:
-        return Refused(f"{name} is no safetensors file as needed here: {why}")
+def _check_header(content: bytes) -> None:
+    """Refuse in a header what the library takes: a long one, a key twice, other types, anything besides."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
@@ -356,43 +384,17 @@ def _header(name: str, content: bytes) -> dict[str, tuple[int, ...]]:
         return dict(pairs)
 
     size = int.from_bytes(content[:8], "little")
-    if len(content) < 8 or size > protocol.HEADER_BYTES or 8 + size > len(content):
-        raise refuse(f"its header must end within the file and have at most {protocol.HEADER_BYTES} bytes")
+    if size > protocol.HEADER_BYTES:
+        raise ValueError(f"its header must have at most {protocol.HEADER_BYTES} bytes, not {size}")
     try:
         header = json.loads(content[8 : 8 + size].decode(), object_pairs_hook=once)
     except (ValueError, RecursionError) as error:
-        raise refuse(f"its header is no JSON ({shown(str(error))})") from error
-    if not isinstance(header, dict) or not header:
-        raise refuse("its header must be an object with an entry for each array")
-    shapes, ranges = {}, []
-    for key, entry in header.items():
+        raise ValueError(f"its header is no JSON ({error})") from error
+    for key, entry in header.items() if isinstance(header, dict) else ():
         if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
-            raise refuse(f"the entry {shown(key)} must have dtype, shape and data_offsets and nothing else")
-        dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
-        if not isinstance(dtype, str) or dtype not in DTYPES:
-            raise refuse(f"{shown(key)} must be of F32 or F64, got {shown(dtype)}")
-        for what, numbers, most in (("shape", shape, 8), ("data_offsets", offsets, 2)):
-            if (
-                not isinstance(numbers, list)
-                or len(numbers) > most
-                or any(type(n) is not int or not 0 <= n <= len(content) for n in numbers)
-            ):
-                raise refuse(f"{shown(key)}: {what} must be whole numbers that fit the file")
-        count = 1
-        for n in shape:
-            count *= n
-        if len(offsets) != 2 or offsets[1] - offsets[0] != count * DTYPES[dtype]:
-            raise refuse(f"{shown(key)}: data_offsets do not fit the shape")
-        shapes[key] = tuple(shape)
-        ranges.append(tuple(offsets))
-    end = 0
-    for first, last in sorted(ranges):
-        if first != end:
-            raise refuse("its arrays overlap, or leave gaps")
-        end = last
-    if 8 + size + end != len(content):
-        raise refuse("its arrays do not fill the file")
-    return shapes
+            raise ValueError(f"{plain(key)} must have dtype, shape and data_offsets and nothing else")
+        if entry["dtype"] not in ("F32", "F64"):
+            raise ValueError(f"{plain(key)} must be of F32 or F64, got {shown(entry['dtype'])}")
 
 
 def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Architecture) -> None:
@@ -458,6 +460,7 @@ def write(
     FileExistsError
         For a folder that is there.
     """
+    import tomli_w
     from safetensors.numpy import save
 
     folder, arrays = Path(folder), arrays or {}
@@ -476,7 +479,7 @@ def write(
     part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         part.chmod(0o755)
-        (part / TOML).write_text("\n".join(_toml(told)) + "\n", encoding="utf-8", newline="\n")
+        (part / TOML).write_text(tomli_w.dumps(told), encoding="utf-8", newline="\n")
         for seed, content in arrays.items():
             found = {key: np.ascontiguousarray(array) for key, array in content.items()}
             (part / f"policy_{seed}.safetensors").write_bytes(save(found))
@@ -486,37 +489,3 @@ def write(
         shutil.rmtree(part, ignore_errors=True)
         raise
     return load(folder)
-
-
-def _toml(table: Mapping[str, Any], path: str = "") -> list[str]:
-    """Return the lines of a TOML table; its own values first, then the tables in it."""
-    lines = [f"{key} = {_value(v)}" for key, v in table.items() if not _is_table(v)]
-    for key, value in table.items():
-        name = f"{path}{key}"
-        if isinstance(value, Mapping):
-            lines += ["", f"[{name}]", *_toml(value, f"{name}.")]
-        elif _is_table(value):
-            for row in value:
-                lines += ["", f"[[{name}]]", *_toml(row, f"{name}.")]
-    return lines
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, Mapping) or (
-        isinstance(value, list | tuple) and len(value) > 0 and isinstance(value[0], Mapping)
-    )
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        parts = [_value(v) for v in value]
-        if sum(map(len, parts)) < 90:
-            return f"[{', '.join(parts)}]"
-        return "[\n" + "".join(f"  {part},\n" for part in parts) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)  # a JSON string is one of TOML
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | np.integer):
-        return str(int(value))
-    return repr(float(value))

@@ -18,7 +18,8 @@ from typing import Any
 from lag_envs import benchmark
 from lag_envs.report import page
 from lag_envs.report.content import Picture, Table
-from lag_envs.report.report import FILE, content_of, write_json
+from lag_envs.report.report import FILE, content_of
+from lag_envs.store import write
 
 FIGURES = "images/accuracy"
 #: Sections whose summaries README shows.
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         old.unlink()
     contents = content_of(found)
     files = {p.name: drawn(p, figures).name for content in contents.values() for p in content.pictures}
-    write_json(docs / "accuracy.json", compact(found, files))
+    write(docs / "accuracy.json", json.dumps(compact(found, files), indent=1, allow_nan=False) + "\n")
     update(args.project)
     return 0
 
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def update(project: Path) -> None:
     """Write the texts that follow from ``docs/accuracy.json`` and ``docs/speed.json``."""
     for path, text in generated(project).items():
-        path.write_text(text, encoding="utf-8")
+        write(path, text)
 
 
 def generated(project: Path) -> dict[Path, str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from lag_envs import store
 from lag_envs.report.content import Content, Picture, Table
 
 VERDICTS = {True: "holds", False: "does not hold", None: "not measured"}
@@ -41,7 +42,7 @@ def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> 
         found=found, contents=contents, verdicts=VERDICTS, tables=tables, file_of=file_of,
         problems=[p for part in found["sections"].values() for p in part["problems"]],
     )  # fmt: skip
-    (folder / "index.html").write_text(text, encoding="utf-8")
+    store.write(folder / "index.html", text)
 
 
 def tables(content: Content, details: bool = False) -> list[Table]:

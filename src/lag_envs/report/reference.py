@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from lag_envs.report import closed_forms
 from lag_envs.report.oracle import Oracle, agreed, listed, oracle_of
 from lag_envs.scenes.base import Scene
+from lag_envs.store import write
 
 Array = NDArray[np.float64]
 #: Folder in which the exact ends are kept; None keeps nothing.
@@ -59,9 +59,7 @@ def remembered(scene: Scene, state: Sequence[float], controls: Any, dt: float) -
             return [mpf(text) for text in json.loads(file.read_text(encoding="utf-8"))]
         found = flow(scene, state, controls, dt)
         if file:
-            part = file.with_suffix(f".{os.getpid()}")
-            part.write_text(json.dumps([mp.nstr(x, 40) for x in found]), encoding="utf-8")
-            part.replace(file)
+            write(file, json.dumps([mp.nstr(x, 40) for x in found]))
         return found
 
 

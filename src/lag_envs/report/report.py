@@ -11,9 +11,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lag_envs.benchmark import columns, machine
+from lag_envs import store
+from lag_envs.benchmark import machine
 from lag_envs.report.content import Content
 from lag_envs.report.runner import Result, module, run_jobs, versions
+from lag_envs.tables import columns
 
 #: Modules of this package, in the order of the page.
 SECTIONS = ("environments", "work_precision", "general", "bound", "stability", "conservation", "leave_out")
@@ -52,7 +54,7 @@ def make_report(settings: Settings) -> bool:
     begin = time.monotonic()
     results, complete = run_jobs(jobs, folder, settings.processes, lambda text: print(text, file=sys.stderr))
     found = collect(settings, results, complete, time.monotonic() - begin)
-    write_json(folder / FILE, found)
+    store.write(folder / FILE, json.dumps(found, indent=1, allow_nan=False) + "\n")
     from lag_envs.report import page
 
     contents = content_of(found)
@@ -113,10 +115,3 @@ def claims(contents: dict[str, Content]) -> list[str]:
         for claim in content.claims
     ]
     return columns(rows) if rows else ["nothing was measured"]
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file in one go, so that a kill leaves the old one or the new one."""
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    part.replace(path)

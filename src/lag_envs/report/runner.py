@@ -7,23 +7,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
-import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import lag_envs
-from lag_envs.benchmark import ONE_THREAD, machine, progress
+from lag_envs import store
+from lag_envs.benchmark import machine, progress
+from lag_envs.workers import died, outcomes, processes
 
 Row = dict[str, Any]
 #: Whose versions matter.
@@ -116,14 +117,11 @@ def run_jobs(
     if len(todo) < len(jobs):
         tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are taken over from before")
     complete = True
-    with progress(len(todo)) as advance, file.open("a", encoding="utf-8") as out:
-        if out.tell() and not file.read_bytes().endswith(b"\n"):
-            out.write("\n")  # what a kill has cut off
+    with progress(len(todo)) as advance:
 
         def keep(result: Result) -> None:
             known[result.key] = result
-            out.write(json.dumps(vars(result), allow_nan=False) + "\n")
-            out.flush()
+            store.append(file, vars(result))
             advance(f"{result.section}: {result.name}")
             if result.problem:
                 tell(f"{result.section}: {result.name}: {result.problem}")
@@ -141,120 +139,50 @@ def run_jobs(
 def load(file: Path) -> list[Result]:
     """Return the results in a file; lines that a kill has cut off are passed over."""
     results = []
-    for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else []:
-        try:
-            results.append(Result(**json.loads(line)))
-        except (ValueError, TypeError):
-            continue
+    for row in store.rows(file):
+        with suppress(TypeError):
+            results.append(Result(**row))
     return results
 
 
-class _Worker:
-    """A process that takes one job at a time."""
-
-    def __init__(self, folder: Path) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, other = context.Pipe()
-        self.process = context.Process(target=_work, args=(other, str(folder)), daemon=True)
-        self.process.start()
-        other.close()
-        self.result: Result | None = None
-        self.start = self.deadline = 0.0
-
-    def give(self, job: Job) -> None:
-        self.result = Result(job.section, job.name, job.key)
-        self.start = time.monotonic()
-        self.deadline = self.start + job.timeout
-        try:
-            self.connection.send((job.function, job.arguments))
-        except OSError:  # it has died; `take` finds out how
-            pass
-
-    def take(self) -> bool:
-        """Take what the process has sent; return whether the job is finished."""
-        assert self.result is not None
-        try:
-            kind, value = self.connection.recv()
-        except (EOFError, OSError):
-            self.process.join()
-            return self.end(f"the process died, exit status {self.process.exitcode}")
-        if kind == "row":
-            self.result.rows.append(value)
-            return False
-        return self.end(value)
-
-    def end(self, problem: str | None) -> bool:
-        assert self.result is not None
-        self.result.problem = problem
-        self.result.seconds = round(time.monotonic() - self.start, 3)
-        return True
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self.connection.close()
+def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Result]:
+    with (
+        TemporaryDirectory(dir=folder, prefix="rows-") as rows,
+        processes(count, _begin, str(folder)) as submit,
+    ):
+        futures = {}
+        for job in jobs:
+            arguments = (job.function, job.arguments, Path(rows) / job.key)
+            futures[submit(_work, *arguments, timeout=job.timeout)] = job
+        for job, outcome in outcomes(futures):
+            if isinstance(outcome, TimeoutError):
+                outcome = f"stopped after {job.timeout:.0f} s", job.timeout
+            elif isinstance(outcome, BaseException):
+                outcome = died(outcome), 0.0
+            # Also those from before it died.
+            yield Result(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
 
 
-def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterable[Result]:
-    waiting = list(reversed(jobs))
-    idle: list[_Worker] = []
-    busy: list[_Worker] = []
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)  # a process inherits it
-    try:
-        while waiting or busy:
-            while waiting and len(busy) < count:
-                worker = idle.pop() if idle else _Worker(folder)
-                worker.give(waiting.pop())
-                busy.append(worker)
-            soonest = min(worker.deadline for worker in busy)
-            ready = wait([w.connection for w in busy], timeout=max(0.0, min(1.0, soonest - time.monotonic())))
-            for worker in list(busy):
-                late = time.monotonic() > worker.deadline
-                if worker.connection in ready:
-                    finished = worker.take()
-                elif late:
-                    finished = worker.end(f"stopped after {worker.deadline - worker.start:.0f} s")
-                else:
-                    continue
-                if finished:
-                    assert worker.result is not None
-                    busy.remove(worker)
-                    if late or not worker.process.is_alive():
-                        worker.stop()
-                    else:
-                        idle.append(worker)
-                    yield worker.result
-    finally:
-        for worker in idle + busy:
-            worker.stop()
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-def _work(connection: Connection, folder: str) -> None:
-    """Do jobs until there are no more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
+def _begin(folder: str) -> None:
+    """Prepare a process."""
     warnings.simplefilter("ignore")
     sys.stdout = sys.stderr = open(os.devnull, "w", encoding="utf-8")
     from lag_envs.report import reference
 
     reference.store = Path(folder) / "references"
     reference.store.mkdir(exist_ok=True)
-    while True:
-        try:
-            function, arguments = connection.recv()
-        except EOFError:
-            return
-        problem = None
-        try:
-            place, _, name = function.partition(":")
-            for row in getattr(module(place), name)(**arguments):
-                json.dumps(row, allow_nan=False)  # what could not be written costs this job only
-                connection.send(("row", row))
-        except Exception as error:
-            problem = describe(error)
-        connection.send(("end", problem))
+
+
+def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | None, float]:
+    """Do a job, write its rows, and return what went wrong and how many seconds it took."""
+    start, problem = time.monotonic(), None
+    try:
+        place, _, name = function.partition(":")
+        for row in getattr(module(place), name)(**arguments):
+            store.append(rows, row)
+    except Exception as error:
+        problem = describe(error)
+    return problem, round(time.monotonic() - start, 3)
 
 
 def module(name: str) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -20,6 +19,7 @@ from urllib.parse import urlsplit
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from lag_envs import store
 from lag_envs.leaderboard.site.scenery import describe
 
 #: Names the files that the last build wrote; only these are ever removed.
@@ -92,14 +92,14 @@ def build(data: Mapping[str, Any], out: Path) -> None:
     before = _manifest(out)
     pages, files = render(data)
     wanted = {**files, **pages}
-    _write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
+    store.write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
     for name, text in wanted.items():
         # A name with a hash says what is in the file, so it need not be written again.
         if name in pages or not (out / name).is_file():
-            _write(out / name, text)
+            store.write(out / name, text)
     for name in before - set(wanted):
         (out / name).unlink(missing_ok=True)
-    _write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
+    store.write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
 
 
 def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
@@ -348,14 +348,3 @@ def _manifest(out: Path) -> set[str]:
         return set()
     except (ValueError, KeyError, TypeError) as error:
         raise FileExistsError(f"{out / MANIFEST} cannot be read ({error}): remove the folder") from error
-
-
-def _write(path: Path, text: str) -> None:
-    """Write a file that is there either whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
-        new.write_text(text, encoding="utf-8")
-        os.replace(new, path)
-    finally:
-        new.unlink(missing_ok=True)

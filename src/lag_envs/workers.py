@@ -1,0 +1,138 @@
+"""Functions in other processes, or on the machines of a Ray cluster: whoever dies or hangs costs only itself.
+
+Both managers give a function ``submit(function, *args, timeout=None)``, which returns a
+`concurrent.futures.Future`; `outcomes` waits for many.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+Submit = Callable[..., Future]
+Key = TypeVar("Key")
+
+
+class SpreadError(Exception):
+    """The work cannot be spread; the text says why, and what to do."""
+
+
+def outcomes(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
+    """Yield what each future returned or raised, as they are finished."""
+    for future in as_completed(futures):
+        yield futures[future], future.exception() or future.result()
+
+
+def died(error: BaseException) -> str:
+    """Return in one line what became of work that raised nothing itself."""
+    if (status := getattr(error, "exitcode", None)) is not None:  # Pebble's ProcessExpired
+        return f"the process died, exit status {status}"
+    return f"{type(error).__name__}: {error}".splitlines()[0]
+
+
+@contextmanager
+def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator[Submit]:
+    """Give processes of one thread each, which end with this one even if it is killed.
+
+    Parameters
+    ----------
+    count : int
+        Processes side by side.
+    begin : callable, optional
+        Called with `args` in each process before its first work. What is still running when the block is
+        left is killed.
+    """
+    from pebble import ProcessPool
+
+    from lag_envs.benchmark import ONE_THREAD
+
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)  # a process inherits it when it starts
+    pool = ProcessPool(
+        count, context=multiprocessing.get_context("spawn"), initializer=_begin, initargs=(begin, args)
+    )
+
+    def submit(function: Callable, *args: Any, timeout: float | None = None) -> Future:
+        return pool.schedule(function, args=args, timeout=timeout)
+
+    try:
+        yield submit
+    finally:
+        pool.stop()
+        pool.join()
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _begin(begin: Callable | None, args: Sequence[Any]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets Ctrl-C too, and ends its processes
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    if begin is not None:
+        begin(*args)
+
+
+@contextmanager
+def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
+    """Give the machines of a Ray cluster; what is still running when the block is left is killed.
+
+    Parameters
+    ----------
+    address : str
+        "auto" for a running one, "local" for one on this machine.
+    modules : sequence of Path
+        Folders of modules that the machines get from here besides this package; what these import has to be
+        installed there.
+
+    Raises
+    ------
+    SpreadError
+        Where Ray is missing, or its cluster.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise SpreadError("--ray needs Ray: pip install 'lag-envs[ray]'") from error
+
+    check_address(address)
+    packages = {"py_modules": [str(folder) for folder in (Path(__file__).parent, *modules)]}
+    try:
+        ray.init(
+            None if address == "local" else address, runtime_env=packages, logging_level=logging.ERROR,
+            log_to_driver=False,
+        )  # fmt: skip
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
+
+    def submit(function: Callable, *args: Any) -> Future:
+        return ray.remote(num_cpus=1, max_retries=1)(function).remote(*args).future()
+
+    try:
+        yield submit
+    finally:
+        ray.shutdown()
+
+
+def check_address(address: str) -> None:
+    """Raise SpreadError where nobody listens: Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host:
+        try:
+            socket.create_connection((host, int(port)), timeout=10.0).close()
+        except (OSError, ValueError, OverflowError) as error:
+            raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error

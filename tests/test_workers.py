@@ -1,0 +1,93 @@
+"""Work in other processes: whoever dies or hangs costs only itself, and nobody outlives the one who asked."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from lag_envs import workers
+from lag_envs.workers import SpreadError, check_address, died, outcomes, processes
+
+HERE = Path(__file__).parents[1]
+greeting = ""
+
+
+def begin(text):
+    global greeting
+    greeting = text
+
+
+def work(what):
+    if what == "dies":
+        os._exit(3)
+    if what == "is killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if what == "hangs":
+        time.sleep(1000)
+    if what == "raises":
+        raise ValueError("no\nsuch")
+    if what == "returns what cannot be sent":
+        return lambda: None
+    return greeting, os.environ["OMP_NUM_THREADS"]
+
+
+def test_whatever_becomes_of_one_the_others_go_on():
+    given = ["dies", "is killed", "hangs", "raises", "returns what cannot be sent", "works", "works too"]
+    threads = os.environ.get("OMP_NUM_THREADS")
+    with processes(2, begin, "hello") as submit:
+        limits = {"hangs": 3.0}
+        found = dict(outcomes({submit(work, what, timeout=limits.get(what)): what for what in given}))
+    assert found["works"] == found["works too"] == ("hello", "1")
+    assert died(found["dies"]) == "the process died, exit status 3"
+    assert died(found["is killed"]) == "the process died, exit status -9"
+    assert isinstance(found["hangs"], TimeoutError)
+    assert died(found["raises"]) == "ValueError: no"
+    assert isinstance(found["returns what cannot be sent"], Exception)
+    assert os.environ.get("OMP_NUM_THREADS") == threads
+
+
+def test_who_leaves_early_does_not_wait():
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt), processes(1) as submit:
+        submit(work, "hangs")
+        raise KeyboardInterrupt
+    assert time.monotonic() - started < 60.0
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, test_workers\n"
+        "from lag_envs.workers import processes\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(1) as submit:\n"
+        "        print(submit(os.getpid).result(), flush=True)\n"
+        "        submit(test_workers.work, 'hangs').result()\n"
+    )
+    path = os.pathsep.join([str(HERE / "src"), str(HERE / "tests"), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
+    parent = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    child = int(parent.stdout.readline())
+    time.sleep(1.0)
+    parent.kill()
+    parent.communicate()
+    end = time.monotonic() + 60.0
+    while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_a_cluster_that_is_not_there(monkeypatch):
+    for address in ("127.0.0.1:1", "ray://127.0.0.1:1", "host:port"):
+        with pytest.raises(SpreadError, match="no Ray cluster at"):
+            check_address(address)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SpreadError, match=r"pip install 'lag-envs\[ray\]'"), workers.cluster("local"):
+        pass
