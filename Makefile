@@ -58,6 +58,7 @@ test-oldest: setup  ## run tests on the oldest supported Numba and NumPy, and al
 lint: setup
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/lint-imports --no-logo --no-cache
 
 types: setup
 	$(BIN)/python -m mypy

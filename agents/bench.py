@@ -18,17 +18,16 @@ from typing import Any
 from agents.analysis import rounded
 from agents.results import to_json
 from lag_envs.benchmark import (
-    ONE_THREAD,
     Contestant,
     Run,
     batch,
-    machine,
     measure,
     quartiles,
     random_actions,
     ratios,
     short,
 )
+from lag_envs.host import ONE_THREAD, machine
 from lag_envs.store import write
 from lag_envs.tables import columns
 

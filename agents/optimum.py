@@ -33,9 +33,9 @@ from agents.value_iteration import (
 )
 from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
-from lag_envs.benchmark import machine
 from lag_envs.controllers.basic import Reader
 from lag_envs.envs.model import Model
+from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task

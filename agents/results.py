@@ -22,7 +22,7 @@ from agents.evaluate import observation_spread
 from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
-from lag_envs.benchmark import machine
+from lag_envs.host import machine
 from lag_envs.scores import known_returns
 from lag_envs.store import write
 
@@ -259,7 +259,7 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 def show(data: Data, output: Path) -> int:
     """Write figures, page, and README's table."""
     from agents.report import figures, page, summary
-    from lag_envs.report.docs import replaced
+    from lag_envs.generated import replaced
 
     files = figures(data, output / PICTURES)
     for old in set((output / PICTURES).glob("agents-*.png")) - set(files):

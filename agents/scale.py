@@ -28,8 +28,8 @@ from agents.optimum import Optimal, played
 from agents.results import to_json
 from agents.run import UserError, check_env
 from lag_envs import TASKS
-from lag_envs.benchmark import machine
 from lag_envs.controllers import build, controllers, make_controller
+from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
 from lag_envs.tasks.measured import measured as of_package

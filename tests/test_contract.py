@@ -587,7 +587,7 @@ def test_lagrangian_is_t_less_v():
 
 
 def test_equations_are_solved_by_the_accelerations():
-    from lag_envs.lagrange import equations
+    from lag_envs.scenes.symbolic import equations
 
     scene = CartPole(friction=0.2)
     found = equations(scene)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import sympy
 
-from lag_envs import lagrange
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.recording import control, parameter
+from lag_envs.scenes import symbolic
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.cart_pole import CartPole
 from lag_envs.scenes.chain import Chain
@@ -66,19 +66,19 @@ class Lagrange:
         self.scene, self.prescribed = scene, tuple(scene.prescribed)
         self.coordinates = (*scene.coordinates, *self.prescribed)
         self.parameters = tuple(scene._numbers())
-        of = {name: sympy.Function(name, real=True)(lagrange.t) for name in self.coordinates}
+        of = {name: sympy.Function(name, real=True)(symbolic.t) for name in self.coordinates}
         q, v, self.a = ({name: sympy.Symbol(f"{k}_{name}") for name in self.coordinates} for k in "qva")
         u = {name: sympy.Symbol(f"u_{name}") for name in scene.control_names}
-        replaced = {sympy.Function(name, real=True)(lagrange.t): symbol for name, symbol in u.items()}
+        replaced = {sympy.Function(name, real=True)(symbolic.t): symbol for name, symbol in u.items()}
         for name, q_t in of.items():
-            rates = q_t.diff(lagrange.t), q_t.diff(lagrange.t, 2)
+            rates = q_t.diff(symbolic.t), q_t.diff(symbolic.t, 2)
             replaced |= {q_t: q[name], rates[0]: v[name], rates[1]: self.a[name]}
-        twin = lagrange.symbolic(scene)
+        twin = symbolic.symbolic(scene)
         self.inputs = [*q.values(), *v.values(), *self.a.values(), *u.values()]
         self.inputs += [getattr(twin, name) for name in self.parameters]
         self.terms, self.mass = {}, {}
         for name in self.coordinates:
-            equation = lagrange.euler_lagrange(scene, name).xreplace(replaced)
+            equation = symbolic.euler_lagrange(scene, name).xreplace(replaced)
             self.terms[name] = [self._function(term) for term in sympy.Add.make_args(equation)]
             self.mass[name] = {other: self._function(equation.diff(a)) for other, a in self.a.items()}
         self.rests = {name: self._function(sympy.sympify(value)) for name, value in twin.rests().items()}

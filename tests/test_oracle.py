@@ -405,7 +405,7 @@ def test_it_shares_no_code_with_what_it_checks():
         for name in node.names
     ]
     assert {name for name in imports if name.startswith("lag_envs")} == {
-        "lag_envs.lagrange", "lag_envs.report.formulas.Formulas", "lag_envs.report.formulas.Series",
+        "lag_envs.scenes.symbolic", "lag_envs.report.formulas.Formulas", "lag_envs.report.formulas.Series",
         "lag_envs.scenes.base.Scene",
     }  # fmt: skip
 

@@ -11,10 +11,10 @@ import sympy
 from mpmath import mp, mpf
 from sympy import cos, sin
 
-from lag_envs.lagrange import symbolic, t
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.report.closed_forms import linear
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
+from lag_envs.scenes.symbolic import symbolic, t
 
 U = sympy.Symbol("u", real=True)
 SCENES = (PivotedBar, Incline, CylinderInCylinder)

@@ -27,7 +27,7 @@ from agents.analysis import (
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
 from agents.measure import Condition, Entrant, Job, conditions
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
-from lag_envs.report.docs import replaced
+from lag_envs.generated import replaced
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 ROOT = Path(__file__).parents[1]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import re
 import signal
 import subprocess
@@ -36,19 +35,15 @@ from numpy.typing import NDArray
 import lag_envs
 from lag_envs import benchmark_jacobians
 from lag_envs.benchmark_jacobians import jacobians
+from lag_envs.host import ONE_THREAD, machine
 from lag_envs.own_files import registered
+from lag_envs.progress import progress
 from lag_envs.store import write
 from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
 LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "jax", "torchrl", "torch")
-#: Environment of the process that measures: no library may start threads.
-ONE_THREAD = {
-    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
-    "JAX_PLATFORMS": "cpu",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
 #: What a cold start does after the start of the process, in stages; prints the seconds of each.
 COLD_START = """
 from time import perf_counter
@@ -469,34 +464,6 @@ def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     return [total - sum(stages), *stages]
 
 
-@contextmanager
-def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on a terminal, tqdm's where it is installed; yields a function that advances it."""
-    if not sys.stderr.isatty() or not total:
-        yield lambda text: None
-        return
-    try:
-        tqdm = import_module("tqdm").tqdm
-    except ImportError:
-        done = 0
-
-        def advance(text: str) -> None:
-            nonlocal done
-            done += 1
-            print(f"\r{100 * done // total:3d} % {text:60.60}", end="", file=sys.stderr, flush=True)
-
-        yield advance
-        print(f"\r{'':66}\r", end="", file=sys.stderr, flush=True)
-        return
-    with tqdm(total=total, leave=False, unit="", dynamic_ncols=True) as bar:
-
-        def advance(text: str) -> None:
-            bar.set_description_str(f"{text:40.40}", refresh=False)
-            bar.update()
-
-        yield advance
-
-
 # --- statistics ---
 
 
@@ -586,23 +553,6 @@ def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     bars = sorted(times)
     slope = np.polyfit(np.log(bars), np.log([times[n] for n in bars]), 1)[0]
     return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
-
-
-def machine() -> dict[str, Any]:
-    """Describe the machine."""
-    model = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = info.read_text(encoding="utf-8").splitlines()
-        model = next(
-            (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), model
-        )
-    return {
-        "processor": model or platform.machine(),
-        "cores": os.cpu_count(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-    }
 
 
 def versions() -> dict[str, str]:
@@ -748,7 +698,7 @@ def _ours(report: dict[str, Any]) -> list[str]:
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
     """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
-    from lag_envs.report.docs import replaced
+    from lag_envs.generated import replaced
 
     write(checkout / "docs" / "speed.json", to_json(report))
     readme = checkout / "README.md"

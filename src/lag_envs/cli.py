@@ -236,8 +236,8 @@ def declare_order(parser: argparse.ArgumentParser) -> None:
 def run_order(args: argparse.Namespace) -> int:
     """Print what each order of the series costs, and which to choose."""
     from lag_envs import own_files
-    from lag_envs.benchmark import progress
     from lag_envs.orders import ORDERS, lines, measure
+    from lag_envs.progress import progress
 
     if is_file(args.id):
         kind = own_files.one(args.id)

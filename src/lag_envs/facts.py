@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.benchmark import columns
 from lag_envs.envs.single import observation_space
 from lag_envs.scenes.checks import StepRefused
+from lag_envs.tables import columns
 from lag_envs.tasks.base import Task
 
 

@@ -53,7 +53,7 @@ def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator
     """
     from pebble import ProcessPool
 
-    from lag_envs.benchmark import ONE_THREAD
+    from lag_envs.host import ONE_THREAD
 
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD)  # a process inherits it when it starts

@@ -14,7 +14,7 @@ import sympy
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from lag_envs.lagrange import Symbolic
+from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]

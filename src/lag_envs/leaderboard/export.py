@@ -380,7 +380,7 @@ def _curve(seed: int, points: Sequence[Sequence[float]]) -> list[dict[str, Any]]
 
 
 def _hardware() -> str:
-    from lag_envs.benchmark import machine
+    from lag_envs.host import machine
 
     about = machine()
     return f"{about['processor']}, {about['cores']} cores"

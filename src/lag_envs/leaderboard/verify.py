@@ -140,7 +140,7 @@ def verify(
 def _machine() -> dict[str, Any]:
     from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
-    from lag_envs.benchmark import machine
+    from lag_envs.host import machine
 
     # What code is compiled for; the name of a processor does not always tell.
     features = hashlib.sha256(get_host_cpu_features().flatten().encode()).hexdigest()[:16]

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import benchmark
+from lag_envs.generated import replaced
 from lag_envs.report import page
 from lag_envs.report.content import Picture, Table
 from lag_envs.report.report import FILE, content_of
@@ -66,22 +67,6 @@ def generated(project: Path) -> dict[Path, str]:
     readme = replaced(readme, "bench", benchmark.markdown(speed))
     readme = replaced(readme, "fast", benchmark.claim(speed))
     return {project / "docs" / "accuracy.md": markdown(accuracy), project / "README.md": readme}
-
-
-def replaced(text: str, name: str, block: str) -> str:
-    r"""Return the text with what stands between two marks replaced.
-
-    Examples
-    --------
-    >>> replaced("a <!-- x:begin -->old<!-- x:end --> b", "x", "new")
-    'a <!-- x:begin -->\nnew\n<!-- x:end --> b'
-    """
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    before, _, rest = text.partition(begin)
-    _, found, after = rest.partition(end)
-    if not found:
-        raise ValueError(f"the text has no {begin} ... {end}")
-    return f"{before}{begin}\n{block}\n{end}{after}"
 
 
 def drawn(picture: Picture, folder: Path) -> Path:

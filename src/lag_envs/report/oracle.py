@@ -1,8 +1,8 @@
 """The oracle: the exact motion of any scene, from Lagrange's equations as SymPy derives them.
 
-Of the package only the scene's energies, its names and SymPy's view of them (`lag_envs.lagrange`) are used.
-Equations, series, arithmetic and step control share nothing with `mechanics` and `stepping`; numbers are
-python-flint's balls. There are two methods:
+Of the package only the scene's energies, its names and SymPy's view of them (`lag_envs.scenes.symbolic`) are
+used. Equations, series, arithmetic and step control share nothing with `mechanics` and `stepping`; numbers
+are python-flint's balls. There are two methods:
 
 * Taylor series, each coefficient by one more iteration of Picard's on series of balls. The step is as long as
   the last coefficients allow. Balls hold what rounding and cancellation do within a step.
@@ -31,8 +31,8 @@ import sympy
 from mpmath import mp, mpf
 from numpy.typing import NDArray
 
-from lag_envs import lagrange
 from lag_envs.report.formulas import Formulas, Series
+from lag_envs.scenes import symbolic
 from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
@@ -104,7 +104,7 @@ class Equations:
     """
 
     def __init__(self, scene: Scene) -> None:
-        names, t = names_of(scene), lagrange.t
+        names, t = names_of(scene), symbolic.t
         self.names = names
         self.rates = [name for name, (_, level) in names.moved.items() if level == "rate"]
         all_ = (*names.free, *names.moved)
@@ -117,7 +117,7 @@ class Equations:
         for name, place in places.items():
             replaced |= {place: self.q[name], place.diff(t): self.v[name], place.diff(t, 2): a[name]}
         found = [
-            lagrange.euler_lagrange(scene, name, lagrange.Exact).xreplace(replaced) for name in names.free
+            symbolic.euler_lagrange(scene, name, symbolic.Exact).xreplace(replaced) for name in names.free
         ]
         self.a = [a[name] for name in names.free]
         self.mass = [e.diff(symbol) for e in found for symbol in self.a]

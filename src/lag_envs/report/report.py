@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs import store
-from lag_envs.benchmark import machine
+from lag_envs.host import machine
 from lag_envs.report.content import Content
 from lag_envs.report.runner import Result, module, run_jobs, versions
 from lag_envs.tables import columns

@@ -23,7 +23,8 @@ from typing import Any
 
 import lag_envs
 from lag_envs import store
-from lag_envs.benchmark import machine, progress
+from lag_envs.host import machine
+from lag_envs.progress import progress
 from lag_envs.workers import died, outcomes, processes
 
 Row = dict[str, Any]

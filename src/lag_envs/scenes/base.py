@@ -502,7 +502,7 @@ class Scene(metaclass=SceneType):
 
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
-        from lag_envs.lagrange import lagrangian
+        from lag_envs.scenes.symbolic import lagrangian
 
         return lagrangian(self)
 
@@ -551,7 +551,7 @@ class Scene(metaclass=SceneType):
         >>> pendulum.acceleration([0.0, 0.0], 1.0)["theta"].item(), pendulum(m=0.5).m
         (0.25, 0.5)
         """
-        from lag_envs.lagrange import from_sympy
+        from lag_envs.scenes.symbolic import from_sympy
 
         return from_sympy(
             name,
