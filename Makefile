@@ -26,7 +26,7 @@ setup:  ## make or update .venv (all others do this first); PYTHON=... chooses a
 demo: setup  ## train and evaluate an agent on PivotedBar-v0
 	$(BIN)/python -m agents.demo $(ARGS)
 
-baselines: setup  ## compute, train and measure all agents (hours; may be broken off), write docs/agents.md
+baselines: setup  ## compute, train and measure all agents (hours; can be interrupted), write docs/agents.md
 	$(BIN)/python -m agents.optimum
 	$(BIN)/python -m agents.train all --seeds 5
 	$(BIN)/python -m agents.train all --algo sac td3 tqc dqn --seeds 1
@@ -87,7 +87,7 @@ submissions: setup  ## make submissions of all our agents, from what `make basel
 site: setup  ## build the leaderboard's page, into the folder site
 	$(BIN)/lag-envs leaderboard build $(ARGS)
 
-format: setup  ## format the code and mend what ruff can mend
+format: setup  ## format the code and auto-fix what ruff can
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 

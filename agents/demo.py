@@ -36,7 +36,7 @@ EPILOG = """what is left in the output folder:
   result.json          the training: returns, learning curve, hyperparameters, versions and times
   tensorboard/         for `tensorboard --logdir FOLDER`
 
-The same command goes on where it was broken off; a run that is finished is evaluated again.
+Re-run it to resume where it was interrupted; a finished run is evaluated again.
 
 examples:
   python -m agents.demo                                  train on PivotedBar-v0, in about a minute

@@ -199,7 +199,7 @@ def thaw(run: Run, content: dict[str, bytes]) -> Any:
         )
     except Exception as error:  # whatever a damaged file leads to
         reason = f"{type(error).__name__}: {error}"
-        raise UserError(f"{run.path(CHECKPOINT)} cannot be read ({reason}); --new starts anew") from error
+        raise UserError(f"{run.path(CHECKPOINT)} cannot be read ({reason}); --new starts over") from error
     if buffer is not None:
         model.replay_buffer = buffer
     model.set_random_seed(run.seed + run.trained)

@@ -71,7 +71,7 @@ how to read the numbers:
 Of a state of 4 dimensions an easier task is solved, such as the one without a track: its value is from above;
 lower is what the best agent gets, see the agents' results.
 
-It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): the same command goes on from there.
+It can be stopped at any time (Ctrl-C, SIGTERM, or a kill): re-run it to resume from there.
 
 examples:
   python -m agents.optimum PivotedBar-v0 --quick      one id on coarse grids, in seconds; writes to FOLDER

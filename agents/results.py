@@ -41,7 +41,7 @@ EPILOG = f"""what it reads and writes:
   OUTPUT/{PAGE}        the page, with figures in OUTPUT/{PICTURES}
   OUTPUT/README.md            the table in it, where there is one
 
-It may be broken off at any time; the same command goes on. Agents that are not there now (other machines'
+It can be interrupted at any time; re-run it to resume. Agents that are not there now (other machines'
 runs, say) keep the numbers that the summary has of them. Commands for different --envs may run side by side.
 """
 
@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"agents.results: error: {error}{full}; what was measured before is kept", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nStopped. What was measured is kept; the same command goes on.", file=sys.stderr)
+        print("\nStopped. What was measured is kept; re-run the command to resume.", file=sys.stderr)
         return 130
 
 
@@ -252,7 +252,7 @@ def load_summary(output: Path, needed: bool = False) -> Data:
         if not isinstance(content, dict) or content.get("schema") != SCHEMA or not content["envs"]:
             raise ValueError("it was not written by this version")
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{file} cannot be read ({error}); --new starts anew") from error
+        raise UserError(f"{file} cannot be read ({error}); --new starts over") from error
     return content
 
 

@@ -98,7 +98,7 @@ class Run:
             self.curve = list(progress["curve"])
         except Exception as error:  # whatever a damaged pickle leads to
             reason = f"{type(error).__name__}: {error}"
-            raise UserError(f"{file} cannot be read ({reason}); --new starts anew") from error
+            raise UserError(f"{file} cannot be read ({reason}); --new starts over") from error
         self.check_settings(settings, file)
         return content
 
@@ -120,7 +120,7 @@ class Run:
                     both = {**value, **(found.get(name) or {})}
                     other = [k for k in both if value.get(k) != (found.get(name) or {}).get(k)]
                     what = f"other hyperparameters ({', '.join(map(str, other))})"
-                raise UserError(f"{file} is of a run with {what}; --new starts anew, --output goes elsewhere")
+                raise UserError(f"{file} is of a run with {what}; --new starts over, --output goes elsewhere")
 
     def foreign(self) -> bool:
         """Tell whether the folder holds files that are not the run's."""

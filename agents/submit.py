@@ -35,7 +35,7 @@ HELP = """what is made, a folder each, in OUT:
   ENV-CONTROLLER        every one of lag_envs.controllers
   ENV-optimal           the value functions of `python -m agents.optimum`, coarsened to a table
 
-A folder that is there is kept, so that the same command goes on; --new makes it anew."""
+A folder that is there is kept, so that re-running resumes; --new makes it again."""
 
 
 # --- optimal ------------------------------------------------------------------------------------------------

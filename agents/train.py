@@ -45,7 +45,7 @@ EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
   tensorboard/         for `tensorboard --logdir FOLDER`
   {CHECKPOINT}       while the run is not finished: all that is needed to go on ({TESTS} times a run)
 
-The same command goes on where a run was broken off, by Ctrl-C or by a kill; seeds that are finished are left
+Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; seeds that are finished are left
 as they are. A run goes on from its last checkpoint, in other episodes than without the interruption.
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml

@@ -71,7 +71,7 @@ def check_whole(board, expected):
 
 
 def killed_at(number, work):
-    """Do the work, and be killed in the middle of the so-manieth call that changes files."""
+    """Do the work, and be killed in the middle of the n-th call that changes files."""
     count = 0
 
     def wrap(name):

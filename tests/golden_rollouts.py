@@ -1,4 +1,4 @@
-"""Roll-outs that are kept, so that whatever is rewritten later can be held against them.
+"""Roll-outs that are kept, so that whatever is rewritten later can be checked against them.
 
 ``python tests/golden_rollouts.py`` records them anew, into ``golden/rollouts.npz`` and ``runs.json``. That is
 right only where an environment is meant to change: the file is what the package did when version 0 of its

@@ -217,7 +217,7 @@ def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monke
     assert not report["complete"]
     assert report["cold_start"] == {}
     assert row(report, ID, "made")["rates"]
-    assert "broken off" in capsys.readouterr().out
+    assert "interrupted" in capsys.readouterr().out
 
 
 def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""What is derived is Lagrange's: held against SymPy's derivatives in 40 digits, at random points."""
+"""What is derived is Lagrange's: checked against SymPy's derivatives in 40 digits, at random points."""
 
 import dataclasses
 import functools

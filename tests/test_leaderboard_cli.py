@@ -144,7 +144,7 @@ def test_mistakes(run):
     write("a")
     run("add", "a", "--nonce", "n")
     other = incline.Tilt.id
-    assert f"the board has nothing of {other!r}; it has PivotedBar-v0" in run("list", other)[2]
+    assert f"there is no board named {other!r}; there are PivotedBar-v0" in run("list", other)[2]
     assert "there is no 'x' on the board" in run("show", "x")[2]
     assert "published before" in run("add", write("b", "b"), "--nonce", "n")[2]
     assert "there is no protocol 3; the current one is 1" in run("show", ids()[0], "--protocol", "3")[2]
@@ -250,7 +250,7 @@ def test_the_page_states_the_protocols_numbers():
         f"Percentile bootstrap, {100 * LEVEL:.0f} %, {RESAMPLES:,} samples",
         f"mean scores differ by at most {protocol.TOLERANCE:.0e}".replace("e-0", "e-"),
         f"no more than {protocol.APART:.0%} of the episodes".replace("%", " %"),
-        f"each of its episodes may differ by {protocol.PLANNED:.0e}".replace("e-0", "e-"),
+        f"each of its returns may differ by {protocol.PLANNED:.0e}".replace("e-0", "e-"),
         f"Two policies play {alike.EPISODES} episodes",
         f"differ by less than {alike.ACTIONS:.0e} (root".replace("e-0", "e-"),
         f"of one learner that differ by less than {alike.TWINS:.0e}".replace("e-0", "e-"),

@@ -1,4 +1,4 @@
-"""The model: one step as a function, held against the environments themselves."""
+"""The model: one step as a function, checked against the environments themselves."""
 
 from __future__ import annotations
 

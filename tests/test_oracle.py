@@ -1,4 +1,4 @@
-"""The oracle is held against closed forms, first principles and itself by other methods."""
+"""The oracle is checked against closed forms, first principles and itself by other methods."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Physics: what is computed is derived again, from places by Newton, and held against closed forms."""
+"""Physics: what is computed is derived again, from places by Newton, and checked against closed forms."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""Each task restated in plain numbers, held against what the environments do."""
+"""Each task restated in plain numbers, checked against what the environments do."""
 
 from __future__ import annotations
 

@@ -190,7 +190,7 @@ def test_checkpoints_of_others_and_damaged_ones_are_refused(tmp_path):
             go(other)
     for damaged in (b"", b"nonsense", data[: len(data) // 2]):
         begun.path(run.CHECKPOINT).write_bytes(damaged)
-        with pytest.raises(UserError, match=r"checkpoint.pkl cannot be read .*--new starts anew"):
+        with pytest.raises(UserError, match=r"checkpoint.pkl cannot be read .*--new starts over"):
             go(make_run(tmp_path))
     begun.path(run.CHECKPOINT).write_bytes(data)
     assert go(make_run(tmp_path))

@@ -610,7 +610,7 @@ def table(report: dict[str, Any]) -> list[str]:
     words = {True: "met", False: "missed", None: "not measured"}
     lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
     if not report["complete"]:
-        lines += ["", "broken off: these are the samples until then"]
+        lines += ["", "interrupted: these are the samples so far"]
     return lines
 
 

@@ -502,7 +502,7 @@ examples:
         """Measure the error of every environment and scene against high precision, beside the usual steppers
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
 Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
-Ctrl-C the same command goes on. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.
+Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.
 
 examples:
   lag-envs report --quick                            a first look, under a minute
@@ -633,7 +633,7 @@ def parser(command_name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its status: 0, 2 for a mistake in the command line, 130 when broken off."""
+    """Run the command and return its status: 0, 2 for a mistake in the command line, 130 when interrupted."""
     given = sys.argv[1:] if arguments is None else arguments
     try:
         args = parser(next((word for word in given if not word.startswith("-")), "")).parse_args(given)

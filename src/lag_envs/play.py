@@ -102,7 +102,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None) -> int:
                 reward, terminated, truncated = 0.0, True, False
             total, taken = total + float(reward), taken + 1
             if terminated or truncated or pressed("r"):
-                ending = "terminated" if terminated else "time is up" if truncated else "broken off"
+                ending = "terminated" if terminated else "time is up" if truncated else "interrupted"
                 print(f"{ending}, sum of rewards {total:.4g}", flush=True)
                 total = 0.0
                 if terminated and steps is None:

@@ -438,7 +438,7 @@ def _nonces(board: Board, found: Cheap) -> Finding:
             held += 1
     finding.told = f"{held} are commits that held all they decide"
     if elsewhere:
-        finding.told += "; to be held against their sources: " + ", ".join(elsewhere)
+        finding.told += "; to be checked against their sources: " + ", ".join(elsewhere)
     return finding
 
 

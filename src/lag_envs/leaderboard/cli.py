@@ -215,7 +215,7 @@ def _list(args: argparse.Namespace) -> int:
         boards = [b for b in boards if b["id"] == args.env]
         if not boards:
             known = ", ".join(sorted({entry.env for entry in state.entries.values()}))
-            raise BoardError(f"the board has nothing of {args.env!r}; it has {known}")
+            raise BoardError(f"there is no board named {args.env!r}; there are {known}")
     for number, found in enumerate(boards):
         frozen = ", frozen" if found["frozen"] else ""
         print("\n" * (number > 0) + f"{found['id']}, protocol {found['protocol']}{frozen}")
@@ -384,7 +384,7 @@ def _serve(args: argparse.Namespace) -> int:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except (OSError, OverflowError) as error:
             raise BoardError(
-                f"port {args.port} cannot be had ({error}); --port 0 takes a free one"
+                f"port {args.port} is already in use ({error}); --port 0 takes a free one"
             ) from error
         with server:
             print(f"http://127.0.0.1:{server.server_address[1]} (Ctrl-C ends)", flush=True)

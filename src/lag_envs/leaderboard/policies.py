@@ -488,7 +488,7 @@ class Controller(Architecture):
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return self.build(**self.numbers)
-        except Exception as error:  # whatever senseless numbers lead to
+        except Exception as error:  # whatever nonsensical numbers cause
             reason = shown(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error
 

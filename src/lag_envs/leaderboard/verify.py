@@ -201,7 +201,7 @@ def act(
     try:
         with np.errstate(all="ignore"):
             action, state = agent.predict(observation, state, start, deterministic=True)
-    except Exception as error:  # whatever senseless numbers lead to
+    except Exception as error:  # whatever nonsensical numbers cause
         raise Refused(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
     if action.shape != (shape or (len(observation), 1)) or not np.isfinite(action).all():
         raise Refused("it returned an action that is not a finite number")

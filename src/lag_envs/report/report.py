@@ -39,7 +39,7 @@ class NotAReport(ValueError):
 
 
 def make_report(settings: Settings) -> bool:
-    """Measure what the folder does not have yet and write everything; return False where it was broken off.
+    """Measure what the folder does not have yet and write everything; return False where it was interrupted.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def make_report(settings: Settings) -> bool:
     print("\n".join(claims(contents)))
     missing = len(jobs) - len(results)
     if missing:
-        print(f"\nbroken off, {missing} of {len(jobs)} jobs are missing; the same command goes on")
+        print(f"\ninterrupted: {missing} of {len(jobs)} jobs are missing; re-run the command to resume")
     print(f"\nwritten to {folder / 'index.html'}")
     return complete
 

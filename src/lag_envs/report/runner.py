@@ -1,6 +1,6 @@
 """Jobs in processes of their own: one that hangs or crashes costs its own rows only.
 
-Every finished job is written at once, so that a report that was broken off goes on where it was.
+Every finished job is written at once, so that an interrupted report resumes where it was.
 """
 
 from __future__ import annotations
