@@ -25,7 +25,7 @@ from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
 from lag_envs.scenes import picture
 from lag_envs.scenes.checks import SMALLEST, StepRefused, check_number, check_step, real_array, shown
-from lag_envs.scenes.shapes import Moment, Shape, Window
+from lag_envs.scenes.shapes import Window
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ SEQUENCES = ("state", "left_out")
 ORDER = "_order_of_task"
 
 #: What a scene may define; all other public names of `Scene` are its calls.
-DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
+DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 
 
 def parameter(
@@ -243,16 +243,29 @@ class Scene(metaclass=SceneType):
         return {}
 
     def bodies(self) -> Any:
-        """Return shapes of each body in its own frame."""
+        """Return shapes by frame, from back to front: a body's own, an indicator's, or the fixed "ground"."""
         return {}
 
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return what is to be seen, from back to front: the bodies where they are."""
-        return picture.shapes(self, now)
+    def indicators(self, now: Any, xp: Any) -> Any:
+        """Return where frames are that show more than bodies, such as a control's arrow.
 
-    def window(self, now: Moment) -> Window:
+        Parameters
+        ----------
+        now : picture.Now
+            ``q``, ``state``, ``share`` and ``target``, each by name.
+        xp : namespace
+            As in formulas, with `where`, `abs`, `minimum` and `maximum`.
+
+        Returns
+        -------
+        mapping
+            By frame (x, y), (x, y, angle) or (x, y, angle, part), see `shapes.Pose`.
+        """
+        return {}
+
+    def window(self) -> Window:
         """Return the part of the plane to look at: around the first body, as far as the others reach."""
-        return picture.window(self, now)
+        return picture.window(self)
 
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""
@@ -985,11 +998,10 @@ def _check_bodies(scene: Scene) -> None:
         bodies = scene.bodies()
     if not isinstance(bodies, Mapping):
         raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
+    known = [picture.GROUND, *found.record.poses, *picture.indicated(scene, picture.at_rest(scene))]
     for body in bodies:
-        if body not in found.record.poses:
-            raise FormulaError(
-                f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
-            )
+        if body not in known:
+            raise picture.no_place(scene, "bodies", body, known)
     try:
         found.full  # noqa: B018
     except FormulaError as error:
