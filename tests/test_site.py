@@ -15,7 +15,8 @@ import pytest
 
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
-from lag_envs.leaderboard.site.scenery import describe
+from lag_envs.leaderboard.site.scenery import Scenery, column, picture
+from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Arrow, Circle, Lens, Line, Moment, Polygon
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline
 from tests import board_pages, chromium
@@ -349,24 +350,25 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
     page = open_page()
     rng = np.random.default_rng(0)
     for env_id, kind in TASKS.items():
-        task, board = kind(), describe(env_id)
+        task = kind()
+        shown, wide = Picture(task), Picture(task).view
+        described, size = json.dumps(picture(shown)), max(wide.right - wide.left, wide.top - wide.bottom)
         for _ in range(3):
             state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
-            share = float(rng.uniform(0 if board["control"]["low"] == 0 else -1, 1))
+            controls = task.wanted(rng.uniform(-1, 1, (1, task.formulas.actions)))[0]
             target, turned = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
-            turned = turned if "psi" in task.scene.left_out else 0.0
-            now = Moment(state, share * task.limit_control, share, target, turned)
-            given = json.dumps({"state": state, "share": share, "target": target, "turned": turned})
-            board_text = json.dumps(board)
-            assert page.js(f"lagEnvs.windowOf({board_text}, {given})") == pytest.approx(task.window(now))
-            found = page.js(f"lagEnvs.shapesOf({board_text}, {given})")
-            wanted = [flat(shape) for shape in task.shapes(now)]
+            now = Moment(state, controls, task.share(controls), target, turned)
+            poses = shown.poses(now)
+            window = page.js(f"lagEnvs.windowOf({described}, {json.dumps(poses)})")
+            assert window == pytest.approx(shown.window(poses)[:4], abs=1e-4 * size)
+            found = page.js(f"lagEnvs.placed({described}, {json.dumps(poses)}, {json.dumps(window)})")
+            wanted = [flat(shape) for shape in shown.placed(now)]
             assert [s[0] for s in found] == [w[0] for w in wanted], env_id
             for shape, (what, points, role) in zip(found, wanted, strict=True):
                 round_one = what in ("circle", "lens")
                 assert (shape[3] if what == "circle" else shape[2] if what != "lens" else None) == role
                 own = [*shape[1], shape[2]] if round_one else shape[1]
-                np.testing.assert_allclose(own, points, atol=1e-12)
+                np.testing.assert_allclose(own, points, atol=1e-4 * size)
 
 
 def test_sorting_by_mouse_and_keyboard(open_page, data):

@@ -63,6 +63,8 @@ class Picture:
         The frames, as `poses` has them.
     shapes : list of (int, Shape)
         Each shape and the number of its frame, from back to front.
+    view : Window
+        What `window` moves.
 
     Raises
     ------
@@ -80,7 +82,7 @@ class Picture:
             if frame not in found:
                 raise no_place(of, "bodies" if frame in bodies else "window", frame, self.frames)
         self.shapes = [(self.frames.index(frame), shape) for frame in bodies for shape in bodies[frame]]
-        self._window = window
+        self.view = window
 
     def poses(self, now: Moment) -> list[Pose]:
         """Return where the frames are."""
@@ -115,10 +117,10 @@ class Picture:
 
     def window(self, poses: Sequence[Pose]) -> Window:
         """Return the part of the plane to look at."""
-        if not self._window.frame:
-            return self._window
-        frame = poses[self.frames.index(self._window.frame)]
-        return self._window.moved(frame[0], frame[1])
+        if not self.view.frame:
+            return self.view
+        frame = poses[self.frames.index(self.view.frame)]
+        return self.view.moved(frame[0], frame[1])
 
     def placed(self, now: Moment) -> list[Shape]:
         """Return what is to be seen at a moment, from back to front."""
