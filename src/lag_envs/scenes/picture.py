@@ -105,7 +105,7 @@ class Picture:
         array = np.asarray(states, np.float64)
         n, columns = len(array), list(array.T)
         held = np.zeros((n, len(self._scene.control_names)))
-        held[1:] = np.reshape(controls, (n - 1, -1))
+        held[1:] = np.reshape(controls, held[1:].shape)
         # Exact if the rates are linear between two states, as those of a coordinate that is pushed are.
         turned = []
         for rate in turning(self._scene, columns):
