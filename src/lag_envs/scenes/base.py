@@ -953,6 +953,8 @@ def _check_class(cls: type[Scene]) -> None:
                 f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
                 "dissipation and applied, from which these follow (see CHANGELOG.md)"
             )
+        if "shapes" in vars(c):
+            raise FormulaError(f"{of}.shapes: {picture.INSTEAD_OF_SHAPES}")
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:
         raise FormulaError(f"{of}.{faults[0]}")
@@ -999,9 +1001,10 @@ def _check_bodies(scene: Scene) -> None:
     if not isinstance(bodies, Mapping):
         raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
     known = [picture.GROUND, *found.record.poses, *picture.indicated(scene, picture.at_rest(scene))]
-    for body in bodies:
+    for body, shapes in bodies.items():
         if body not in known:
             raise picture.no_place(scene, "bodies", body, known)
+        picture.check_shapes(scene, body, shapes)
     try:
         found.full  # noqa: B018
     except FormulaError as error:

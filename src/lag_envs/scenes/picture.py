@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
 #: The frame of what never moves.
 GROUND = "ground"
+INSTEAD_OF_SHAPES = (
+    "a picture is drawn from shapes in frames and from the frames' places; return the shapes by frame from "
+    "bodies(self), where bodies are from poses(self, q, xp), and where arrows, targets and the like are from "
+    "indicators(self, now, xp)"
+)
 
 
 class Now(NamedTuple):
@@ -81,6 +86,7 @@ class Picture:
         for frame in [*bodies, *filter(None, [window.frame])]:
             if frame not in found:
                 raise no_place(of, "bodies" if frame in bodies else "window", frame, self.frames)
+            check_shapes(of, frame, bodies.get(frame, []))
         self.shapes = [(self.frames.index(frame), shape) for frame in bodies for shape in bodies[frame]]
         self.view = window
 
@@ -148,6 +154,17 @@ def no_place(of: Any, where: str, frame: str, known: Sequence[str]) -> FormulaEr
         f"{type(of).__name__}.{where} has {frame!r}, which has no place in poses or indicators "
         f"({', '.join(known)})"
     )
+
+
+def check_shapes(of: Any, frame: str, shapes: Any) -> None:
+    """Raise a FormulaError for what is no list of shapes."""
+    for shape in shapes if isinstance(shapes, Sequence) else [shapes]:
+        if not isinstance(shape, Shape) or shape is shapes:
+            kinds = ", ".join(kind.__name__ for kind in get_args(Shape))
+            raise FormulaError(
+                f"{type(of).__name__}.bodies must have a list of shapes ({kinds}) for {frame!r}, "
+                f"got {shapes!r:.60}"
+            )
 
 
 def indicated(of: Any, now: Now) -> dict[str, tuple]:

@@ -142,6 +142,8 @@ class Task:
                 f"{type(self).__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
                 "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
             )
+        if type(self).shapes is not Task.shapes:
+            raise FormulaError(f"{type(self).__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(
