@@ -10,6 +10,7 @@ import pytest
 
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.base import Scene, parameter
+from lag_envs.scenes.shapes import Circle
 
 
 class Good(Scene):
@@ -419,6 +420,36 @@ def pose_without_an_angle():
 @mistake("bodies", "'wheel'", "poses")
 def body_without_a_pose():
     return changed("bodies", lambda self: {"wheel": []})
+
+
+@mistake("bodies", "'ground'", "Line, Polygon, Circle", "'cart'")
+def body_that_is_no_shape():
+    return changed("bodies", lambda self: {"ground": ["cart"]})
+
+
+@mistake("bodies", "a list of shapes", "'ground'")
+def body_that_is_one_shape():
+    return changed("bodies", lambda self: {"ground": Circle((0.0, 0.0), 1.0)})
+
+
+@mistake("indicators", "'arrow'", "(x, y, angle, part)")
+def indicator_without_a_place():
+    return changed("indicators", lambda self, now, xp: {"arrow": now.q.x})
+
+
+@mistake("indicators", "by frame")
+def indicators_without_names():
+    return changed("indicators", lambda self, now, xp: [(now.q.x, 0.0)])
+
+
+@mistake("indicators", "'z'", "x, y")
+def indicator_at_an_unknown_coordinate():
+    return changed("indicators", lambda self, now, xp: {"arrow": (now.q.z, 0.0)})
+
+
+@mistake("shapes", "bodies(self)", "poses(self, q, xp)", "indicators(self, now, xp)")
+def shapes_per_moment():
+    return changed("shapes", lambda self, now: [])
 
 
 # --- names -------------------------------------------------------------------------------------------------

@@ -14,7 +14,23 @@ from rollouts import SINGLE
 
 import lag_envs
 from lag_envs.envs import rendering
-from lag_envs.scenes.shapes import Arrow, Circle, Moment, Polygon, Role, round_length, ticks
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.scenes.picture import Picture, turning
+from lag_envs.scenes.shapes import (
+    Arrow,
+    Circle,
+    Line,
+    Moment,
+    Polygon,
+    Pose,
+    Role,
+    Ruler,
+    Window,
+    beginning,
+    placed,
+    round_length,
+    ticks,
+)
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 
 pygame = pytest.importorskip("pygame")
@@ -120,6 +136,55 @@ def test_target_is_where_it_was_set():
     task = TASKS[incline.Tilt.id]
     (mark,) = (s for s in task.shapes(moment(task, target=0.3, state=[0.0, 0.0, 0.0])) if s.role == "target")
     assert mark == Circle((0.3, 0.05), 0.05, "target")
+
+
+def test_a_task_adds_shapes_where_frames_are():
+    class Marked(pivoted_bar.SwingUp):
+        def bodies(self):
+            return {**super().bodies(), "hat": [Circle((0.0, 0.0), 0.1, "target")]}
+
+    with pytest.raises(FormulaError, match=r"Marked\.bodies has 'hat', which has no place in .*indicators"):
+        Marked().shapes(Moment([0.0] * 4))
+
+    class Wide(pivoted_bar.SwingUp):
+        def window(self):
+            return Window(0.0, 0.0, 1.0, 1.0, "hat")
+
+    with pytest.raises(FormulaError, match=r"Wide\.window has 'hat'"):
+        Wide().shapes(Moment([0.0] * 4))
+
+    class Old(pivoted_bar.SwingUp):
+        def shapes(self, now):
+            return []
+
+    with pytest.raises(FormulaError, match=r"Old\.shapes: .* indicators\(self, now, xp\)"):
+        Old()
+
+
+def test_poses_of_an_episode_are_those_of_its_moments():
+    for task in TASKS.values():
+        rng, picture = np.random.default_rng(1), Picture(task)
+        states = task.centre + rng.uniform(-1, 1, (6, len(task.centre))) * task.half_widths
+        controls = task.wanted(rng.uniform(-1, 1, (5, task.formulas.actions)))
+        poses = picture.episode(states, controls, 0.2, task.dt)
+        target = 0.2 if task.formulas.targets else None
+        turned = np.zeros(len(turning(task.scene, states[0])))
+        rates = [np.array(turning(task.scene, state)) for state in states]
+        for i, state in enumerate(states):
+            control = controls[i - 1] if i else np.zeros(len(controls[0]))
+            turned = turned + (0.5 * task.dt * (rates[i - 1] + rates[i]) if i else 0.0)
+            now = Moment(state.tolist(), control, task.share(control), target, turned)
+            np.testing.assert_allclose(poses[i], picture.poses(now), atol=1e-14)
+
+
+def test_a_pose_moves_turns_mirrors_and_shortens():
+    view, bent = Window(-1.0, -1.0, 1.0, 1.0), Line([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
+    (moved,) = placed(bent, Pose(1.0, 2.0, math.pi / 2, -0.75), view)
+    assert np.asarray(moved.points) == pytest.approx(np.array([(1.0, 2.0), (1.0, 3.0), (1.5, 3.0)]))
+    assert beginning(bent.points, 0.0) == [(0.0, 0.0), (0.0, 0.0)]
+    ticks = placed(Ruler(0.5, 0.1), Pose(100.0, 0.0, 0.0), view.moved(50.1, 0.0))
+    assert len(ticks) == 16 and all(tick.points[0][0] % 0.5 == 0.0 for tick in ticks)
+    assert min(tick.points[0][0] for tick in ticks) == 46.5
 
 
 def turn(shapes):

@@ -21,6 +21,7 @@ from gymnasium.error import DependencyNotInstalled, Error
 from numpy.typing import NDArray
 
 from lag_envs.scenes import shapes as s
+from lag_envs.scenes.picture import Picture, turning
 from lag_envs.scenes.shapes import Moment, Point, Reading, Role, Shape, Window
 from lag_envs.tasks.base import Task
 
@@ -95,8 +96,9 @@ class Viewer:
     def __init__(self, task: Task, mode: str) -> None:
         pygame = _pygame()
         self._task = task
+        self._picture = Picture(task)
         self._turned: Any = 0.0
-        self._before: tuple[list[float], float] | None = None
+        self._before: tuple[list[float], NDArray[np.float64]] | None = None
         self._clock = pygame.time.Clock()
         self._rate = max(1, round(1.0 / task.dt))
         self._human = mode == "human"
@@ -126,8 +128,8 @@ class Viewer:
             return None
         values = state.tolist()
         self._turn(values)
-        share = self._task.share(control)
-        picture = paint(self._task, Moment(values, control, share, target, self._turned))
+        now = Moment(values, control, self._task.share(control), target, self._turned)
+        picture = paint(self._task, now, self._picture)
         if self._human:
             _desk.show(self, picture)
             self._clock.tick(self._rate)
@@ -141,19 +143,21 @@ class Viewer:
 
     def _turn(self, state: list[float]) -> None:
         """Integrate what turns but is not in the state; exact if its rate is linear and each step drawn."""
-        rate = self._task.turning(state)
+        rate = np.array(turning(self._task.scene, state))
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
         self._before = (state, rate)
 
 
-def paint(task: Task, now: Moment) -> pygame.Surface:
-    """Return a picture with its read-out."""
-    pygame = _pygame()
+def paint(task: Task, now: Moment, shown: Picture | None = None) -> pygame.Surface:
+    """Return a picture with its read-out; `shown` is the task's `Picture`, where it was made before."""
+    pygame, shown = _pygame(), shown or Picture(task)
+    poses = shown.poses(now)
+    view = shown.window(poses)
     scene = pygame.Surface((FINE * WIDTH, FINE * (HEIGHT - STRIP)), depth=32)
     scene.fill(PAPER)
-    pen = Pen(scene, task.window(now))
-    pen.paint(task.shapes(now))
+    pen = Pen(scene, view)
+    pen.paint([part for frame, shape in shown.shapes for part in s.placed(shape, poses[frame], view)])
     picture = pygame.Surface((WIDTH, HEIGHT), depth=32)
     size = (WIDTH, HEIGHT - STRIP)
     pygame.transform.smoothscale(scene, size, picture.subsurface((0, 0), size))

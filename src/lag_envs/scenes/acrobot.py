@@ -22,7 +22,7 @@ import dataclasses
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Circle, Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class Acrobot(Scene):
         elbow = self.length_1 * xp.sin(q.theta_1), -self.length_1 * xp.cos(q.theta_1)
         return {"first": (0.0, 0.0, q.theta_1), "second": (*elbow, q.theta_1 + q.theta_2)}
 
-    def bodies(self) -> dict[str, list[Shape]]:
+    def bodies(self) -> Bodies:
         """Return the links as they hang down."""
         return {"first": link(self.length_1), "second": link(self.length_2)}
 

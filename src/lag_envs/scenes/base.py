@@ -25,7 +25,7 @@ from lag_envs.scenes.checks import check_both
 from lag_envs.scenes.declaring import MAPPINGS, SEQUENCES, complete, controls_of, declare
 from lag_envs.scenes.door import admit
 from lag_envs.scenes.parameters import parameter as parameter
-from lag_envs.scenes.shapes import Moment, Shape, Window
+from lag_envs.scenes.shapes import Window
 
 if TYPE_CHECKING:
     import sympy
@@ -144,16 +144,29 @@ class Scene(metaclass=SceneType):
         return {}
 
     def bodies(self) -> Any:
-        """Return shapes of each body in its own frame."""
+        """Return shapes by frame, from back to front: a body's own, an indicator's, or the fixed "ground"."""
         return {}
 
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return what is to be seen, from back to front: the bodies where they are."""
-        return picture.shapes(self, now)
+    def indicators(self, now: Any, xp: Any) -> Any:
+        """Return where frames are that show more than bodies, such as a control's arrow.
 
-    def window(self, now: Moment) -> Window:
+        Parameters
+        ----------
+        now : picture.Now
+            ``q``, ``state``, ``share`` and ``target``, each by name.
+        xp : namespace
+            As in formulas, with `where`, `abs`, `minimum` and `maximum`.
+
+        Returns
+        -------
+        mapping
+            By frame (x, y), (x, y, angle) or (x, y, angle, part), see `shapes.Pose`.
+        """
+        return {}
+
+    def window(self) -> Window:
         """Return the part of the plane to look at: around the first body, as far as the others reach."""
-        return picture.window(self, now)
+        return picture.window(self)
 
     def check(self) -> None:
         """Raise ValueError where parameters, each in its range, do not fit together."""

@@ -19,10 +19,11 @@ friction viscous instead of Coulomb's.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Polygon, Shape
+from lag_envs.scenes.shapes import Arrow, Bodies, Circle, Line, Polygon
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,11 +85,12 @@ class CartPole(Scene):
         """Return places and angles of cart and pole."""
         return {"cart": (q.x, 0.0, 0.0), "pole": (q.x, 0.0, -q.theta)}
 
-    def bodies(self) -> dict[str, list[Shape]]:
-        """Return the cart, and the pole upright."""
+    def bodies(self) -> Bodies:
+        """Return the rail, the cart, the pole upright, and an arrow for the force."""
         size, long = 0.2 * self.half_length, 2.0 * self.half_length
         wide = 0.3 * size
         return {
+            "rail": [Line([(-40.0 * size, -size), (40.0 * size, -size)], "ground")],
             "cart": [
                 Polygon([(-2 * size, -size), (2 * size, -size), (2 * size, size), (-2 * size, size)], "frame")
             ],
@@ -96,13 +98,9 @@ class CartPole(Scene):
                 Polygon([(-wide, -wide), (wide, -wide), (wide, long), (-wide, long)]),
                 Circle((0.0, 0.0), 0.5 * wide, "hole"),
             ],
+            "push": [Arrow([(0.0, 2.0 * size), (0.0, 6.0 * size)])],
         }
 
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return the rail, the bodies, and an arrow for the force."""
-        x, size = now.state[0], 0.2 * self.half_length
-        far = x + 40.0 * size
-        tip = x + (2.0 * size + 4.0 * size * abs(now.share)) * (1.0 if now.share >= 0.0 else -1.0)
-        start = x + 2.0 * size * (1.0 if now.share >= 0.0 else -1.0)
-        rail = Line([(2 * x - far, -size), (far, -size)], "ground")
-        return [rail, *super().shapes(now), Arrow([(start, 0.0), (tip, 0.0)])]
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the rail is, which shows no end, and the arrow."""
+        return {"rail": (now.q.x, 0.0), "push": (now.q.x, 0.0, -0.5 * math.pi, now.share.force)}

@@ -25,7 +25,7 @@ from typing import Any
 
 from lag_envs.scenes.acrobot import link
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Polygon, Shape
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class Chain(Scene):
             x, y = x + self.length * xp.sin(q[i]), y - self.length * xp.cos(q[i])
         return poses
 
-    def bodies(self) -> dict[str, list[Shape]]:
+    def bodies(self) -> Bodies:
         """Return the support, and the bars as they hang down."""
         wide, high = 0.2 * self.length, 0.08 * self.length
         support: list[Shape] = [

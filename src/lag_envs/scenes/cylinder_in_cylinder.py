@@ -27,16 +27,16 @@ from typing import Any
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.shapes import (
     Arrow,
+    Bodies,
     Circle,
     Line,
-    Moment,
-    Point,
     Polygon,
-    Shape,
     Window,
     arc,
+    half_turn,
     polar,
     roller,
+    share_of_half_turn,
 )
 
 
@@ -136,15 +136,15 @@ class CylinderInCylinder(Scene):
         spin = (self.shell_radius * q.psi - self.arm * q.theta) / self.radius
         return {
             "shell": (0.0, 0.0, q.psi),
-            "cylinder": (self.arm * xp.sin(q.theta), -self.arm * xp.cos(q.theta), spin),
+            "cylinder": (*self.place(q.theta, xp=xp), spin),
         }
 
-    def bodies(self) -> dict[str, list[Shape]]:
-        """Return the shell with its joints, and the cylinder."""
+    def bodies(self) -> Bodies:
+        """Return the shell with its joints, the angle, the cylinder, and an arrow for the control."""
         big, rim, up, part = self.shell_radius, 1.1 * self.shell_radius, 0.5 * math.pi, math.pi / 12
         origin, joints = (0.0, 0.0), [up + part * i for i in range(3, 22, 2)]
-        ratio = self.inertia / (self.mass * self.radius * self.radius)
         mark = [*arc(origin, rim, up - part, up + part), *arc(origin, big, up + part, up - part)]
+        drag, push = [origin, (0.0, 0.6 * big)], arc(origin, 1.19 * big, 0.0, math.pi / 3)
         return {
             "shell": [
                 Circle(origin, rim, "ground"),
@@ -152,33 +152,31 @@ class CylinderInCylinder(Scene):
                 Polygon(mark, "frame"),
                 Circle(origin, big, "hole"),
             ],
-            "cylinder": roller(origin, self.radius, up, ratio),
+            "ground": [Line([origin, (0.0, -big)], "guide")],
+            "arm": [Line([origin, (0.0, -self.arm)], "guide")],
+            "angle": [half_turn(0.4 * self.arm)],
+            "cylinder": roller(self.radius, self.inertia / (self.mass * self.radius * self.radius)),
+            "push": [Arrow(push if self.control == "tilt" else drag)],
         }
 
-    def place(self, theta: float, distance: float | None = None) -> Point:
-        """Return the point at an angle, and at a distance [m] from the shell's axis: by default R - r."""
-        return polar((0.0, 0.0), self.arm if distance is None else distance, theta - 0.5 * math.pi)
-
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return shell and cylinder, the angle, and an arrow for drag or acceleration."""
-        theta, big, origin, up = now.state[0], self.shell_radius, (0.0, 0.0), 0.5 * math.pi
-        centre, moved = self.place(theta), super().shapes(now)
-        n = len(self.bodies()["shell"])
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where angle and arrow are: the shell's acceleration beside it, drag at the cylinder."""
+        theta, share, quarter = now.q.theta, now.share[0], 0.5 * math.pi
+        found = {
+            "arm": (0.0, 0.0, theta),
+            "angle": (0.0, 0.0, -quarter, share_of_half_turn(theta, xp)),
+        }
         if self.control == "tilt":
-            action = arc(origin, 1.19 * big, up, up + now.share * math.pi / 3)
-        else:
-            back = -math.copysign(0.6 * big * now.share, now.state[1])
-            action = [centre, polar(centre, back, theta)]
-        return [
-            *moved[:n],
-            Line([origin, (0.0, -big)], "guide"),
-            Line([origin, centre], "guide"),
-            Line(arc(origin, 0.4 * self.arm, -up, math.remainder(theta, 2.0 * math.pi) - up), "guide"),
-            *moved[n:],
-            Arrow(action),
-        ]
+            return found | {"push": (0.0, 0.0, quarter, share)}
+        back = xp.where(now.state[1] < 0.0, share, -share)
+        return found | {"push": (*self.place(theta, xp=xp), theta - quarter, back)}
 
-    def window(self, now: Moment) -> Window:
+    def place(self, theta: Any, distance: Any = None, xp: Any = math) -> tuple[Any, Any]:
+        """Return the point at an angle, and at a distance [m] from the shell's axis: by default R - r."""
+        far = self.arm if distance is None else distance
+        return far * xp.sin(theta), -far * xp.cos(theta)
+
+    def window(self) -> Window:
         """Return a window on the whole shell."""
         size = 1.28 * self.shell_radius
         return Window(-size, -size, size, size)

@@ -19,7 +19,7 @@ MAPPINGS = ("coordinates", "prescribed", "controls", "modes", "reactions", "rati
 SEQUENCES = ("state", "left_out")
 
 #: What a scene may define; all other public names of `Scene` are its calls.
-DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "shapes", "window", "check")
+DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 
 
 # A class that goes to another process by value before it is used takes its fields along, and in them this

@@ -14,6 +14,7 @@ from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.layout import Layout, check_name
 from lag_envs.mechanics.motion import Mechanics
+from lag_envs.scenes import picture
 from lag_envs.scenes.checks import shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
 from lag_envs.scenes.parameters import fill_in
@@ -73,6 +74,8 @@ def _check_class(cls: type, base: type) -> None:
                 f"{of} is written for lag_envs 0.1, with drive, unpack and pack; write kinetic, potential, "
                 "dissipation and applied, from which these follow (see CHANGELOG.md)"
             )
+        if "shapes" in vars(c):
+            raise FormulaError(f"{of}.shapes: {picture.INSTEAD_OF_SHAPES}")
     faults = [fault for c in cls.__mro__ for fault in vars(c).get("_faults", ())]
     if faults:
         raise FormulaError(f"{of}.{faults[0]}")
@@ -118,11 +121,11 @@ def _check_bodies(scene: Any) -> None:
         bodies = scene.bodies()
     if not isinstance(bodies, Mapping):
         raise FormulaError(f"{of}.bodies must return shapes by body, got {bodies!r:.60}")
-    for body in bodies:
-        if body not in found.record.poses:
-            raise FormulaError(
-                f"{of}.bodies has {body!r}, which has no place in poses ({', '.join(found.record.poses)})"
-            )
+    known = [picture.GROUND, *found.record.poses, *picture.indicated(scene, picture.at_rest(scene))]
+    for body, shapes in bodies.items():
+        if body not in known:
+            raise picture.no_place(scene, "bodies", body, known)
+        picture.check_shapes(scene, body, shapes)
     try:
         found.full  # noqa: B018
     except FormulaError as error:

@@ -25,7 +25,7 @@ from typing import Any
 
 from lag_envs.scenes import shapes
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Arrow, Line, Moment, Point, Polygon, Shape, Window
+from lag_envs.scenes.shapes import Arrow, Bodies, Line, Polygon, Ruler, Window
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -125,72 +125,41 @@ class Incline(Scene):
 
     def poses(self, q: Any, xp: Any) -> Any:
         """Return place and angle of the cylinder; rolling ties its own angle to its place."""
-        c, s = xp.cos(q.phi), xp.sin(q.phi)
+        return {"cylinder": (*self.place(q.x, self.radius, q.phi, xp), -q.x / self.radius - q.phi)}
+
+    def bodies(self, low: float | None = None, high: float | None = None) -> Bodies:
+        """Return ground from low to high [m], cylinder and tilt, and an arrow for the drag."""
+        radius = self.radius
+        low, high = (-20.0 * radius, 20.0 * radius) if low is None or high is None else (low, high)
+        deep, angle = low - high, self.tilt or 0.0
+        level = [
+            Line([(0.0, 0.0), (-24.0 * radius, 0.0)], "guide"),
+            Line(shapes.arc((0.0, 0.0), 20.0 * radius, math.pi - angle, math.pi), "guide"),
+        ]
         return {
-            "cylinder": (q.x * c + self.radius * s, self.radius * c - q.x * s, -q.x / self.radius - q.phi)
+            "hill": [Polygon([(low, 0.0), (high, 0.0), (high, deep), (low, deep)], "ground")],
+            "plane": [Ruler(shapes.round_length((high - low) / 15.0), 0.6 * radius)],
+            "ground": [] if self.tilt is None else level,
+            "cylinder": shapes.roller(radius, self.inertia / (self.mass * radius * radius)),
+            "drag": [Arrow([(0.0, 0.0), (0.0, 8.0 * radius)])] if self.control == "damping" else [],
         }
 
-    def bodies(self) -> dict[str, list[Shape]]:
-        """Return the cylinder."""
-        ratio = self.inertia / (self.mass * self.radius * self.radius)
-        return {"cylinder": shapes.roller((0.0, 0.0), self.radius, 0.5 * math.pi, ratio)}
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where plane, ground and arrow are."""
+        x, phi = now.q.x, now.q.phi
+        back = xp.where(now.state[1] < 0.0, now.share[0], -now.share[0])
+        return {
+            "plane": (0.0, 0.0, -phi),
+            "hill": (*self.place(x, 0.0, phi, xp), -phi),
+            "drag": (*self.place(x, self.radius, phi, xp), -phi - 0.5 * math.pi, back),
+        }
 
-    def tilted(self, now: Moment) -> float:
-        """Return the tilt [rad]."""
-        if self.tilt is not None:
-            return self.tilt
-        return now.control if self.control == "tilt" else now.state[-1]
-
-    def place(self, x: float, height: float, phi: float) -> Point:
+    def place(self, x: Any, height: Any, phi: Any, xp: Any = math) -> tuple[Any, Any]:
         """Return the point at x along the surface and at a height above it [m]."""
-        c, s = math.cos(phi), math.sin(phi)
+        c, s = xp.cos(phi), xp.sin(phi)
         return x * c + height * s, height * c - x * s
 
-    def shapes(self, now: Moment, ends: tuple[float, float] | None = None) -> list[Shape]:
-        """Return plane, cylinder and tilt; the surface reaches from end to end [m]."""
-        x, radius, phi = now.state[0], self.radius, self.tilted(now)
-        ends = (x - 20.0 * radius, x + 20.0 * radius) if ends is None else ends
-        cylinder = super().shapes(now)
-        if self.control == "damping":
-            return [*self._slope(*ends, phi), *cylinder, self._drag(now, phi)]
-        far = max(-ends[0], ends[1])
-        start, sweep = (-phi, -0.3 * now.share) if self.control == "tilt_rate" else (0.0, -phi)
-        turn = Arrow(shapes.arc((0.0, 0.0), 1.15 * far, start, start + sweep))
-        return [*self._plank(*ends, phi), *cylinder, turn]
-
-    def _slope(self, low: float, high: float, phi: float) -> list[Shape]:
-        radius = self.radius
-        left, right = self.place(low, 0.0, phi), self.place(high, 0.0, phi)
-        depth = min(left[1], right[1]) - (high - low)
-        behind = [(right[0], depth), (left[0], depth)]
-        if abs(phi) > 0.25 * math.pi:  # rather a wall than a hill
-            behind = [self.place(x, low - high, phi) for x in (high, low)]
-        marks = shapes.ticks(low, high, shapes.round_length((high - low) / 15.0))
-        return [
-            Polygon([left, right, *behind], "ground"),
-            *(Line([self.place(x, 0.0, phi), self.place(x, -0.6 * radius, phi)], "ground") for x in marks),
-            Line([(0.0, 0.0), (-24.0 * radius, 0.0)], "guide"),
-            Line(shapes.arc((0.0, 0.0), 20.0 * radius, math.pi - phi, math.pi), "guide"),
-        ]
-
-    def _drag(self, now: Moment, phi: float) -> Arrow:
-        x, v = now.state
-        tip = x - math.copysign(8.0 * self.radius * now.share, v)
-        return Arrow([self.place(x, self.radius, phi), self.place(tip, self.radius, phi)])
-
-    def _plank(self, low: float, high: float, phi: float) -> list[Shape]:
-        far, thick = max(-low, high), 0.02 * (high - low)
-        floor, side = -9.0 * thick, 2.0 * far
-        corners = [(low, 0.0), (high, 0.0), (high, -thick), (low, -thick)]
-        return [
-            Polygon([(-4.0 * thick, floor), (0.0, -0.5 * thick), (4.0 * thick, floor)], "ground"),
-            Polygon([(-side, floor), (side, floor), (side, -side), (-side, -side)], "ground"),
-            Line([(-1.3 * far, 0.0), (1.3 * far, 0.0)], "guide"),
-            Polygon([self.place(a, b, phi) for a, b in corners], "frame"),
-        ]
-
-    def window(self, now: Moment) -> Window:
+    def window(self) -> Window:
         """Return a window that follows the cylinder."""
-        x, y = self.place(now.state[0], self.radius, self.tilted(now))
         size = 12.0 * self.radius
-        return Window(x - size, y - size, x + size, y + size)
+        return Window(-size, -size, size, size, "cylinder")

@@ -1,71 +1,227 @@
-"""The picture of a scene from its bodies and their poses."""
+"""The picture of a scene, or of a task on it: shapes in frames, and where the frames are at a moment."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.mechanics.algebra import Expr
+from lag_envs.mechanics.algebra import Expr, FormulaError
 from lag_envs.mechanics.evaluation import Numeric
-from lag_envs.mechanics.recording import Values
-from lag_envs.scenes.shapes import Moment, Shape, Window, extent, placed
+from lag_envs.mechanics.recording import Values, formula
+from lag_envs.scenes.shapes import Moment, Pose, Shape, Window, extent, placed
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
 
-Pose = tuple[float, float, float]
+#: The frame of what never moves.
+GROUND = "ground"
+INSTEAD_OF_SHAPES = (
+    "a picture is drawn from shapes in frames and from the frames' places; return the shapes by frame from "
+    "bodies(self), where bodies are from poses(self, q, xp), and where arrows, targets and the like are from "
+    "indicators(self, now, xp)"
+)
 
 
-def turning(scene: Scene, state: Sequence[float]) -> tuple[float, ...]:
+class Now(NamedTuple):
+    """What indicators can show, all by name.
+
+    Attributes
+    ----------
+    q : Values
+        Places of all coordinates, also of those that the state leaves out.
+    state : Values
+        The state.
+    share : Values
+        The controls as shares of their largest sizes.
+    target : Values
+        The targets.
+    """
+
+    q: Values
+    state: Values
+    share: Values
+    target: Values
+
+
+class Seen(Numeric):
+    """The namespace ``xp`` of `indicators`: the functions that a task's formulas have."""
+
+    where, abs, minimum, maximum = np.where, np.abs, np.minimum, np.maximum
+
+
+class Picture:
+    """What a painter paints.
+
+    Parameters
+    ----------
+    of : Scene or Task
+        Whose picture; a task's is its scene's with what the task adds.
+
+    Attributes
+    ----------
+    frames : list of str
+        The frames, as `poses` has them.
+    shapes : list of (int, Shape)
+        Each shape and the number of its frame, from back to front.
+    view : Window
+        What `window` moves.
+
+    Raises
+    ------
+    FormulaError
+        Where shapes lie in a frame without a pose.
+    """
+
+    def __init__(self, of: Any) -> None:
+        self._of, self._scene = of, getattr(of, "scene", of)
+        self._targets = [t.name for t in of.formulas.target_boxes] if of is not self._scene else []
+        bodies, window = of.bodies(), of.window()
+        found = self._poses(Moment([0.0] * len(self._scene.state_names)))
+        self.frames = list(found)
+        for frame in [*bodies, *filter(None, [window.frame])]:
+            if frame not in found:
+                raise no_place(of, "bodies" if frame in bodies else "window", frame, self.frames)
+            check_shapes(of, frame, bodies.get(frame, []))
+        self.shapes = [(self.frames.index(frame), shape) for frame in bodies for shape in bodies[frame]]
+        self.view = window
+
+    def poses(self, now: Moment) -> list[Pose]:
+        """Return where the frames are."""
+        return [Pose(*map(float, pose)) for pose in self._poses(now).values()]
+
+    def episode(self, states: ArrayLike, controls: ArrayLike, target: Any, dt: float) -> NDArray[np.float64]:
+        """Return the poses of an episode, shape (n, frames, 4).
+
+        Parameters
+        ----------
+        states : array_like, shape (n, n_state)
+            Its states.
+        controls : array_like, shape (n - 1, n_controls)
+            The controls between them.
+        target : float, sequence of float or None
+            Its targets.
+        dt : float
+            The time between two states [s].
+        """
+        array = np.asarray(states, np.float64)
+        n, columns = len(array), list(array.T)
+        held = np.zeros((n, len(self._scene.control_names)))
+        held[1:] = np.reshape(controls, held[1:].shape)
+        # Exact if the rates are linear between two states, as those of a coordinate that is pushed are.
+        turned = []
+        for rate in turning(self._scene, columns):
+            rates = np.broadcast_to(rate, n)
+            turned.append(np.concatenate([[0.0], np.cumsum(0.5 * dt * (rates[1:] + rates[:-1]))]))
+        now = Moment(columns, list(held.T), self._of.share(list(held.T)), target, turned)
+        found = self._poses(now).values()
+        return np.stack([np.stack([np.broadcast_to(x, n) for x in pose], -1) for pose in found], 1)
+
+    def window(self, poses: Sequence[Pose]) -> Window:
+        """Return the part of the plane to look at."""
+        if not self.view.frame:
+            return self.view
+        frame = poses[self.frames.index(self.view.frame)]
+        return self.view.moved(frame[0], frame[1])
+
+    def placed(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen at a moment, from back to front."""
+        poses = self.poses(now)
+        view = self.window(poses)
+        return [part for frame, shape in self.shapes for part in placed(shape, poses[frame], view)]
+
+    def _poses(self, now: Moment) -> dict[str, tuple]:
+        scene = self._scene
+        q = _places(scene, now)
+        found = {GROUND: (0.0, 0.0)} | dict(scene.poses(Values("coordinate", q), Numeric))
+        seen = Now(
+            Values("coordinate", q),
+            Values("entry of the state", dict(zip(scene.state_names, now.state, strict=True))),
+            Values("control", _filled(scene.control_names, now.share)),
+            Values("target", _filled(self._targets, 0.0 if now.target is None else now.target)),
+        )
+        found |= indicated(self._of, seen)
+        return {frame: Pose(*pose) for frame, pose in found.items()}
+
+
+def no_place(of: Any, where: str, frame: str, known: Sequence[str]) -> FormulaError:
+    """Return the error for a frame that nothing places."""
+    return FormulaError(
+        f"{type(of).__name__}.{where} has {frame!r}, which has no place in poses or indicators "
+        f"({', '.join(known)})"
+    )
+
+
+def check_shapes(of: Any, frame: str, shapes: Any) -> None:
+    """Raise a FormulaError for what is no list of shapes."""
+    for shape in shapes if isinstance(shapes, Sequence) else [shapes]:
+        if not isinstance(shape, Shape) or shape is shapes:
+            kinds = ", ".join(kind.__name__ for kind in get_args(Shape))
+            raise FormulaError(
+                f"{type(of).__name__}.bodies must have a list of shapes ({kinds}) for {frame!r}, "
+                f"got {shapes!r:.60}"
+            )
+
+
+def indicated(of: Any, now: Now) -> dict[str, tuple]:
+    """Return the poses of a scene's or a task's indicators, or raise a FormulaError."""
+    with formula(of, "indicators"):
+        found = of.indicators(now, Seen)
+        if not isinstance(found, Mapping):
+            raise FormulaError(f"it must return places by frame, got {found!r:.60}")
+        for frame, pose in found.items():
+            if not isinstance(pose, Sequence) or not 2 <= len(pose) <= 4:
+                raise FormulaError(
+                    f"{frame!r} must be at (x, y), (x, y, angle) or (x, y, angle, part), got {pose!r:.60}"
+                )
+    return dict(found)
+
+
+def at_rest(scene: Scene) -> Now:
+    """Return a moment at which all numbers are zero."""
+    zero = Moment([0.0] * len(scene.state_names))
+    return Now(
+        Values("coordinate", _places(scene, zero)),
+        Values("entry of the state", dict.fromkeys(scene.state_names, 0.0)),
+        Values("control", dict.fromkeys(scene.control_names, 0.0)),
+        Values("target", {}),
+    )
+
+
+def turning(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
     """Return the rates of the places that the state leaves out, in their order; unknown ones are 0."""
     layout = scene._layout
     rates = {entry.coordinate: state[i] for i, entry in enumerate(layout.state) if entry.kind == "velocity"}
-    return tuple(float(rates.get(name, 0.0)) for name in layout.left_out if name in layout.names)
+    return tuple(rates.get(name, 0.0) for name in layout.left_out if name in layout.names)
 
 
-def poses(scene: Scene, now: Moment) -> dict[str, Pose]:
-    """Return place [m] and angle [rad] of each body."""
+def _filled(names: Sequence[str], given: Any) -> dict[str, Any]:
+    """Return numbers by name, 0 where there are none; many moments are given as a list of arrays."""
+    values = list(given) if isinstance(given, list | tuple) or np.ndim(given) else [given]
+    return dict.fromkeys(names, 0.0) | dict(zip(names, values, strict=False))
+
+
+def _places(scene: Scene, now: Moment) -> dict[str, Any]:
+    """Return the places of all coordinates."""
     layout = scene._layout
-    controls = dict(zip(layout.controls, np.ravel(now.control).tolist(), strict=False))
-    unseen = (name for name in layout.left_out if name in layout.names)
-    turned = dict(itertools.zip_longest(unseen, np.ravel(now.turned).tolist(), fillvalue=0.0))
+    controls = _filled(layout.controls, now.control)
+    turned = _filled([name for name in layout.left_out if name in layout.names], now.turned)
     rests = scene.rests()
-    q = dict.fromkeys(layout.names, 0.0)
+    q: dict[str, Any] = dict.fromkeys(layout.names, 0.0)
     for name, level, by in layout.prescribed:
-        q[name] = (
-            rests.get(name, 0.0)
-            if level == "rest"
-            else controls.get(by or "", 0.0)
-            if level == "place"
-            else 0.0
-        )
-    q |= {name: turned[name] for name in turned if name in q}
-    q |= {entry.coordinate: now.state[i] for i, entry in enumerate(layout.state) if entry.kind == "place"}
-    return _poses(scene, q)
+        q[name] = {"rest": rests.get(name, 0.0), "place": controls.get(by or "", 0.0)}.get(level, 0.0)
+    places = {entry.coordinate: now.state[i] for i, entry in enumerate(layout.state) if entry.kind == "place"}
+    return q | turned | places
 
 
-def _poses(scene: Scene, q: dict[str, float]) -> dict[str, Pose]:
-    found = scene.poses(Values("coordinate", q), Numeric)
-    return {body: (float(x), float(y), float(angle)) for body, (x, y, angle) in found.items()}
-
-
-def shapes(scene: Scene, now: Moment) -> list[Shape]:
-    """Return the shapes of all bodies where they are."""
-    bodies = scene.bodies()
-    return [shape for body, pose in poses(scene, now).items() for shape in placed(bodies.get(body, []), pose)]
-
-
-def window(scene: Scene, now: Moment) -> Window:
+def window(scene: Scene) -> Window:
     """Return a window that follows the first body and holds what the others reach."""
-    found = poses(scene, now)
-    x, y, _ = next(iter(found.values()), (0.0, 0.0, 0.0))
-    size = 1.15 * _reach(scene)
-    return Window(x - size, y - size, x + size, y + size)
+    size, first = 1.15 * _reach(scene), next(iter(scene.mechanics.record.poses), "")
+    return Window(-size, -size, size, size, first)
 
 
 @lru_cache(maxsize=256)
@@ -75,9 +231,9 @@ def _reach(scene: Scene) -> float:
     A coordinate that the poses have in sines and cosines only is taken for an angle, any other for a length,
     which is followed for as far as the bodies are large.
     """
-    sizes = {body: extent(outline) for body, outline in scene.bodies().items()}
     names, record = scene._layout.names, scene.mechanics.record.poses
-    lengths = {s.name for x, y, _ in record.values() for s in _plain(x) | _plain(y)}
+    sizes = {body: extent(outline) for body, outline in scene.bodies().items() if body in record}
+    lengths = {s.name for x, y, *_ in record.values() for s in _plain(x) | _plain(y)}
     generator, far = np.random.default_rng(5), 0.0
     scale = max(sizes.values(), default=1.0) or 1.0
     for _ in range(256):
@@ -85,8 +241,8 @@ def _reach(scene: Scene) -> float:
             n: generator.uniform(-scale, scale) if n in lengths else generator.uniform(-math.pi, math.pi)
             for n in names
         }
-        found = _poses(scene, q)
-        x, y, _ = next(iter(found.values()), (0.0, 0.0, 0.0))
+        found = scene.poses(Values("coordinate", q), Numeric)
+        x, y, *_ = next(iter(found.values()), (0.0, 0.0, 0.0))
         for body, pose in found.items():
             far = max(far, math.hypot(pose[0] - x, pose[1] - y) + sizes.get(body, 0.0))
     return far or 1.0

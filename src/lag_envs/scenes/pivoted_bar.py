@@ -24,7 +24,7 @@ from typing import Any
 
 from lag_envs.scenes import shapes
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Arrow, Circle, Line, Moment, Point, Polygon, Shape, Window
+from lag_envs.scenes.shapes import Arrow, Bodies, Circle, Line, Polygon, Role, Ruler, Shape, Window
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,60 +99,70 @@ class PivotedBar(Scene):
         """Return places and angles of support and bar."""
         return {"support": (q.s, q.rise, 0.0), "bar": (q.s, q.rise, q.theta)}
 
-    def bodies(self) -> dict[str, list[Shape]]:
-        """Return the support, and the bar as it hangs down."""
-        wide, high, half = 0.11 * self.reach, 0.05 * self.reach, 0.035 * self.reach
-        near, far = 2.0 * self.com_distance - self.reach - half, self.reach
+    def bodies(self) -> Bodies:
+        """Return rail, support and bar, the angle, and an arrow for the acceleration."""
+        wide, high = 0.11 * self.reach, 0.05 * self.reach
         com = (0.0, -self.com_distance)
         return {
-            "support": [Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame")],
+            "ground": self._rail(),
+            "line": self._endless_rail(),
+            "support": [
+                Line([(0.0, 0.0), (0.0, -0.4 * self.reach)], "guide"),
+                Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame"),
+            ],
+            "angle": [shapes.half_turn(0.25 * self.reach)],
             "bar": [
                 Line([(0.0, 0.0), com], "body"),
-                Polygon([(-half, -near), (-half, -far), (half, -far), (half, -near)]),
+                self.outline(),
                 Circle((0.0, 0.0), 0.02 * self.reach, "hole"),
                 Circle(com, 0.022 * self.reach, "mark"),
             ],
+            "push": [Arrow([(0.0, wide), (0.0, wide + 0.45 * self.reach)])],
         }
 
-    def outline(self, s: float, theta: float) -> list[Point]:
-        """Return the corners of the bar [m]."""
-        placed = shapes.placed(self.bodies()["bar"], (s, 0.0, theta))
-        return next(list(shape.points) for shape in placed if isinstance(shape, Polygon))
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where rail, angle and arrow are."""
+        s, down = now.q.s, -0.5 * math.pi
+        return {
+            "line": (s, 0.0),
+            "angle": (s, 0.0, down, shapes.share_of_half_turn(now.q.theta, xp)),
+            "push": (s, 0.0, down, now.share[0]),
+        }
+
+    def outline(self, role: Role = "body") -> Polygon:
+        """Return the bar as it hangs down."""
+        half = 0.035 * self.reach
+        near, far = 2.0 * self.com_distance - self.reach - half, self.reach
+        return Polygon([(-half, -near), (-half, -far), (half, -far), (half, -near)], role)
 
     @property
     def reach(self) -> float:
         """Distance from the pivot to the far end of a uniform bar with this mass, centre and inertia [m]."""
         return self.com_distance + 0.5 * math.sqrt(12.0 * self.inertia / self.mass)
 
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return rail, support and bar, the angle, and an arrow for the acceleration."""
-        s, theta, reach = (0.0 if self.track is None else now.state[0]), now.state[-2], self.reach
-        turn = math.remainder(theta, 2.0 * math.pi)
-        edge = s + math.copysign(0.11 * reach, now.share)
-        return [
-            *self._rail(s),
-            Line([(s, 0.0), (s, -0.4 * reach)], "guide"),
-            Line(shapes.arc((s, 0.0), 0.25 * reach, -0.5 * math.pi, turn - 0.5 * math.pi), "guide"),
-            *super().shapes(now if self.track is not None else now._replace(turned=0.0)),
-            Arrow([(edge, 0.0), (edge + 0.45 * reach * now.share, 0.0)]),
-        ]
-
-    def _rail(self, s: float) -> list[Shape]:
+    def _rail(self) -> list[Shape]:
+        """Return what stays where it is: a track with its ends, or the ticks of one without."""
         if self.track is None:
             return [Line([(-2.0 * self.reach, 0.0), (2.0 * self.reach, 0.0)], "guide")]
-        endless, size = math.isinf(self.track), 0.035 * self.reach
-        low, high = (s - 3.0 * self.reach, s + 3.0 * self.reach) if endless else (-self.track, self.track)
-        step = shapes.round_length(0.1 * (high - low))
-        rail: list[Shape] = [Line([(x, 0.0), (x, -size)], "ground") for x in shapes.ticks(low, high, step)]
-        rail.append(Line([(low, 0.0), (high, 0.0)], "frame"))
-        if not endless:
-            rail += [Line([(end, -2.0 * size), (end, 2.0 * size)], "limit") for end in (low, high)]
-        return rail
+        size = 0.035 * self.reach
+        if math.isinf(self.track):
+            return [Ruler(shapes.round_length(0.6 * self.reach), size)]
+        low, high = -self.track, self.track
+        step = shapes.round_length(0.2 * self.track)
+        return [
+            *(Line([(x, 0.0), (x, -size)], "ground") for x in shapes.ticks(low, high, step)),
+            Line([(low, 0.0), (high, 0.0)], "frame"),
+            *(Line([(end, -2.0 * size), (end, 2.0 * size)], "limit") for end in (low, high)),
+        ]
 
-    def window(self, now: Moment) -> Window:
+    def _endless_rail(self) -> list[Shape]:
+        """Return the part of a track without ends that goes along with the support."""
+        far = 3.0 * self.reach
+        return [Line([(-far, 0.0), (far, 0.0)], "frame")] if self.track == math.inf else []
+
+    def window(self) -> Window:
         """Return a window on the whole track, or one that follows the support."""
         tall = 1.08 * self.reach
         if self.track is None or math.isinf(self.track):
-            s = 0.0 if self.track is None else now.state[0]
-            return Window(s - tall, -tall, s + tall, tall)
+            return Window(-tall, -tall, tall, tall, "support")
         return Window(-self.track - tall, -tall, self.track + tall, tall)

@@ -22,7 +22,7 @@ import dataclasses
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Circle, Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class RotaryPendulum(Scene):
         """Return the arm, seen from above, and beside it the pendulum, seen along the arm."""
         return {"arm": (0.0, 0.0, q.phi), "pendulum": (1.5 * self.arm_length, 0.0, q.theta)}
 
-    def bodies(self) -> dict[str, list[Shape]]:
+    def bodies(self) -> Bodies:
         """Return the arm, and the pendulum as it hangs down."""
         wide = 0.05 * self.arm_length
         r, long = self.arm_length, 2.0 * self.com_distance

@@ -1,13 +1,15 @@
 """What is to be seen of a scene and of a task: plain data in metres, x to the right and y up.
 
-A shape names its role and not its colour; how a role looks is the viewer's business.
+A shape lies in a frame, and a pose says where the frame is at a moment. That is all that a painter needs: it
+transforms and paints. A shape names its role and not its colour; how a role looks is the painter's business.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
 
 Point = tuple[float, float]
 
@@ -46,6 +48,14 @@ class Arrow(NamedTuple):
     role: Role = "action"
 
 
+class Ruler(NamedTuple):
+    """Ticks below the x axis at every multiple of a step, wherever one looks; `size` is their length [m]."""
+
+    step: float
+    size: float
+    role: Role = "ground"
+
+
 class Lens(NamedTuple):
     """A round part of the picture [m] that is shown once more, magnified."""
 
@@ -53,40 +63,68 @@ class Lens(NamedTuple):
     radius: float
 
 
-Shape = Line | Polygon | Circle | Arrow | Lens
+Shape = Line | Polygon | Circle | Arrow | Ruler | Lens
+
+#: Shapes by frame, from back to front.
+Bodies = dict[str, Sequence[Shape]]
+
+
+class Pose(NamedTuple):
+    """Where a frame is.
+
+    Attributes
+    ----------
+    x, y : float [m]
+        Its origin.
+    angle : float [rad]
+        How far it is turned counter-clockwise.
+    part : float
+        The part of its lines and arrows that is painted, from their start. Where it is negative the frame's
+        mirror image is, with -y for y: an arrow along the y axis then points the other way.
+    """
+
+    x: float
+    y: float
+    angle: float = 0.0
+    part: float = 1.0
 
 
 class Window(NamedTuple):
-    """The part of the plane that is to be seen [m]."""
+    """The part of the plane that is to be seen [m]; it moves with the origin of a frame, if it names one."""
 
     left: float
     bottom: float
     right: float
     top: float
+    frame: str = ""
+
+    def moved(self, x: float, y: float) -> Window:
+        """Return the window elsewhere."""
+        return Window(self.left + x, self.bottom + y, self.right + x, self.top + y)
 
 
 class Moment(NamedTuple):
-    """What a picture shows.
+    """What a picture shows; with arrays in place of numbers it is many moments.
 
     Attributes
     ----------
     state : sequence of float
         The state, in the scene's order.
-    control : float
-        The control that was applied last, in SI units.
-    share : float
-        The same as a share of the task's largest control; the length of an arrow.
-    target : float or None
-        The episode's target.
-    turned : float
-        Integral of `Scene.turning`.
+    control : float or sequence of float
+        The controls that were applied last, in SI units.
+    share : float or sequence of float
+        The same as shares of the task's largest controls; the lengths of arrows.
+    target : float, sequence of float or None
+        The episode's targets.
+    turned : float or sequence of float
+        The places that the state leaves out, see `picture.turning`.
     """
 
-    state: Sequence[float]
-    control: float = 0.0
-    share: float = 0.0
-    target: float | None = None
-    turned: float = 0.0
+    state: Sequence[Any]
+    control: Any = 0.0
+    share: Any = 0.0
+    target: Any = None
+    turned: Any = 0.0
 
 
 class Reading(NamedTuple):
@@ -109,21 +147,42 @@ def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> l
     return [polar(centre, radius, start + (end - start) * i / n) for i in range(n + 1)]
 
 
-def placed(shapes: Sequence[Shape], pose: tuple[float, float, float]) -> list[Shape]:
-    """Return shapes of a body's own frame where the body is: at (x, y) [m], turned by an angle [rad]."""
-    x, y, angle = pose
-    c, s = math.cos(angle), math.sin(angle)
+def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
+    """Return a shape of a frame in the plane, as somebody sees it who looks at a window."""
+    x, y, angle, part = pose
+    c, s, way = math.cos(angle), math.sin(angle), -1.0 if part < 0.0 else 1.0
 
     def move(point: Point) -> Point:
-        return x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]
+        a, b = point[0], way * point[1]
+        return x + c * a - s * b, y + s * a + c * b
 
-    moved: list[Shape] = []
-    for shape in shapes:
-        if isinstance(shape, Circle | Lens):
-            moved.append(shape._replace(centre=move(shape.centre)))
-        else:
-            moved.append(shape._replace(points=[move(point) for point in shape.points]))
-    return moved
+    match shape:
+        case Circle() | Lens():
+            return [shape._replace(centre=move(shape.centre))]
+        case Polygon():
+            return [shape._replace(points=[move(point) for point in shape.points])]
+        case Ruler(step, size, role):
+            across, up = 0.5 * (view.left + view.right) - x, 0.5 * (view.bottom + view.top) - y
+            middle, far = c * across + s * up, 2.0 * max(view.right - view.left, view.top - view.bottom)
+            at = ticks(middle - far, middle + far, step)
+            return [Line([move((a, 0.0)), move((a, -size))], role) for a in at]
+        case _:
+            return [shape._replace(points=[move(point) for point in beginning(shape.points, abs(part))])]
+
+
+def beginning(points: Sequence[Point], part: float) -> Sequence[Point]:
+    """Return the first part of a line."""
+    if part >= 1.0:
+        return points
+    room, kept = part * sum(math.dist(a, b) for a, b in pairwise(points)), [points[0]]
+    for a, b in pairwise(points):
+        step = math.dist(a, b)
+        if step >= room:
+            share = room / step if step else 0.0
+            return [*kept, (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))]
+        kept.append(b)
+        room -= step
+    return kept
 
 
 def extent(shapes: Sequence[Shape]) -> float:
@@ -132,20 +191,31 @@ def extent(shapes: Sequence[Shape]) -> float:
     for shape in shapes:
         if isinstance(shape, Circle | Lens):
             sizes.append(math.hypot(*shape.centre) + shape.radius)
-        else:
+        elif not isinstance(shape, Ruler):
             sizes += [math.hypot(*point) for point in shape.points]
     return max(sizes)
 
 
-def roller(centre: Point, radius: float, angle: float, ratio: float) -> list[Shape]:
-    """Return a rolling cylinder that has turned counter-clockwise by an angle [rad].
+def roller(radius: float, ratio: float) -> list[Shape]:
+    """Return a rolling cylinder about the origin [m].
 
     The ratio I/(m r²) above 1/2 is that of a tube, which is drawn to scale.
     """
     hollow = min(math.sqrt(max(2.0 * ratio - 1.0, 0.0)), 0.95) * radius
-    quarters = [arc(centre, radius, angle + start, angle + start + 0.5 * math.pi) for start in (0.0, math.pi)]
-    marks = [Polygon([centre, *rim], "mark") for rim in quarters]
+    centre, quarter = (0.0, 0.0), 0.5 * math.pi
+    rims = [arc(centre, radius, start, start + quarter) for start in (quarter, 3.0 * quarter)]
+    marks = [Polygon([centre, *rim], "mark") for rim in rims]
     return [Circle(centre, radius), *marks, Circle(centre, max(hollow, 0.1 * radius), "hole")]
+
+
+def half_turn(radius: float) -> Line:
+    """Return the line along which an angle is shown: from the x axis, all of it half a turn."""
+    return Line(arc((0.0, 0.0), radius, 0.0, math.pi), "guide")
+
+
+def share_of_half_turn(angle: Any, xp: Any) -> Any:
+    """Return an angle within (-π, π) as a share of half a turn."""
+    return 2.0 / math.pi * xp.atan(xp.sin(angle) / xp.maximum(1.0 + xp.cos(angle), 1e-9))
 
 
 def ticks(low: float, high: float, step: float) -> list[float]:

@@ -22,7 +22,7 @@ import dataclasses
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Circle, Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ class TwoLinkArm(Scene):
         elbow = self.length_1 * xp.cos(q.theta_1), self.length_1 * xp.sin(q.theta_1)
         return {"upper_arm": (0.0, 0.0, q.theta_1), "forearm": (*elbow, q.theta_1 + q.theta_2)}
 
-    def bodies(self) -> dict[str, list[Shape]]:
+    def bodies(self) -> Bodies:
         """Return the links along the horizontal, the forearm with its hand."""
         upper, fore = (self._link(length) for length in (self.length_1, self.length_2))
         return {

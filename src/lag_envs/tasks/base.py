@@ -22,7 +22,7 @@ from lag_envs.scenes.base import ORDER, Scene
 from lag_envs.scenes.checks import StepRefused, check_number, check_state, real_array
 from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.door import is_own
-from lag_envs.scenes.shapes import Moment, Reading, Shape, Window
+from lag_envs.scenes.shapes import Bodies, Moment, Reading, Shape, Window
 from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
@@ -146,6 +146,8 @@ class Task:
                 f"{type(self).__name__} is written for lag_envs 0.1, with scene_type and formulas by index; "
                 "write scene, action, start, observe and reward by name (see CHANGELOG.md)"
             )
+        if type(self).shapes is not Task.shapes:
+            raise FormulaError(f"{type(self).__name__}.shapes: {picture.INSTEAD_OF_SHAPES}")
         kind = type(self).scene
         if not (isinstance(kind, type) and issubclass(kind, Scene)):
             raise FormulaError(
@@ -401,26 +403,38 @@ class Task:
 
     # --- the picture ---------------------------------------------------------------------------------------
 
-    def shapes(self, now: Moment) -> list[Shape]:
-        """Return what is to be seen, from back to front: the scene, and what matters to the task."""
-        return self.scene.shapes(now)
+    def bodies(self) -> Bodies:
+        """Return shapes by frame, from back to front: the scene's, and what matters to the task."""
+        return dict(self.scene.bodies())
 
-    def window(self, now: Moment) -> Window:
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where frames are that show more than bodies: see `Scene.indicators`."""
+        return dict(self.scene.indicators(now, xp))
+
+    def window(self) -> Window:
         """Return the part of the plane to look at [m]."""
-        return self.scene.window(now)
+        return self.scene.window()
 
-    def share(self, control: Any) -> Any:
-        """Return controls as shares of their largest sizes."""
+    def shapes(self, now: Moment) -> list[Shape]:
+        """Return what is to be seen at a moment, from back to front."""
+        return picture.Picture(self).placed(now)
+
+    def wanted(self, actions: ArrayLike) -> NDArray[np.float64]:
+        """Return the controls that actions (n,) or (n, n_actions) ask for, shape (n, n_controls)."""
+        columns = np.reshape(np.asarray(actions, np.float64), (-1, len(self.formulas.acting))).T
+        names, found = self.scene.control_names, np.zeros((columns.shape[-1], len(self.scene.control_names)))
+        for acting, numbers in zip(self.formulas.acting, columns, strict=True):
+            found[:, names.index(acting.control)] = _control(acting, numbers, np)
+        return found
+
+    def share(self, control: Any) -> list[Any]:
+        """Return controls, numbers or arrays, as shares of their largest sizes."""
         largest = {a.control: max(abs(a.low), abs(a.high)) for a in self.formulas.acting}
-        shares = [
-            float(value) / largest[name] if name in largest else 0.0
-            for name, value in zip(self.scene.control_names, np.atleast_1d(control), strict=True)
+        values = control if isinstance(control, list) else np.atleast_1d(control)
+        return [
+            value / largest[name] if name in largest else 0.0 * value
+            for name, value in zip(self.scene.control_names, values, strict=True)
         ]
-        return shares[0] if len(shares) == 1 else shares
-
-    def turning(self, state: Sequence[float]) -> Any:
-        """Return the rates of the coordinates that the state leaves out."""
-        return np.array(picture.turning(self.scene, state))
 
     def control_readings(self, now: Moment) -> list[Reading]:
         """Return what the read-out tells of the controls."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lag_envs.scenes import CylinderInCylinder
-from lag_envs.scenes.shapes import Circle, Line, Moment, Reading, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Line, Moment, Reading
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
@@ -71,12 +71,16 @@ class _Shell(Task):
             "psi_dot": self.fastest_shell * (1.0 + 1e-6),
         }
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add how far the cylinder may go."""
         scene, limits = self.scene, (-self.largest_angle, self.largest_angle)
         inner = scene.shell_radius - scene.radius
         lines = [Line([scene.place(a, inner), scene.place(a, scene.shell_radius)], "limit") for a in limits]
-        return [*super().shapes(now), *lines]
+        return {**super().bodies(), "limits": lines}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the limits are."""
+        return {**super().indicators(now, xp), "limits": (0.0, 0.0)}
 
     def check_start(self, state: Any) -> None:
         """Refuse a start at which the episode would be over, or with the shell too fast."""
@@ -284,10 +288,13 @@ it.
         """Return bounds on the observation."""
         return {**super().bounds(), "target": self.largest_angle}
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add the target."""
-        mark = Circle(self.scene.place(now.target or 0.0), self.scene.radius, "target")
-        return [*super().shapes(now), mark]
+        return {**super().bodies(), "goal": [Circle((0.0, 0.0), self.scene.radius, "target")]}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the target is."""
+        return {**super().indicators(now, xp), "goal": self.scene.place(now.target.target, xp=xp)}
 
     def check_target(self, target: Any) -> float:
         """Refuse a target at which the episode would be over."""
@@ -484,11 +491,12 @@ then spends more on keeping it; PPO is later there, but for one seed, and keeps 
         """Return θ, θ', ψ'."""
         return {name: after[name] for name in self.scene.state_names}
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add the turning points of a swing of the wanted energy."""
         places = [self.scene.place(a) for a in (-self.amplitude, self.amplitude)]
         marks = [Circle(place, self.scene.radius, "target") for place in places]
-        return [*super().shapes(now), *marks]
+        shapes = super().bodies()
+        return {**shapes, "limits": [*shapes["limits"], *marks]}
 
     def readings(self, now: Moment) -> list[Reading]:
         """Tell the energy per inertia, and the wanted one."""
@@ -710,10 +718,13 @@ with the action that lets go all the time.
         swing = FASTEST_START + self.weight() * self.duration + 3.0 * self.limit
         return {"theta": 1e3 + swing * self.duration, "theta_dot": swing}
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add the place of rest."""
-        mark = Circle(self.scene.place(0.0), self.scene.radius, "target")
-        return [*super().shapes(now), mark]
+        return {**super().bodies(), "goal": [Circle(self.scene.place(0.0), self.scene.radius, "target")]}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the frame of the place of rest is."""
+        return {**super().indicators(now, xp), "goal": (0.0, 0.0)}
 
     def check_start(self, state: Any) -> None:
         """Refuse a start without contact."""

@@ -9,7 +9,19 @@ from typing import Any
 import numpy as np
 
 from lag_envs.scenes import Incline
-from lag_envs.scenes.shapes import Circle, Lens, Line, Moment, Reading, Shape, Window, polar
+from lag_envs.scenes.shapes import (
+    Arrow,
+    Bodies,
+    Circle,
+    Lens,
+    Line,
+    Moment,
+    Polygon,
+    Reading,
+    Window,
+    arc,
+    polar,
+)
 from lag_envs.stepping import slope
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
@@ -244,16 +256,41 @@ the cascade. PPO is later at the mark than the cascade, and stops beside it wher
             {} if self.quasi_static else {"phi": tilt}
         )
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Return a plank that ends at the edges, with the target and the largest tilt."""
-        scene, edge, phi, radius = self.scene, self.edge, self.scene.tilted(now), self.scene.radius
-        posts = [Line([scene.place(x, y, phi) for y in (0.0, 0.8 * radius)], "limit") for x in (-edge, edge)]
+        edge, radius, thick = self.edge, self.scene.radius, 0.04 * self.edge
+        floor, side = -9.0 * thick, 2.0 * edge
+        corners = [(-edge, 0.0), (edge, 0.0), (edge, -thick), (-edge, -thick)]
+        posts = [Line([(x, 0.0), (x, 0.8 * radius)], "limit") for x in (-edge, edge)]
         tilts = [-self.largest_tilt, self.largest_tilt]
         limits = [Line([polar((0.0, 0.0), r * edge, a) for r in (1.03, 1.09)], "limit") for a in tilts]
-        mark = Circle(scene.place(now.target or 0.0, radius, phi), radius, "target")
-        return [mark, *scene.shapes(now, ends=(-edge, edge)), *posts, *limits]
+        sweep = self.limit_control if self.quasi_static else 0.3
+        return {
+            "goal": [Circle((0.0, 0.0), radius, "target")],
+            "ground": [
+                Polygon([(-4.0 * thick, floor), (0.0, -0.5 * thick), (4.0 * thick, floor)], "ground"),
+                Polygon([(-side, floor), (side, floor), (side, -side), (-side, -side)], "ground"),
+                Line([(-1.3 * edge, 0.0), (1.3 * edge, 0.0)], "guide"),
+            ],
+            "plane": [Polygon(corners, "frame")],
+            "cylinder": super().bodies()["cylinder"],
+            "turn": [Arrow(arc((0.0, 0.0), 1.15 * edge, 0.0, -sweep))],
+            "posts": posts,
+            "limits": limits,
+        }
 
-    def window(self, now: Moment) -> Window:
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where target, plank, limits and an arrow for the tilt or its rate are."""
+        phi = now.q.phi
+        return {
+            "goal": self.scene.place(now.target.target, self.scene.radius, phi, xp),
+            "plane": (0.0, 0.0, -phi),
+            "turn": (0.0, 0.0, 0.0 if self.quasi_static else -phi, now.share[0]),
+            "posts": (0.0, 0.0, -phi),
+            "limits": (0.0, 0.0),
+        }
+
+    def window(self) -> Window:
         """Look at the whole plank."""
         return Window(-1.25 * self.edge, -0.6 * self.edge, 1.25 * self.edge, 0.6 * self.edge)
 
@@ -488,23 +525,30 @@ little sooner and too fast, and what that costs is more than the time it saves.
         speed = FASTEST_START + self.coefficients([0.0, 0.0], [0.0], np).pull * self.duration
         return {"distance": 1e3 + speed * self.duration, "v": speed}
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Return the slope with the line, and the cylinder magnified."""
-        scene, radius, tilt = self.scene, self.scene.radius, self.scene.tilt
-        near, far = self._stretch(now)
-        line = Line([scene.place(0.0, 0.0, tilt), scene.place(0.0, 6.0 * radius, tilt)], "target")
-        lens = Lens(scene.place(now.state[0], radius, tilt), 2.2 * radius)
-        return [*scene.shapes(now, ends=(near - 3.0, far + 3.0)), line, lens]
+        radius, shapes = self.scene.radius, self.scene.bodies(-3.0, self._length + 3.0)
+        line = Line([(0.0, 0.0), (0.0, 6.0 * radius)], "target")
+        return {**shapes, "line": [line], "glass": [Lens((0.0, 0.0), 2.2 * radius)]}
 
-    def window(self, now: Moment) -> Window:
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where they are; the ground begins before the line, or before a cylinder farther away."""
+        scene, x, phi = self.scene, now.q.x, now.q.phi
+        start = xp.minimum(-3.2, x - 0.2)
+        return {
+            **super().indicators(now, xp),
+            "hill": (*scene.place(start, 0.0, phi, xp), -phi),
+            "line": (0.0, 0.0, -phi),
+            "glass": scene.place(x, scene.radius, phi, xp),
+        }
+
+    #: How much of the slope is to be seen [m].
+    _length = 3.6
+
+    def window(self) -> Window:
         """Look at the last metres before the line, or at those around a cylinder that is farther away."""
-        scene = self.scene
-        ends = [scene.place(x, scene.radius, scene.tilt) for x in self._stretch(now)]
-        return Window(ends[0][0], ends[1][1], ends[1][0], ends[0][1])
-
-    def _stretch(self, now: Moment) -> tuple[float, float]:
-        start = min(-3.2, now.state[0] - 0.2)
-        return start, start + 3.6
+        near, far = (self.scene.place(x, self.scene.radius, self.scene.tilt) for x in (0.0, self._length))
+        return Window(near[0], far[1], far[0], near[1], "hill")
 
     def readings(self, now: Moment) -> list[Reading]:
         """Tell the speed at which the line should be crossed."""

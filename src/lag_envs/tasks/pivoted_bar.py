@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lag_envs.scenes import PivotedBar
-from lag_envs.scenes.shapes import Line, Moment, Polygon, Shape, Window, polar
+from lag_envs.scenes.shapes import Bodies, Line, Window, polar
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
@@ -275,10 +275,13 @@ track, so nobody knows whether the difference can be had. The other learners cat
         fastest = FASTEST_START + self.largest * self.duration
         return {"s/S": (1e3 + fastest * self.duration) / self.length, "s_dot/2": 0.5 * fastest} | bar
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add the upright bar."""
-        s = now.state[0] if self.has_track else 0.0
-        return [Polygon(self.scene.outline(s, math.pi), "target"), *super().shapes(now)]
+        return {"upright": [self.scene.outline("target")], **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the upright bar is."""
+        return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
 
     def check_start(self, state: Any) -> None:
         """Refuse a start from which the support cannot stop inside the track."""
@@ -540,14 +543,19 @@ many episodes.
             "theta_dot": swing,
         }
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def bodies(self) -> Bodies:
         """Add the upright bar, and how far it may lean."""
-        s, up, reach = now.state[0], 0.5 * math.pi, self.scene.reach
+        up, reach = 0.5 * math.pi, self.scene.reach
         limits = [up - self.largest_angle, up + self.largest_angle]
-        lines = [Line([polar((s, 0.0), r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
-        return [Polygon(self.scene.outline(s, math.pi), "target"), *super().shapes(now), *lines]
+        lines = [Line([polar((0.0, 0.0), r * reach, a) for r in (0.9, 1.05)], "limit") for a in limits]
+        return {"upright": [self.scene.outline("target")], **super().bodies(), "lean": lines}
 
-    def window(self, now: Moment) -> Window:
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where they are."""
+        places = {"upright": (now.q.s, 0.0, math.pi), "lean": (now.q.s, 0.0)}
+        return {**super().indicators(now, xp), **places}
+
+    def window(self) -> Window:
         """Look at the upper half."""
         reach, side = self.scene.reach, self.track + 0.5 * self.scene.reach
         return Window(-side, -0.3 * reach, side, 1.15 * reach)

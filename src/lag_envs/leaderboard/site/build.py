@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from lag_envs import store
-from lag_envs.leaderboard.site.scenery import describe
+from lag_envs.leaderboard.site.scenery import Scenery, describe
 
 #: Names the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
@@ -115,7 +115,8 @@ def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
     boards, taken = [], {"index"}
     for given in data["environments"]:
-        board = _board(_clean(given), data["protocol"])
+        scenery = Scenery(str(given["id"]))
+        board = _board(_clean(given), data["protocol"], scenery)
         while board["page"] in taken:
             board["page"] += "-2"
         taken.add(board["page"])
@@ -124,7 +125,8 @@ def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
             row["file"] = None
             if replays:
                 # The script that fetches the file knows it by this key.
-                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({_json(replays)});\n")
+                episodes = _json([scenery.episode(replay) for replay in replays])
+                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({episodes});\n")
         boards.append(board)
 
     templates = Environment(
@@ -136,7 +138,7 @@ def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
         "script": script, "protocol": data["protocol"], "value_of": value_of, "embed": _embedded,
     }  # fmt: skip
-    drawn = ("scene", "geometry", "state_names", "control", "dt", "poster", "optimum")
+    drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
     page = templates.get_template("environment.html")
     pages = {f"{b['page']}.html": page.render(board=b, title=b["id"], now=b["page"]) for b in boards}
@@ -145,23 +147,18 @@ def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
     return pages, files
 
 
-def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
+def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:
     """Return an environment's data with all that the templates and the script ask for."""
     board: dict[str, Any] = {
         "known": None,
         "value": None,
         "other": [],
         "goal": None,
-        "geometry": None,
-        "control": None,
+        "picture": None,
         "frozen": False,
-    }
-    board |= {
-        "scene": None,
         "state_names": [],
         "state_units": [],
         "dt": None,
-        "start": None,
         "title": given["id"],
     }
     board |= {"protocol": protocol} | given | describe(given["id"])
@@ -176,8 +173,9 @@ def _board(given: dict[str, Any], protocol: Any) -> dict[str, Any]:
     watched = [row for row in board["rows"] if row["replays"]]
     shown = next((row for row in watched if row["rank"] is not None), watched[0] if watched else None)
     board["shown"] = shown and shown["name"]
-    still = {"states": [board["start"]], "target": None} if board["start"] else None
-    board["poster"] = _poster(shown["replays"][0], board) if shown else still
+    states = _apart(shown["replays"][0]["states"], board["state_names"]) if shown else scenery.start
+    target = shown["replays"][0].get("target") if shown else None
+    board["poster"] = scenery.still(states, target) if states else None
     return board
 
 
@@ -218,20 +216,17 @@ def safe_url(url: Any) -> str | None:
         return None
 
 
-def _poster(replay: Mapping[str, Any], board: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return poses of an episode at equal times, while most of it happens."""
-    states: Sequence[Sequence[float]] = replay["states"]
-    names = board["state_names"]
+def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequence[float]]:
+    """Return states of an episode at equal times, while most of it happens."""
     angle = names.index("theta") if "theta" in names else 0
     if not names or len(states[0]) != len(names):
-        return None
+        return []
     path = [0.0]
     for a, b in pairwise(states):
         path.append(path[-1] + abs(b[angle] - a[angle]))
     end = max(1, next((i for i, x in enumerate(path) if x >= 0.98 * path[-1]), len(path) - 1))
     chosen = [round(i * end / (POSES - 1)) for i in range(POSES)]
-    poses = [states[min(i, len(states) - 1)] for i in dict.fromkeys(chosen)]
-    return {"states": poses, "target": replay.get("target")}
+    return [states[min(i, len(states) - 1)] for i in dict.fromkeys(chosen)]
 
 
 # --- numbers as text --------------------------------------------------------------------------------------

@@ -1,16 +1,27 @@
-"""What a browser needs to draw an environment from its states: geometry, names and units."""
+"""What a browser needs to show an environment: names and units, shapes once, and poses per moment.
+
+Numbers that change with time are columns: whole multiples of a unit, of which the second differences are
+written, for these are small; one that never changes is a single number.
+"""
 
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
-from lag_envs.scenes.incline import Incline
-from lag_envs.scenes.pivoted_bar import PivotedBar
-from lag_envs.scenes.shapes import Moment
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.scenes.picture import Picture
+from lag_envs.scenes.shapes import Circle, Lens, Ruler, Shape
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
+
+#: Unit of states, actions and returns, of which three digits are shown.
+UNIT = 1e-4
+#: Units of lengths as a share of the window, of angles [rad] and of parts of lines: a fraction of a pixel.
+LENGTH, ANGLE, PART = 1e-4, 2e-4, 2e-3
 
 
 def describe(env_id: str) -> dict[str, Any]:
@@ -24,11 +35,8 @@ def describe(env_id: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``title``, ``scene``, ``geometry`` (metres, radians; None for a scene that the page cannot draw),
-        ``state_names``, ``state_units``, ``start`` (the middle of where episodes start), ``dt`` [s] and
-        ``control`` (name, unit, value at action -1 and 1, and the limit that an arrow is a share of; None
-        where there are several).
-        Empty for an id that this version does not have, such as that of a frozen board.
+        ``title``, ``state_names``, ``state_units``, ``dt`` [s] and ``picture`` (None where the scene has no
+        bodies). Empty for an id that this version does not have, such as that of a frozen board.
 
     Examples
     --------
@@ -42,65 +50,126 @@ def describe(env_id: str) -> dict[str, Any]:
     task = TASKS[env_id]()
     return {
         "title": (inspect.getdoc(type(task)) or env_id).partition("\n")[0],
-        "scene": type(task.scene).__name__,
-        "geometry": geometry(task),
         "state_names": list(task.scene.state_names),
         "state_units": list(task.scene.state_units),
-        "start": [float(x) for x in task.centre],
         "dt": task.dt,
-        "control": _control(task),
+        "picture": picture(Picture(task)),
     }
 
 
-def _control(task: Task) -> dict[str, Any] | None:
-    if len(task.formulas.acting) != 1:
-        return None
-    (acting,) = task.formulas.acting
-    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
-    ends = {"low": acting.low, "high": acting.high, "limit": task.limit_control}
-    return {"name": acting.control, "unit": units[acting.control], **ends}
+def picture(shown: Picture) -> dict[str, Any] | None:
+    """Return the shapes of a picture as ``site.js`` has them.
 
-
-def geometry(task: Task) -> dict[str, Any] | None:
-    """Return the numbers from which ``site.js`` draws what `Task.shapes` draws [m, rad].
-
-    None for another scene: its page has curves, but no picture.
+    Returns
+    -------
+    dict or None
+        ``shapes``, of which each is [kind, number of its frame, ...]; ``window``, [left, bottom, right, top]
+        [m], which moves with the frame ``follows``; and ``units``, those of x, y, angle and part. None where
+        there is nothing to be seen.
     """
-    scene = task.scene
-    own: dict[str, Any]
-    if isinstance(scene, PivotedBar):
-        own = {
-            "reach": scene.reach,
-            # A uniform bar's far end lies as far beyond its centre of mass as the near one before it.
-            "near": 2.0 * scene.com_distance - scene.reach,
-            "com": scene.com_distance,
-            "track": scene.track,
-            "lean": getattr(task, "largest_angle", None),
-        }
-    elif isinstance(scene, Incline):
-        own = {
-            "control": scene.control,
-            "radius": scene.radius,
-            "ratio": scene.inertia / (scene.mass * scene.radius**2),
-            "tilt": scene.tilt,
-            "edge": getattr(task, "edge", None),
-            "largest_tilt": getattr(task, "largest_tilt", None),
-        }
-    elif isinstance(scene, CylinderInCylinder):
-        amplitude = getattr(task, "amplitude", None)
-        own = {
-            "control": scene.control,
-            "shell": scene.shell_radius,
-            "radius": scene.radius,
-            "arm": scene.arm,
-            "ratio": scene.inertia / (scene.mass * scene.radius**2),
-            "largest_angle": getattr(task, "largest_angle", None),
-            # Where the marks are: at the episode's target, or at fixed angles.
-            "marks": None
-            if task.target_range is not None
-            else ([0.0] if amplitude is None else [-amplitude, amplitude]),
-        }
-    else:
+    if not shown.shapes:
         return None
-    start = [float(x) for x in task.centre]
-    return own | {"window": list(task.window(Moment(start)))}
+    left, bottom, right, top, follows = shown.view
+    length = LENGTH * max(right - left, top - bottom)
+    return {
+        "shapes": [_shape(frame, shape) for frame, shape in shown.shapes],
+        "window": _short([left, bottom, right, top]),
+        "follows": shown.frames.index(follows) if follows else None,
+        "units": _short([length, length, ANGLE, PART]),
+    }
+
+
+class Scenery:
+    """Poses of an environment's episodes.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment; episodes of one that this version does not have get no poses.
+    """
+
+    def __init__(self, env_id: str) -> None:
+        self._task: Task | None = TASKS[env_id]() if env_id in TASKS else None
+        self._shown = Picture(self._task) if self._task else None
+        found = picture(self._shown) if self._shown else None
+        self._units = found and found["units"]
+
+    def episode(self, replay: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a recorded episode with columns in place of its numbers, and with poses."""
+        steps = min(len(replay["states"]) - 1, len(replay["actions"]))
+        states, actions = replay["states"][: steps + 1], replay["actions"][:steps]
+        rewards = np.nan_to_num(np.array(replay["rewards"][:steps], np.float64))
+        columns = {
+            "states": [column(x, UNIT) for x in _columns(states)],
+            "actions": [column(x, UNIT) for x in _columns(actions)],
+            "returns": column(np.concatenate([[0.0], np.cumsum(rewards)]), UNIT),
+        }
+        kept = {key: value for key, value in replay.items() if key not in ("states", "actions", "rewards")}
+        dt = replay.get("dt") or (self._task.dt if self._task else 1.0)
+        poses = self._poses(states, actions, replay.get("target"), dt)
+        return {**kept, "unit": UNIT, "steps": steps, **columns, "poses": poses}
+
+    def still(self, states: Sequence[Sequence[float]], target: Any) -> dict[str, Any]:
+        """Return the poses of single states."""
+        return {"count": len(states), "target": target, "poses": self._poses(states, None, target, 0.0)}
+
+    @property
+    def start(self) -> list[list[float]]:
+        """The middle of where episodes start, if there is one."""
+        return [[float(x) for x in self._task.centre]] if self._task else []
+
+    def _poses(self, states: Any, actions: Any, target: Any, dt: float) -> dict[str, Any] | None:
+        """Return the columns that differ, and for each frame which are its x, y, angle and part."""
+        task, shown = self._task, self._shown
+        if task is None or shown is None or not self._units:
+            return None
+        if any(len(state) != len(task.scene.state_names) for state in states):
+            return None
+        controls = np.zeros((len(states) - 1, len(task.scene.control_names)))
+        if actions:
+            controls = task.wanted(actions)
+        columns: dict[str, Any] = {}
+        frames = []
+        found = shown.episode(np.array(states, np.float64), controls, target, dt)
+        for poses in found.swapaxes(0, 1):
+            of = [column(x, unit) for x, unit in zip(poses.T, self._units, strict=True)]
+            frames.append([columns.setdefault(str(x), (len(columns), x))[0] for x in of])
+        return {"columns": [x for _, x in columns.values()], "frames": frames}
+
+
+def column(values: ArrayLike, unit: float) -> int | list[int]:
+    """Return numbers as a column.
+
+    Examples
+    --------
+    >>> column([0.5, 0.5, 0.5], 0.1), column([0.0, 1.0, 2.0, 3.0, 3.0], 1.0)
+    (5, [0, 1, 0, 0, -1])
+    """
+    whole = np.rint(np.nan_to_num(np.asarray(values, np.float64)) / unit).astype(np.int64)
+    if (whole == whole[:1]).all():
+        return int(whole[0]) if len(whole) else 0
+    return np.diff(np.diff(whole, prepend=0), prepend=0).tolist()
+
+
+def _columns(rows: Any) -> NDArray[np.float64]:
+    array = np.array(rows, np.float64)
+    return array.reshape(len(array), -1).T if len(array) else np.empty((1, 0))
+
+
+def _shape(frame: int, shape: Shape) -> list[Any]:
+    """Return a shape as [kind, frame, points or numbers, ..., role]."""
+    kind = type(shape).__name__.lower()
+    match shape:
+        case Circle(centre, radius, role):
+            return [kind, frame, _short(centre), *_short([radius]), role]
+        case Ruler(step, size, role):
+            return [kind, frame, *_short([step, size]), role]
+        case Lens(centre, radius):
+            return [kind, frame, _short(centre), *_short([radius])]
+        case _:
+            return [kind, frame, [_short(point) for point in shape.points], shape.role]
+
+
+def _short(numbers: Iterable[float]) -> list[float]:
+    """Return numbers with five digits."""
+    return [float(f"{x:.5g}") for x in numbers]

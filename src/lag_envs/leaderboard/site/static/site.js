@@ -33,6 +33,7 @@
   const isNumber = (x) => typeof x === "number" && Number.isFinite(x);
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
   const mix = (a, b, share) => a + (b - a) * share;
+  const distance = ([ax, ay], [bx, by]) => Math.hypot(bx - ax, by - ay);
 
   function text(x, digits = 3) {
     if (!isNumber(x)) return "–";
@@ -58,6 +59,13 @@
     return { step, at };
   }
 
+  /** Multiples of a step that lie between two numbers. */
+  function multiples(low, high, step) {
+    const found = [];
+    for (let i = Math.ceil(low / step - 1e-6); i <= Math.floor(high / step + 1e-6); i++) found.push(i * step);
+    return found;
+  }
+
   const digitsOf = (step) => clamp(Math.ceil(-Math.log10(step) - 1e-6), 0, 6);
   const GREEK = { theta: "θ", psi: "ψ", phi: "φ" };
 
@@ -69,182 +77,79 @@
   }
 
   // --- scenes ----------------------------------------------------------------------------------------------
-  // The same shapes as Python's `Task.shapes`, in metres, x to the right and y up: [what, ..., role].
+  // An environment's shapes lie in frames, [what, frame, ..., role], in metres, x to the right and y up; an
+  // episode says where the frames are. What the scene is, nobody here knows.
 
-  const polar = ([x, y], radius, angle) => [x + radius * Math.cos(angle), y + radius * Math.sin(angle)];
-  const remainder = (angle) => angle - TURN * Math.round(angle / TURN);
-  const withSign = (size, sign) => (sign < 0 || Object.is(sign, -0) ? -size : size);
-
-  function arc(centre, radius, start, end) {
-    const n = 1 + Math.ceil(Math.abs(end - start) / 0.1);
-    return Array.from({ length: n + 1 }, (_, i) => polar(centre, radius, start + ((end - start) * i) / n));
-  }
-
-  function roller(centre, radius, angle, ratio) {
-    const hollow = Math.min(Math.sqrt(Math.max(2 * ratio - 1, 0)), 0.95) * radius;
-    const mark = (from) => ["polygon", [centre, ...arc(centre, radius, from, from + Math.PI / 2)], "mark"];
-    return [
-      ["circle", centre, radius, "body"],
-      mark(angle),
-      mark(angle + Math.PI),
-      ["circle", centre, Math.max(hollow, 0.1 * radius), "hole"],
-    ];
-  }
-
-  function roundLength(length) {
-    const power = 10 ** Math.floor(Math.log10(length));
-    return power * [5, 2, 1].find((step) => step === 1 || step * power <= 1.000001 * length);
-  }
-
-  function multiples(low, high, step) {
-    const found = [];
-    for (let i = Math.ceil(low / step - 1e-6); i <= Math.floor(high / step + 1e-6); i++) found.push(i * step);
-    return found;
-  }
-
-  function outline(g, s, theta) {
-    const half = 0.035 * g.reach;
-    const [sin, cos] = [Math.sin(theta), Math.cos(theta)];
-    const corners = [[g.near - half, -half], [g.reach, -half], [g.reach, half], [g.near - half, half]];
-    return corners.map(([a, b]) => [s + a * sin + b * cos, -a * cos + b * sin]);
-  }
-
-  function bar(g, { state, share }) {
-    const s = g.track === null ? 0 : state[0];
-    const theta = state[state.length - 2];
-    const [wide, high, size] = [0.11 * g.reach, 0.05 * g.reach, 0.035 * g.reach];
-    const com = [s + g.com * Math.sin(theta), -g.com * Math.cos(theta)];
-    const edge = s + withSign(wide, share);
-    const rail = [];
-    if (g.track === null) {
-      rail.push(["line", [[-2 * g.reach, 0], [2 * g.reach, 0]], "guide"]);
-    } else {
-      const step = roundLength(0.2 * g.track);
-      rail.push(...multiples(-g.track, g.track, step).map((x) => ["line", [[x, 0], [x, -size]], "ground"]));
-      rail.push(["line", [[-g.track, 0], [g.track, 0]], "frame"]);
-      rail.push(...[-g.track, g.track].map((x) => ["line", [[x, -2 * size], [x, 2 * size]], "limit"]));
+  /** Numbers of a column: whole multiples of a unit, of which the second differences are given. */
+  function unpack(column, length, unit) {
+    const values = new Float64Array(length);
+    if (!Array.isArray(column)) return values.fill(column * unit);
+    let [step, value] = [0, 0];
+    for (let i = 0; i < length; i++) {
+      step += column[i];
+      value += step;
+      values[i] = value * unit;
     }
-    const down = -Math.PI / 2;
-    const shapes = [
-      ["polygon", outline(g, s, Math.PI), "target"],
-      ...rail,
-      ["line", [[s, 0], [s, -0.4 * g.reach]], "guide"],
-      ["line", arc([s, 0], 0.25 * g.reach, down, remainder(theta) + down), "guide"],
-      ["polygon", [[s - wide, -high], [s + wide, -high], [s + wide, high], [s - wide, high]], "frame"],
-      ["line", [[s, 0], com], "body"],
-      ["polygon", outline(g, s, theta), "body"],
-      ["circle", [s, 0], 0.02 * g.reach, "hole"],
-      ["circle", com, 0.022 * g.reach, "mark"],
-      ["arrow", [[edge, 0], [edge + 0.45 * g.reach * share, 0]], "action"],
-    ];
-    if (g.lean !== null) {
-      for (const angle of [Math.PI / 2 - g.lean, Math.PI / 2 + g.lean]) {
-        shapes.push(["line", [0.9, 1.05].map((r) => polar([s, 0], r * g.reach, angle)), "limit"]);
+    return values;
+  }
+
+  /** Poses with numbers for their columns. */
+  const prepared = ({ columns, frames }, length) => ({ columns: columns.map((c) => unpack(c, length, 1)), frames });
+
+  /** Where the frames are, [x, y, angle, part], from recorded poses at a moment and a share of the next. */
+  function posesAt({ columns, frames }, units, moment, share = 0) {
+    return frames.map((frame) => frame.map((c, i) => {
+      const values = columns[c];
+      // What a control does it does all through a step.
+      const next = i < 3 ? Math.min(moment + 1, values.length - 1) : moment;
+      return units[i] * mix(values[moment], values[next], share);
+    }));
+  }
+
+  /** The first part of a line. */
+  function beginning(points, part) {
+    if (part >= 1) return points;
+    let room = 0;
+    for (let i = 1; i < points.length; i++) room += distance(points[i - 1], points[i]);
+    room *= part;
+    const kept = [points[0]];
+    for (let i = 1; i < points.length; i++) {
+      const [a, b] = [points[i - 1], points[i]];
+      const step = distance(a, b);
+      if (step >= room) {
+        const share = step ? room / step : 0;
+        return [...kept, [mix(a[0], b[0], share), mix(a[1], b[1], share)]];
       }
+      kept.push(b);
+      room -= step;
     }
-    return shapes;
+    return kept;
   }
 
-  function onPlane(x, height, phi) {
-    const [c, s] = [Math.cos(phi), Math.sin(phi)];
-    return [x * c + height * s, height * c - x * s];
-  }
-
-  function stretch(x) {
-    const start = Math.min(-3.2, x - 0.2);
-    return [start, start + 3.6];
-  }
-
-  function incline(g, { state, share, target }) {
-    const [x, radius] = [state[0], g.radius];
-    const phi = g.control === "damping" ? g.tilt : state[state.length - 1];
-    const cylinder = roller(onPlane(x, radius, phi), radius, Math.PI / 2 - x / radius - phi, g.ratio);
-    const line = (points, role) => ["line", points, role];
-    if (g.control === "damping") {
-      const [low, high] = [stretch(x)[0] - 3, stretch(x)[1] + 3];
-      const [left, right] = [onPlane(low, 0, phi), onPlane(high, 0, phi)];
-      const depth = Math.min(left[1], right[1]) - (high - low);
-      const marks = multiples(low, high, roundLength((high - low) / 15));
-      const tip = x - withSign(8 * radius * share, state[1]);
-      return [
-        ["polygon", [left, right, [right[0], depth], [left[0], depth]], "ground"],
-        ...marks.map((m) => line([onPlane(m, 0, phi), onPlane(m, -0.6 * radius, phi)], "ground")),
-        line([[0, 0], [-24 * radius, 0]], "guide"),
-        line(arc([0, 0], 20 * radius, Math.PI - phi, Math.PI), "guide"),
-        ...cylinder,
-        ["arrow", [onPlane(x, radius, phi), onPlane(tip, radius, phi)], "action"],
-        line([onPlane(0, 0, phi), onPlane(0, 6 * radius, phi)], "target"),
-        ["lens", onPlane(x, radius, phi), 2.2 * radius],
-      ];
-    }
-    const [edge, thick] = [g.edge, 0.04 * g.edge];
-    const [floor, side] = [-9 * thick, 2 * edge];
-    const corners = [[-edge, 0], [edge, 0], [edge, -thick], [-edge, -thick]];
-    return [
-      ["circle", onPlane(target ?? 0, radius, phi), radius, "target"],
-      ["polygon", [[-4 * thick, floor], [0, -0.5 * thick], [4 * thick, floor]], "ground"],
-      ["polygon", [[-side, floor], [side, floor], [side, -side], [-side, -side]], "ground"],
-      line([[-1.3 * edge, 0], [1.3 * edge, 0]], "guide"),
-      ["polygon", corners.map(([a, b]) => onPlane(a, b, phi)), "frame"],
-      ...cylinder,
-      ["arrow", arc([0, 0], 1.15 * edge, -phi, -phi - 0.3 * share), "action"],
-      ...[-edge, edge].map((p) => line([0, 0.8 * radius].map((y) => onPlane(p, y, phi)), "limit")),
-      ...[-1, 1].map((way) =>
-        line([1.03, 1.09].map((r) => polar([0, 0], r * edge, way * g.largest_tilt)), "limit"),
-      ),
-    ];
-  }
-
-  function shell(g, { state, share, target, turned }) {
-    const [up, rim, part, theta] = [Math.PI / 2, 1.1 * g.shell, Math.PI / 12, state[0]];
-    const place = (angle, distance = g.arm) => polar([0, 0], distance, angle - up);
-    const [first, last] = [up + turned - part, up + turned + part];
-    const joints = [3, 5, 7, 9, 11, 13, 15, 17, 19, 21].map((i) => up + turned + part * i);
-    const angle = up + (g.shell * turned - g.arm * theta) / g.radius;
-    const action =
-      g.control === "tilt"
-        ? arc([0, 0], 1.19 * g.shell, up, up + (share * Math.PI) / 3)
-        : [place(theta), polar(place(theta), -withSign(0.6 * g.shell * share, state[1]), theta)];
-    const shapes = [
-      ["circle", [0, 0], rim, "ground"],
-      ...joints.map((a) => ["line", [polar([0, 0], g.shell, a), polar([0, 0], rim, a)], "ground"]),
-      ["polygon", [...arc([0, 0], rim, first, last), ...arc([0, 0], g.shell, last, first)], "frame"],
-      ["circle", [0, 0], g.shell, "hole"],
-      ["line", [[0, 0], [0, -g.shell]], "guide"],
-      ["line", [[0, 0], place(theta)], "guide"],
-      ["line", arc([0, 0], 0.4 * g.arm, -up, remainder(theta) - up), "guide"],
-      ...roller(place(theta), g.radius, angle, g.ratio),
-      ["arrow", action, "action"],
-    ];
-    if (g.largest_angle !== null) {
-      for (const a of [-g.largest_angle, g.largest_angle]) {
-        shapes.push(["line", [place(a, g.shell - g.radius), place(a, g.shell)], "limit"]);
+  /** Shapes of frames as shapes of the plane: [what, points or centre, (radius,) role]. */
+  function placed({ shapes }, poses, view) {
+    return shapes.flatMap(([what, frame, ...given]) => {
+      const [x, y, angle, part] = poses[frame];
+      const [cos, sin, way] = [Math.cos(angle), Math.sin(angle), part < 0 ? -1 : 1];
+      const move = ([a, b]) => [x + cos * a - sin * way * b, y + sin * a + cos * way * b];
+      if (what === "circle" || what === "lens") return [[what, move(given[0]), ...given.slice(1)]];
+      if (what === "ruler") {
+        const [step, size, role] = given;
+        const [left, bottom, right, top] = view;
+        const middle = cos * ((left + right) / 2 - x) + sin * ((bottom + top) / 2 - y);
+        const far = 2 * Math.max(right - left, top - bottom);
+        const at = multiples(middle - far, middle + far, step);
+        return at.map((a) => ["line", [move([a, 0]), move([a, -size])], role]);
       }
-    }
-    for (const a of g.marks ?? [target ?? 0]) shapes.push(["circle", place(a), g.radius, "target"]);
-    return shapes;
+      const points = what === "polygon" ? given[0] : beginning(given[0], Math.abs(part));
+      return [[what, points.map(move), given[1]]];
+    });
   }
 
-  const SCENES = { PivotedBar: bar, Incline: incline, CylinderInCylinder: shell };
-
-  /** What is to be seen: `now` has state, share (of the largest control), target and turned. */
-  function shapesOf(board, now) {
-    return SCENES[board.scene](board.geometry, now);
-  }
-
-  function windowOf(board, now) {
-    const g = board.geometry;
-    if (board.scene !== "Incline" || g.control !== "damping") return g.window;
-    const [start, end] = stretch(now.state[0]).map((x) => onPlane(x, g.radius, g.tilt));
-    return [start[0], end[1], end[0], start[1]];
-  }
-
-  const canDraw = (board) => board.scene in SCENES && board.geometry !== null;
-
-  function shareOf(board, action) {
-    if (!isNumber(action) || !board.control) return 0;
-    const { low, high, limit } = board.control;
-    return mix(low, high, (clamp(action, -1, 1) + 1) / 2) / limit;
+  /** The part of the plane to look at, [left, bottom, right, top]. */
+  function windowOf({ window: [left, bottom, right, top], follows }, poses) {
+    const [x, y] = follows === null ? [0, 0] : poses[follows];
+    return [left + x, bottom + y, right + x, top + y];
   }
 
   // --- painting --------------------------------------------------------------------------------------------
@@ -326,21 +231,10 @@
   /** An arrow as long as its points say; a short one is thinner. */
   function arrow(pen, points, full, colour) {
     let length = 0;
-    for (let i = 1; i < points.length; i++) {
-      length += Math.hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
-    }
+    for (let i = 1; i < points.length; i++) length += distance(points[i - 1], points[i]);
     if (length < 1.5) return;
     const width = full * Math.min(1, length / (4 * full));
-    const head = 3 * width;
-    const shaft = [points[0]];
-    let room = length - head;
-    for (let i = 1; i < points.length && room > 0; i++) {
-      const [[ax, ay], [bx, by]] = [points[i - 1], points[i]];
-      const step = Math.hypot(bx - ax, by - ay);
-      const share = Math.min(1, room / step);
-      shaft.push([mix(ax, bx, share), mix(ay, by, share)]);
-      room -= step;
-    }
+    const shaft = beginning(points, 1 - (3 * width) / length);
     const [tip, end] = [points[points.length - 1], shaft[shaft.length - 1]];
     const [dx, dy] = [(tip[0] - end[0]) / 2, (tip[1] - end[1]) / 2];
     pen.lineWidth = width;
@@ -376,20 +270,20 @@
   }
 
   /** Poses of an episode in one picture, as on one photographic plate. */
-  function poster(canvas, board) {
+  function poster(canvas, { picture, poster: still }) {
     const { pen, width, height } = fit(canvas);
-    if (!width || !board.poster || !canDraw(board)) return;
+    if (!width || !picture || !still?.poses) return;
     pen.clearRect(0, 0, width, height);
-    const { states, target } = board.poster;
-    const nows = states.map((state) => ({ state, share: 0, target, turned: 0 }));
-    const last = nows[nows.length - 1];
+    const n = still.count;
+    const poses = prepared(still.poses, n);
+    const at = Array.from({ length: n }, (_, i) => posesAt(poses, picture.units, i));
+    const view = windowOf(picture, at[n - 1]);
     const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
-    const view = windowOf(board, last);
-    const back = shapesOf(board, last).filter(([what]) => what !== "lens" && what !== "arrow");
-    paint(pen, box, view, back, ["ground", "frame", "guide", "target", "limit", "hole"]);
-    nows.forEach((now, i) => {
-      pen.globalAlpha = i === nows.length - 1 ? 1 : mix(0.1, 0.45, i / nows.length);
-      paint(pen, box, view, shapesOf(board, now), ["body", "mark"]);
+    const shapes = at.map((now) => placed(picture, now, view).filter(([what]) => what !== "lens"));
+    paint(pen, box, view, shapes[n - 1], ["ground", "frame", "guide", "target", "limit", "hole"]);
+    shapes.forEach((now, i) => {
+      pen.globalAlpha = i === n - 1 ? 1 : mix(0.1, 0.45, i / n);
+      paint(pen, box, view, now, ["body", "mark"]);
     });
     pen.globalAlpha = 1;
   }
@@ -421,21 +315,19 @@
     return fetched.get(file);
   }
 
-  /** Add what is drawn but not recorded: the return so far, and how far the shell has turned. */
+  /** An episode with numbers for its columns. */
   function prepare(replay) {
     const dt = replay.dt || board.dt || 1;
-    const sums = [0];
-    for (const reward of replay.rewards) sums.push(sums[sums.length - 1] + (reward ?? 0));
-    const turned = [0];
-    const rate = board.state_names.indexOf("psi_dot");
-    if (rate >= 0) {
-      for (let i = 1; i < replay.states.length; i++) {
-        const mean = (replay.states[i - 1][rate] + replay.states[i][rate]) / 2;
-        turned.push(turned[i - 1] + dt * mean);
-      }
-    }
-    const end = Math.max(1, Math.min(replay.states.length - 1, replay.actions.length));
-    return { ...replay, dt, sums, turned, end, t0: replay.t0 ?? 0 };
+    const rows = (columns, n) => {
+      const values = columns.map((c) => unpack(c, n, replay.unit));
+      return Array.from({ length: n }, (_, i) => values.map((v) => v[i]));
+    };
+    const states = rows(replay.states, replay.steps + 1);
+    const actions = rows(replay.actions, replay.steps).map((a) => (a.length === 1 ? a[0] : a));
+    const sums = [...unpack(replay.returns, replay.steps + 1, replay.unit)];
+    const rewards = sums.slice(1).map((sum, i) => sum - sums[i]);
+    const poses = replay.poses && prepared(replay.poses, replay.steps + 1);
+    return { ...replay, dt, states, actions, rewards, sums, poses, end: Math.max(1, replay.steps) };
   }
 
   // --- player ----------------------------------------------------------------------------------------------
@@ -482,7 +374,6 @@
       const frame = Math.min(Math.floor(exact + 1e-6), replay.end);
       const share = clamp(exact - frame, 0, 1);
       const next = Math.min(frame + 1, replay.end);
-      const between = (values) => mix(values[frame], values[next], share);
       const state = replay.states[frame].map((x, i) => mix(x, replay.states[next][i], share));
       const action = frame > 0 ? replay.actions[frame - 1] : null;
       return {
@@ -492,9 +383,7 @@
         reward: frame > 0 ? replay.rewards[frame - 1] : null,
         total: replay.sums[frame],
         time: frame * replay.dt,
-        target: replay.target,
-        share: shareOf(board, action),
-        turned: replay.turned.length > 1 ? between(replay.turned) : 0,
+        poses: replay.poses && posesAt(replay.poses, board.picture.units, frame, share),
       };
     }
 
@@ -524,9 +413,10 @@
         return;
       }
       const now = momentOf(side);
-      if (width && canDraw(board) && now.state.length === board.state_names.length) {
+      if (width && now.poses) {
         const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
-        paint(pen, box, windowOf(board, now), shapesOf(board, now));
+        const view = windowOf(board.picture, now.poses);
+        paint(pen, box, view, placed(board.picture, now.poses, view));
       }
       const over = now.frame >= side.replay.end;
       fill(side, [
@@ -1279,7 +1169,7 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
-  window.lagEnvs = { put, shapesOf, windowOf };
+  window.lagEnvs = { put, placed, windowOf };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
   readColours();
