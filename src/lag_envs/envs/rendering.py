@@ -174,7 +174,7 @@ class Pen:
 
     def __init__(self, surface: pygame.Surface, window: Window) -> None:
         self._surface = surface
-        width, height = surface.get_size()
+        self._size = width, height = surface.get_size()
         self.scale = 1.0 / max((window.right - window.left) / width, (window.top - window.bottom) / height)
         self._left = 0.5 * (width - self.scale * (window.left + window.right))
         self._top = 0.5 * (height + self.scale * (window.bottom + window.top))
@@ -242,11 +242,22 @@ class Pen:
         self._fill([tip, (x + aside[0], y + aside[1]), (x - aside[0], y - aside[1])], style.edge)
 
     def _stroke(self, points: list[Point], colour: str, width: float) -> None:
+        # Most dashes of a guide are beside a lens.
+        if self._beside(points, 4.0 * width):
+            return
         ways = _aside(points)
         there, back = _moved(points, ways, 0.5 * width), _moved(points, ways, -0.5 * width)
         self._fill([*there, *reversed(back)], colour)
 
+    def _beside(self, points: list[Point], pad: float) -> bool:
+        """Tell whether nothing of an outline can be on the surface."""
+        width, height = self._size
+        x, y = [p[0] for p in points], [p[1] for p in points]
+        return max(x) < -pad or min(x) > width + pad or max(y) < -pad or min(y) > height + pad
+
     def _fill(self, points: list[Point], colour: str) -> None:
+        if self._beside(points, 2.0):
+            return
         draw, points = _pygame().draw, _near(points)
         draw.polygon(self._surface, colour, points)
         draw.aalines(self._surface, colour, True, points)
@@ -343,6 +354,8 @@ _desk = _Desk()
 
 def _near(points: list[Point]) -> list[Point]:
     """Move points that are far outside nearer: pygame goes through all rows and columns of what it draws."""
+    if all(-FAR < x < FAR and -FAR < y < FAR for x, y in points):
+        return points
     return [(min(max(x, -FAR), FAR), min(max(y, -FAR), FAR)) for x, y in points]
 
 
