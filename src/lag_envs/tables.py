@@ -7,20 +7,18 @@ from collections.abc import Sequence
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align the rows' cells; what looks like a number goes to the right.
+    """Align the rows' cells; a column of numbers, but for its head, goes to the right.
 
     Examples
     --------
     >>> columns([("name", "return"), ("a", "1"), ("bc", "-23")])
     ['name  return', 'a          1', 'bc       -23']
     """
-    if not rows:
-        return []
-    widths = [max(len(row[j]) for row in rows if j < len(row)) for j in range(max(map(len, rows)))]
-    return [
-        "  ".join(
-            cell.rjust(width) if re.fullmatch(r"-?[\d.,]+( [kMG])?", cell) else cell.ljust(width)
-            for cell, width in zip(row, widths, strict=False)
-        ).rstrip()
-        for row in rows
-    ]
+    lines: list[list[str]] = [[] for _ in rows]
+    for j in range(max(map(len, rows), default=0)):
+        cells = [row[j] if j < len(row) else "" for row in rows]
+        width = max(map(len, cells))
+        right = all(re.fullmatch(r"(-?[\d.,]+( [kMG])?|-?)", cell) for cell in cells[1:])
+        for line, cell in zip(lines, cells, strict=True):
+            line.append(cell.rjust(width) if right else cell.ljust(width))
+    return ["  ".join(line).rstrip() for line in lines]
