@@ -104,7 +104,7 @@ def test_info_prints_the_facts(capsys):
     ("kind", "parts"),
     [
         ("Deliver", ("push  -20 to 20 N", "pull  0 to 20 N", "y_goal  -1.5 ± 0.3 m", "sin        ±1")),
-        ("Switched", ("s_ddot  -5, 0, 5 m/s²  actions 0 to 2", "bars                          3")),
+        ("Switched", ("s_ddot  -5, 0, 5 m/s²  actions 0 to 2", "bars          3")),
         ("Drift", ("Controls, and the actions that set them\n  none", "1 ± 0.5 rad")),
     ],
 )  # fmt: skip

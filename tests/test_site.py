@@ -6,18 +6,20 @@ import json
 import math
 import os
 import re
+import runpy
 import shutil
 import threading
 import time
 import warnings
 from functools import partial
+from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 from toy_pendulum import Swing
 
-from examples.ball_on_beam import Balance
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import Scenery, picture
@@ -169,8 +171,12 @@ class Reach(Task):
 @pytest.fixture
 def own(monkeypatch):
     """Return a board of scenes that are not of the package, and one without bodies."""
+    example = Path(__file__).parents[1] / "examples" / "ball_on_beam.py"
+    gym.registry.pop("BallOnBeam-v0", None)
+    balance = runpy.run_path(str(example))["Balance"]
+    del gym.registry["BallOnBeam-v0"]
     shapeless = type("Shapeless", (Swing,), {"bodies": lambda self: {}})
-    kinds = {"BallOnBeam-v0": Balance, "Reach-v0": Reach, "Shapeless-v0": shapeless}
+    kinds = {"BallOnBeam-v0": balance, "Reach-v0": Reach, "Shapeless-v0": shapeless}
     boards = []
     for env_id, kind in kinds.items():
         monkeypatch.setitem(TASKS.data, env_id, kind)
