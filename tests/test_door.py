@@ -4,11 +4,13 @@ import dataclasses
 import math
 import random
 import re
+import weakref
 
 import numpy as np
 import pytest
 
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.scenes import CylinderInCylinder, door
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.shapes import Circle
 
@@ -863,3 +865,14 @@ def test_bad_parameter(keywords, words):
 def test_bad_state_or_control(call, state, control, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         getattr(Good(), call)(state, control)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1e-9, 1e-12])
+def test_a_mass_that_cancels_is_not_singular(gap, monkeypatch):
+    """R² - 2Rr + r² rounds to 0, or below, where r is near R; it does so in the first scene of a process."""
+    monkeypatch.setattr(door, "_admitted", weakref.WeakKeyDictionary())
+    shell = CylinderInCylinder(shell_radius=0.5, radius=0.5 - gap)
+    acceleration = -9.81 * math.sin(0.1) / (1.5 * shell.arm)
+    dt = 1e-3 / math.sqrt(-acceleration)
+    after = shell.simulate([0.1, 0.0, 0.0], [0.0], dt)[-1]
+    assert after[1] == pytest.approx(acceleration * dt, rel=1e-4)

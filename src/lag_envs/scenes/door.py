@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import weakref
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,9 @@ from lag_envs.scenes import picture
 from lag_envs.scenes.checks import shown
 from lag_envs.scenes.declaring import DEFINED, own_annotations
 from lag_envs.scenes.parameters import fill_in
+
+#: A mass matrix whose smallest eigenvalue is below this, its diagonal scaled to 1, counts as singular.
+SINGULAR = 1e-13
 
 #: What was derived of scenes whose formulas passed the door: by class, and by `Scene._structure`.
 _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
@@ -132,27 +137,47 @@ def _check_bodies(scene: Any) -> None:
         raise FormulaError(f"{of}.{error}") from error
 
 
+class _Fractions:
+    """Functions of fractions, for formulas whose terms cancel: no sum of theirs is rounded."""
+
+    Rational = Fraction
+    pi = Fraction(math.pi)
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(math, "atan" if name == "arctan" else name)
+        return lambda x: Fraction(function(x))
+
+
 def _check_motion(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
+    smallest = _smallest_eigenvalue(scene, found, np.float64, Numeric)
+    if smallest < SINGULAR:  # perhaps since its terms cancel, as where two radii are nearly equal
+        smallest = _smallest_eigenvalue(scene, found, Fraction, _Fractions())
+    if smallest < SINGULAR:
+        what = "singular" if smallest > -SINGULAR else "not positive"
+        raise FormulaError(
+            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; "
+            "every motion of the free coordinates needs a positive kinetic energy"
+        )
+
+
+def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> float:
+    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, where it is largest."""
     n = len(found.free)
-    values = {recording.parameter(name): np.float64(getattr(scene, name)) for name in scene._numbers()}
+    values = {recording.parameter(name): number(getattr(scene, name)) for name in scene._numbers()}
     generator = np.random.default_rng(11)
     symbols = sorted({s for e in found.entries() for s in e.symbols()} - set(values), key=lambda s: s.text)
     seen = []
     with np.errstate(all="ignore"):
         for low, high in ((0.1, 1.5), (-3.0, 3.0), (0.01, 0.1), (1.0, 10.0)) * 4:
-            at = values | {symbol: generator.uniform(low, high) for symbol in symbols}
-            matrix = np.array([float(x) for x in evaluate(found.entries(), at, Numeric)]).reshape(n, n)
+            at = values | {symbol: number(generator.uniform(low, high)) for symbol in symbols}
+            try:
+                entries = evaluate(found.entries(), at, xp)
+                matrix = np.array([float(x) for x in entries]).reshape(n, n)
+            except (ArithmeticError, ValueError):
+                continue
             if not np.isfinite(matrix).all():
                 continue
             size = np.sqrt(np.abs(np.diag(matrix)))
-            if not (size > 0.0).all():
-                seen.append(0.0)
-                continue
-            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]))
-    if seen and max(seen) < 1e-13:
-        what = "singular" if max(seen) > -1e-13 else "not positive"
-        raise FormulaError(
-            f"{type(scene).__name__}.kinetic gives a mass matrix of {', '.join(found.free)} that is {what}; "
-            "every motion of the free coordinates needs a positive kinetic energy"
-        )
+            seen.append(float(np.linalg.eigvalsh(matrix / np.outer(size, size))[0]) if size.all() else 0.0)
+    return max(seen, default=math.inf)
