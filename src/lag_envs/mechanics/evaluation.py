@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,15 @@ class Numeric:
     pi = math.pi
     sin, cos, tan, exp, log, sqrt, tanh = np.sin, np.cos, np.tan, np.exp, np.log, np.sqrt, np.tanh
     atan = arctan = np.arctan
+
+
+class Exact:
+    """Functions of rational numbers; sums and products of them are exact, so that nothing cancels."""
+
+    Rational, mpf, pi = Fraction, None, Fraction(math.pi)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda x: Fraction(getattr(math, "atan" if name == "arctan" else name)(float(x)))
 
 
 def _bare(x: Any) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lag_envs.mechanics import recording
 from lag_envs.mechanics.algebra import FormulaError, evaluate
-from lag_envs.mechanics.evaluation import Numeric
+from lag_envs.mechanics.evaluation import Exact, Numeric
 from lag_envs.mechanics.layout import Layout, check_name
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.scenes import picture
@@ -137,22 +137,11 @@ def _check_bodies(scene: Any) -> None:
         raise FormulaError(f"{of}.{error}") from error
 
 
-class _Fractions:
-    """Functions of fractions, for formulas whose terms cancel: no sum of theirs is rounded."""
-
-    Rational = Fraction
-    pi = Fraction(math.pi)
-
-    def __getattr__(self, name: str) -> Any:
-        function = getattr(math, "atan" if name == "arctan" else name)
-        return lambda x: Fraction(function(x))
-
-
 def _check_motion(scene: Any, found: Mechanics) -> None:
     """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
     smallest = _smallest_eigenvalue(scene, found, np.float64, Numeric)
     if smallest < SINGULAR:  # perhaps since its terms cancel, as where two radii are nearly equal
-        smallest = _smallest_eigenvalue(scene, found, Fraction, _Fractions())
+        smallest = _smallest_eigenvalue(scene, found, Fraction, Exact())
     if smallest < SINGULAR:
         what = "singular" if smallest > -SINGULAR else "not positive"
         raise FormulaError(

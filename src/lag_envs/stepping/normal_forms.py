@@ -25,21 +25,13 @@ from numpy.typing import ArrayLike
 
 from lag_envs.mechanics.algebra import Atom, Expr, Monomial, evaluate
 from lag_envs.mechanics.equations import place, velocity
+from lag_envs.mechanics.evaluation import Exact
 from lag_envs.mechanics.layout import Layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
-
-
-class Exact:
-    """Functions of rational numbers; sums and products of them are exact, so that nothing cancels."""
-
-    Rational, mpf = Fraction, None
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda x: Fraction(getattr(math, name)(float(x)))
 
 
 class Term(NamedTuple):
