@@ -5,7 +5,7 @@ import pytest
 import sympy
 from mpmath import mp, mpf
 from reference import conditioning, flow, moving_plane, random_cases, scales
-from series_systems import SYSTEMS, acceleration
+from series_systems import SYSTEMS
 from test_series import FLOATS
 
 from lag_envs import scenes
@@ -473,3 +473,11 @@ def test_remembered(tmp_path, monkeypatch):
     assert reference.errors([float(x) for x in first], first) == pytest.approx([0.0, 0.0], abs=1e-15)
     with pytest.raises(TypeError):
         reference.remembered(*problem[:3], 0.03)
+
+
+def test_recurrences_that_lose_many_bits():
+    """tanh and exp in drag and forces: rounding grows with each order, and more bits are taken."""
+    lattice = next(system.scene for system in SYSTEMS if system.name == "Lattice")
+    state = [0.7963143950173581, 9.9078134365626624e-4, -0.10207323685357128, 1.4940809122348817]
+    found, finer = (oracle_of(lattice).once(state, [1.1647682194020892], 0.02, digits) for digits in (40, 60))
+    assert max(abs(a - b) for a, b in zip(found, finer, strict=True)) < mpf(10) ** -38

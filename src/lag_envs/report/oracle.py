@@ -44,6 +44,8 @@ DOUBLINGS = 2
 STIFF = 300.0
 #: After so many series, and half as many more each time; the layer takes about as many.
 FIRST_TRY = 16
+#: Bits that are spared for rounding within a step, tried in turn.
+SPARE = (80, 240, 720)
 
 
 class Unresolved(ArithmeticError):
@@ -52,6 +54,10 @@ class Unresolved(ArithmeticError):
 
 class Singular(Unresolved):
     """So short are the steps, or so many, that more digits would not help."""
+
+
+class Rounded(Unresolved):
+    """Rounding within a step is larger than what a step may leave out: the arithmetic has too few bits."""
 
 
 # --- equations ----------------------------------------------------------------------------------------------
@@ -205,6 +211,7 @@ class Plan(NamedTuple):
     """How a motion is computed."""
 
     digits: int  #: that each step keeps, absolute and relative to places and velocities
+    spare: int = SPARE[0]  #: bits beyond those, of which a recurrence loses some with each order
 
     @property
     def order(self) -> int:
@@ -214,7 +221,7 @@ class Plan(NamedTuple):
     @property
     def bits(self) -> int:
         """Of the arithmetic."""
-        return int(3.33 * self.digits) + 80
+        return int(3.33 * self.digits) + self.spare
 
     def small(self, of: Any) -> Any:
         """Return what may be left out of a number of this size."""
@@ -381,18 +388,23 @@ class Oracle:
 
     def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
         """Return the end as one computation gives it, each of whose steps keeps so many digits."""
-        plan = Plan(digits)
         for what, given, names in (
             ("state", state, self.names.state),
             ("controls", listed(controls), self.names.controls),
         ):
             if len(given) != len(names):
                 raise ValueError(f"{what} must have {len(names)} entries, got {len(given)}")
-        with flint.ctx.workprec(plan.bits):
-            try:
-                return [number(x) for x in self._end(plan, state, controls, dt)]
-            except (ValueError, ZeroDivisionError, OverflowError) as error:
-                raise Unresolved(f"a singular point on the way: {error}") from error
+        for spare in SPARE:
+            plan = Plan(digits, spare)
+            with flint.ctx.workprec(plan.bits):
+                try:
+                    return [number(x) for x in self._end(plan, state, controls, dt)]
+                except Rounded:
+                    if spare == SPARE[-1]:
+                        raise
+                except (ValueError, ZeroDivisionError, OverflowError) as error:
+                    raise Unresolved(f"a singular point on the way: {error}") from error
+        raise AssertionError(SPARE)
 
     def _end(self, plan: Plan, state: Sequence, controls: Any, dt: Any) -> list:
         u, left = [_ball(x) for x in listed(controls)], _ball(dt)
@@ -512,7 +524,7 @@ class Oracle:
         places, rates = ({name: flint.arb_poly(of[name])(part) for name in of} for of in (x, w))
         after = [of[name] for of in (places, rates) for name in free]
         if not all(y.rad() < limit for y, limit in zip(after, limits, strict=True)):
-            raise Unresolved("rounding within a step is larger than what a step may leave out")
+            raise Rounded("rounding within a step is larger than what a step may leave out")
         return {n: y.mid() for n, y in places.items()}, {n: y.mid() for n, y in rates.items()}, part
 
     # --- heavy damping ---
