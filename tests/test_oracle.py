@@ -5,7 +5,7 @@ import pytest
 import sympy
 from mpmath import mp, mpf
 from reference import conditioning, flow, moving_plane, random_cases, scales
-from series_systems import SYSTEMS
+from series_systems import SYSTEMS, acceleration
 from test_series import FLOATS
 
 from lag_envs import scenes
