@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lag_envs.report.oracle import solve
 from lag_envs.scenes.base import Scene, parameter
 
 
@@ -331,18 +332,5 @@ SYSTEMS = (
 
 
 def acceleration(system: System, q: list, v: list, u: list, s: Any, a: Any, xp: Any) -> list:
-    """Return the accelerations, by elimination on numbers of any kind."""
-    mass, force = system.motion(q, v, u, s, a, xp)
-    n = len(force)
-    rows = [[*row, b] for row, b in zip(mass, force, strict=True)]
-    for i in range(n):
-        for j in range(i + 1, n):
-            factor = rows[j][i] / rows[i][i]
-            rows[j] = [x - factor * y for x, y in zip(rows[j], rows[i], strict=True)]
-    result: list = [None] * n
-    for i in reversed(range(n)):
-        total = rows[i][n]
-        for j in range(i + 1, n):
-            total = total - rows[i][j] * result[j]
-        result[i] = total / rows[i][i]
-    return result
+    """Return the accelerations, for numbers of any kind."""
+    return solve(*system.motion(q, v, u, s, a, xp))
