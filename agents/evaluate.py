@@ -110,7 +110,7 @@ class Sensor:
         return seen.astype(observation.dtype)
 
 
-def observation_spread(env_id: str, seed: int, episodes: int = 100) -> NDArray[np.float64]:
+def observation_std(env_id: str, seed: int, episodes: int = 100) -> NDArray[np.float64]:
     """Return each observation entry's standard deviation under random actions, shape (n_observation,).
 
     Parameters

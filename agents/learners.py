@@ -127,7 +127,7 @@ def make_envs(run: Run) -> Any:
         raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
     if bins and (task.formulas.choices or task.formulas.actions > 1):
         raise UserError(f"{run.algo} numbers the actions of one control, {run.env} has others; try ppo")
-    envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), spread=int(steps), **options)
+    envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), stagger=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
     envs = envs if factor is None else ScaledReward(envs, factor)
     normalise = hyper.get("normalize")

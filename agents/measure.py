@@ -268,7 +268,7 @@ def set_pace(agent: Any, job: Job) -> bool:
     return pace == 1.0 or not plans(job.entrant)
 
 
-def measure(job: Job, agent: Any, spread: NDArray, tick: Callable[[], Any]) -> NDArray[np.float64]:
+def measure(job: Job, agent: Any, scale: NDArray, tick: Callable[[], Any]) -> NDArray[np.float64]:
     """Return the returns of a policy under a condition, shape (episodes,).
 
     Parameters
@@ -277,12 +277,12 @@ def measure(job: Job, agent: Any, spread: NDArray, tick: Callable[[], Any]) -> N
         What to measure.
     agent : object
         The policy.
-    spread : ndarray, shape (n_observation,)
+    scale : ndarray, shape (n_observation,)
         What noise is relative to.
     tick : callable
         Called at each step.
     """
-    sensor = Sensor(job.condition.noise * spread, job.condition.late)
+    sensor = Sensor(job.condition.noise * scale, job.condition.late)
 
     def observe(observation: NDArray, start: NDArray[np.bool_]) -> NDArray:
         tick()
@@ -296,7 +296,7 @@ def measure(job: Job, agent: Any, spread: NDArray, tick: Callable[[], Any]) -> N
 def follow(
     todo: Iterable[Job],
     stores: dict[str, Store],
-    spreads: dict[str, NDArray],
+    scales: dict[str, NDArray],
     fields: dict[str, Field],
 ) -> None:
     """Measure, policy by policy, and show how far it is and what is left."""
@@ -320,7 +320,7 @@ def follow(
                         agent = job.entrant.make()
                     if not set_pace(agent, job):
                         continue
-                    returns = measure(job, agent, spreads[env_id], bar.update)
+                    returns = measure(job, agent, scales[env_id], bar.update)
                 except Exception as error:  # whatever an agent does; the others are measured all the same
                     first = f"{type(error).__name__}: {error}".splitlines()[0]
                     fields[env_id].broken.append(f"{name}, {job.condition.name}: {first}")

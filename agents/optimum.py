@@ -33,7 +33,7 @@ from agents.value_iteration import (
 )
 from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
-from lag_envs.controllers.basic import Reader
+from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
 from lag_envs.host import machine
 from lag_envs.store import write
@@ -297,7 +297,7 @@ class Optimal:
                 f"value iteration gives no policy for {env_id!r}, only for {', '.join(played())}"
             )
         self.solution = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
-        self.read = Reader(self.solution.task)
+        self.read = ObservationDecoder(self.solution.task)
         #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
         self.pace = 1.0
 

@@ -503,9 +503,9 @@ def _fewer(data: Data) -> list[str]:
 
 def _noise_table(envs: Mapping[str, Data]) -> str:
     rows = [
-        [env_id, ", ".join(f"{entry} {value:.3g}" for entry, value in env["spread"].items())]
+        [env_id, ", ".join(f"{entry} {value:.3g}" for entry, value in env["observation_std"].items())]
         for env_id, env in envs.items()
-        if env.get("spread")
+        if env.get("observation_std")
     ]
     return table(["environment", "standard deviation of each entry under random actions"], rows)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from numpy.typing import NDArray
 
 from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
-from agents.evaluate import observation_spread
+from agents.evaluate import observation_std
 from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
@@ -31,7 +31,7 @@ SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs
 #: Episodes under each condition; those of agents that take long, where something is changed; with --quick.
 EPISODES, PLANNED, QUICK = 1000, 200, 20
 #: Seed of the random actions from which the noise's size is taken.
-SPREAD_SEED = 3_000_000_000
+SCALE_SEED = 3_000_000_000
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
 
 EPILOG = f"""what it reads and writes:
@@ -127,11 +127,11 @@ def measure_all(
     ]
     todo = [job for job in jobs if job.key not in stores[job.entrant.env].returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
-    spreads = {env_id: observation_spread(env_id, SPREAD_SEED) for env_id in envs}
-    follow(todo, stores, spreads, fields)
+    scales = {env_id: observation_std(env_id, SCALE_SEED) for env_id in envs}
+    follow(todo, stores, scales, fields)
 
     broken = [problem for found in fields.values() for problem in found.broken]
-    return broken, (fields, jobs, stores, spreads)
+    return broken, (fields, jobs, stores, scales)
 
 
 # --- the summary --------------------------------------------------------------------------------------------
@@ -141,7 +141,7 @@ def summarise(
     fields: dict[str, Field],
     jobs: Iterable[Job],
     stores: dict[str, Store],
-    spreads: dict[str, NDArray],
+    scales: dict[str, NDArray],
     episodes: int,
     old: Data,
 ) -> Data:
@@ -199,7 +199,7 @@ def summarise(
         if any(agent["kind"] == "learned" for agent in found["agents"].values()):
             absent = [text for text in absent if not text.startswith("learners")]
         names = TASKS[env_id]().observation
-        found["spread"] = rounded(dict(zip(names, spreads[env_id].tolist(), strict=True)))
+        found["observation_std"] = rounded(dict(zip(names, scales[env_id].tolist(), strict=True)))
         found["problems"] = absent
         envs[env_id] = found
     if not envs:

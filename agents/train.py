@@ -106,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for run in runs:
             if run not in todo:
                 print(f"{run.name}: finished before")
-        spread = partial(on_ray, address=args.ray) if args.ray else partial(processes, jobs=args.jobs)
-        failed, stopped = follow(todo, spread) if todo else ({}, False)
+        parallel_map = partial(on_ray, address=args.ray) if args.ray else partial(processes, jobs=args.jobs)
+        failed, stopped = follow(todo, parallel_map) if todo else ({}, False)
         summarise([run for run in runs if run.name not in failed])
     except UserError as error:
         print(f"agents.train: error: {error}", file=sys.stderr)
@@ -272,7 +272,7 @@ def poll(events: Any, futures: dict[Any, Run]) -> tuple | None:
 # --- progress -----------------------------------------------------------------------------------------------
 
 
-def follow(runs: Sequence[Run], spread: Callable) -> tuple[dict[str, str], bool]:
+def follow(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str], bool]:
     """Train the runs and show how they go; return why which failed, and whether it was stopped."""
     from tqdm import tqdm
 
@@ -284,7 +284,7 @@ def follow(runs: Sequence[Run], spread: Callable) -> tuple[dict[str, str], bool]
         dynamic_ncols=True, initial=sum(steps.values()),
     )  # fmt: skip
     try:
-        with terminable(), spread(runs) as poll, bar:
+        with terminable(), parallel_map(runs) as poll, bar:
             while left:
                 event = poll()
                 if event is None:

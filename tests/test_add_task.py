@@ -22,7 +22,7 @@ from agents.learners import load_policy
 from agents.report import page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
-from lag_envs.controllers.basic import Reader
+from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
 from lag_envs.leaderboard.board import Board, board_data, finish
@@ -99,7 +99,7 @@ def test_controllers(task):
         observation, _ = env.reset(seed=0)
         assert make_controller(ID, "springs").predict(observation)[0].shape == (2,)
     with pytest.raises(ValueError, match="Reach has 2 targets; one at most can be read"):
-        Reader(task())
+        ObservationDecoder(task())
     with pytest.raises(ValueError, match=r"gain must have shape \(2, 6\), got \(1, 1\)"):
         make_controller(ID, "springs").__class__(task(), gain=[1.0])
 

@@ -113,9 +113,9 @@ def test_adapter_refuses_another_autoreset_mode():
         VecEnv(gym.make_vec(ENV, 2))
 
 
-def test_spread_starts():
+def test_staggered_starts():
     """The environments then end their first episodes one after the other."""
-    envs = make_vec_env(ENV, 4, spread=20, duration=0.4)
+    envs = make_vec_env(ENV, 4, stagger=20, duration=0.4)
     envs.seed(1)
     first = envs.reset()
     ends = {t: np.flatnonzero(envs.step(np.zeros((4, 1), np.float32))[2]).tolist() for t in range(1, 41)}

@@ -410,7 +410,7 @@ def test_episodes_are_spread_out():
     envs = gym.make_vec(ID, num_envs=4, duration=0.16)  # 8 steps
     envs.reset(seed=0)
     actions = benchmark.random_actions(4)
-    benchmark.spread_out(envs, actions)
+    benchmark.stagger_episodes(envs, actions)
     ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
     assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
     assert max(map(sum, ended)) == 1

@@ -20,8 +20,8 @@ from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, submission
 from lag_envs.leaderboard.board import Board, BoardError, board_data, closed, finish, id_of
 from lag_envs.leaderboard.log import fold, parse
+from lag_envs.leaderboard.parallel import map_submissions, packed
 from lag_envs.leaderboard.protocol import first_seed
-from lag_envs.leaderboard.spread import map_submissions, packed
 from lag_envs.leaderboard.submission import Refused
 from lag_envs.leaderboard.verify import verify_folder
 from lag_envs.scores import known_returns, score

@@ -20,7 +20,7 @@ from lag_envs.controllers import (
     do_nothing,
     make_controller,
 )  # fmt: skip
-from lag_envs.controllers.basic import Reader
+from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.scores import known_returns, score
@@ -103,7 +103,7 @@ def observations():
         if env_id in (BAR, FREE):
             states[n // 2 :, -2:] = [3.0, 0.1]  # where the LQR takes over
         goal = 0.0 if task.target_range is None else task.target_range * rng.uniform(-1.0, 1.0, n)
-        read = Reader(task)
+        read = ObservationDecoder(task)
         k = SimpleNamespace(**task.formulas.constants())
         seen = task.formulas.observe(np, task.scene._form.lift(states), [goal] * task.formulas.targets, k)
         values = np.stack(np.broadcast_arrays(*seen), axis=-1).astype(np.float32)

@@ -276,13 +276,13 @@ def test_energy_balance_of_a_step(case):
 
 
 FORMS = {
-    "PivotedBar": "Drive",
-    "Incline-damping": "Pull",
-    "Incline-tilt": "Pull",
-    "Incline-tilt_rate": "Turn",
-    "CylinderInCylinder-damping": "Drive",
-    "CylinderInCylinder-tilt": "Drive",
-    "Chain-1": "Drive",
+    "PivotedBar": "Coefficients",
+    "Incline-damping": "FixedSlope",
+    "Incline-tilt": "FixedSlope",
+    "Incline-tilt_rate": "TurningSlope",
+    "CylinderInCylinder-damping": "Coefficients",
+    "CylinderInCylinder-tilt": "Coefficients",
+    "Chain-1": "Coefficients",
 }
 
 
@@ -317,12 +317,12 @@ def test_normal_form_is_the_derived_equation(case):
             c = form.drive(y, u, k, mpmath)
             q, v, *pair = form.unpack(y, u, k)
             assert abs(v - point.v[free]) < 1e-30 and q == point.q[free]
-            if form.kind.__name__ == "Drive":
+            if form.kind.__name__ == "Coefficients":
                 found = c.delta - c.alpha * pair[1] - c.beta * pair[0] - c.gamma * v
-            elif form.kind.__name__ == "Turn":
-                found = c.weight * pair[1] + c.carry * c.rate**2 * q - c.drag * v
+            elif form.kind.__name__ == "TurningSlope":
+                found = c.gravity * pair[1] + c.centrifugal * c.rate**2 * q - c.damping_rate * v
             else:
-                found = c.pull - c.drag * v
+                found = c.acceleration - c.damping_rate * v
             point.a |= {free: found}
             residual, size = oracle.residual(free, point)
             assert abs(residual) < 1e-25 * size

@@ -22,7 +22,7 @@ from agents.evaluate import evaluate, evaluate_batch
 from agents.optimum import IMAGES, RESULTS, Optimal, Solution, extrapolated, grid, played, solvable
 from agents.value_iteration import PROGRESS, VALUES, CacheError, Grid, ValueIteration, stretched
 from lag_envs.controllers import make_controller, optimal_return
-from lag_envs.controllers.basic import Reader
+from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
@@ -289,7 +289,7 @@ def test_agent_is_there_for_what_is_solved():
 
 @pytest.mark.parametrize("env_id", played())
 def test_observations_are_read_back(env_id):
-    read = Reader(TASKS[env_id]())
+    read = ObservationDecoder(TASKS[env_id]())
     envs = gym.make_vec(env_id, 50)
     observations, _ = envs.reset(seed=3)
     for _ in range(5):

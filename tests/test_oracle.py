@@ -16,7 +16,7 @@ from lag_envs.report.closed_forms import elliptic, linear
 from lag_envs.report.formulas import Formulas
 from lag_envs.report.oracle import Oracle, Unresolved, oracle_of
 from lag_envs.scenes import Scene, parameter
-from lag_envs.stepping.pendulum import Drive
+from lag_envs.stepping.pendulum import Coefficients
 
 ZERO = mpf(0)
 KINDS = "task", "damped", "stiff", "extreme"
@@ -38,7 +38,7 @@ def arguments(case):
 
 def series(drive, theta, rate, dt, digits=50):
     """Return the driven pendulum's end by the oracle, as one computation gives it."""
-    scene, control = driven(Drive(*drive))
+    scene, control = driven(Coefficients(*drive))
     return oracle_of(scene).once([0.0, 0.0, theta, rate], control, dt, digits)[2:]
 
 

@@ -19,8 +19,8 @@ from lag_envs.scenes.picture import Picture, turning
 from lag_envs.scenes.shapes import (
     Arrow,
     Circle,
+    Frame,
     Line,
-    Moment,
     Polygon,
     Pose,
     Role,
@@ -55,7 +55,7 @@ def picture(env_id, state=None, action=0.5, **options):
 
 def moment(task, share=0.5, **changes):
     state = [c + h for c, h in zip(task.centre, task.half_widths, strict=True)]
-    return Moment(state, share * task.limit_control, share, task.target_range and 0.1)._replace(**changes)
+    return Frame(state, share * task.limit_control, share, task.target_range and 0.1)._replace(**changes)
 
 
 def blue(frame):
@@ -144,14 +144,14 @@ def test_a_task_adds_shapes_where_frames_are():
             return {**super().bodies(), "hat": [Circle((0.0, 0.0), 0.1, "target")]}
 
     with pytest.raises(FormulaError, match=r"Marked\.bodies has 'hat', which has no place in .*indicators"):
-        Marked().shapes(Moment([0.0] * 4))
+        Marked().shapes(Frame([0.0] * 4))
 
     class Wide(pivoted_bar.SwingUp):
         def window(self):
             return Window(0.0, 0.0, 1.0, 1.0, "hat")
 
     with pytest.raises(FormulaError, match=r"Wide\.window has 'hat'"):
-        Wide().shapes(Moment([0.0] * 4))
+        Wide().shapes(Frame([0.0] * 4))
 
     class Old(pivoted_bar.SwingUp):
         def shapes(self, now):
@@ -173,7 +173,7 @@ def test_poses_of_an_episode_are_those_of_its_moments():
         for i, state in enumerate(states):
             control = controls[i - 1] if i else np.zeros(len(controls[0]))
             turned = turned + (0.5 * task.dt * (rates[i - 1] + rates[i]) if i else 0.0)
-            now = Moment(state.tolist(), control, task.share(control), target, turned)
+            now = Frame(state.tolist(), control, task.share(control), target, turned)
             np.testing.assert_allclose(poses[i], picture.poses(now), atol=1e-14)
 
 
@@ -202,14 +202,14 @@ def turned(task, before, after):
 def test_cylinders_roll_without_slipping():
     # On the incline at x'/R + phi' clockwise; in the shell at (R psi' - a theta')/r counter-clockwise.
     task = TASKS[incline.Tilt.id]
-    before, after = Moment([0.1, 0.0, 0.01]), Moment([0.12, 0.0, 0.03])
+    before, after = Frame([0.1, 0.0, 0.01]), Frame([0.12, 0.0, 0.03])
     assert turned(task, before, after) == pytest.approx(-(0.02 / 0.05 + 0.02))
     task = TASKS[cylinder_in_cylinder.Pump.id]
-    before, after = Moment([0.1, 0.0, 0.0], turned=0.3), Moment([0.2, 0.0, 0.0], turned=0.4)
+    before, after = Frame([0.1, 0.0, 0.0], turned=0.3), Frame([0.2, 0.0, 0.0], turned=0.4)
     assert turned(task, before, after) == pytest.approx((0.5 * 0.1 - 0.4 * 0.1) / 0.1)
     task = TASKS[incline.Brake.id]
-    (x0, y0), _ = turn(task.shapes(Moment([-1.0, 0.0])))
-    (x1, y1), _ = turn(task.shapes(Moment([-0.9, 0.0])))
+    (x0, y0), _ = turn(task.shapes(Frame([-1.0, 0.0])))
+    (x1, y1), _ = turn(task.shapes(Frame([-0.9, 0.0])))
     assert (x1 - x0, y1 - y0) == pytest.approx((0.1 * math.cos(math.pi / 12), -0.1 * math.sin(math.pi / 12)))
 
 

@@ -14,10 +14,10 @@ from lag_envs import TASKS
 from lag_envs.report import environment_results, environments, episodes, gymnasium_peers
 from lag_envs.report.bound import Driven
 from lag_envs.report.episodes import Episode, play, random_actions, replay
+from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import Result
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import comparison
 from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
 
 #: Limit on the error of one second of any environment, relative to the state's size; measured 5.3e-16.

@@ -12,7 +12,7 @@ from lag_envs.report.oracle import Unresolved
 from lag_envs.report.runner import Result
 from lag_envs.scenes import PivotedBar
 from lag_envs.stepping import pendulum
-from lag_envs.stepping.pendulum import Drive
+from lag_envs.stepping.pendulum import Coefficients
 from lag_envs.tasks import cylinder_in_cylinder
 
 PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
@@ -50,7 +50,7 @@ def test_bound_is_never_broken():
 def test_what_is_left_out_is_the_sum_of_the_rest():
     """The exact end less the series multiplied out by hand, and less the recurrence that is compiled."""
     alpha, gamma, theta, omega, h = 3.0, 0.75, 0.4, 1.1, 0.125
-    drive = Drive(alpha, 0.0, gamma, 0.0, 0.0)
+    drive = Coefficients(alpha, 0.0, gamma, 0.0, 0.0)
     scene, control = bound.driven(drive)
     end = reference.flow(scene, [0.0, 0.0, theta, omega], control, h)[2:]
     with mp.workdps(60):
@@ -72,7 +72,7 @@ def test_what_is_left_out_is_the_sum_of_the_rest():
 
 def test_bound_is_that_of_the_product():
     """With the product's x, the bound that is drawn is the bound that the product reports."""
-    drive, omega, h = Drive(20.0, 3.0, 0.5, 0.0, 0.0), 2.0, 0.01
+    drive, omega, h = Coefficients(20.0, 3.0, 0.5, 0.0, 0.0), 2.0, 0.01
     known = pendulum.truncation_bound(omega, drive, h)
     assert known.substeps == 1
     x = h * pendulum._rate(omega, *drive, 0.0)
@@ -209,9 +209,9 @@ def test_float32_of_ordinary_steps():
 
 
 def test_formulas_on_arrays_are_the_compiled_ones():
-    """The comparison steppers, run as NumPy formulas, give what they give as compiled flows."""
+    """The comparison integrators, run as NumPy formulas, give what they give as compiled flows."""
+    from lag_envs.report.integrators import comparison
     from lag_envs.report.stepped import Stepped
-    from lag_envs.report.steppers import comparison
 
     case = Case(PivotedBar(track=None, damping=0.01), (2.0, 3.0), 3.0)
     flow = comparison("RK4", Stepped(case.scene).flow)

@@ -24,7 +24,7 @@ from agents.analysis import (
     summarise_env,
     summarise_learners,
 )
-from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_spread
+from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_std
 from agents.measure import Condition, Entrant, Job, conditions
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
 from lag_envs.generated import replaced
@@ -147,7 +147,7 @@ def invented():
         incline.Tilt.id: summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
     }
     for env in envs.values():
-        env |= {"spread": {"s": 0.5}, "problems": ["optimal: not computed"]}
+        env |= {"observation_std": {"s": 0.5}, "problems": ["optimal: not computed"]}
     machine = {"processor": "P", "cores": 2, "system": "S", "python": "3"}
     return {
         "schema": 1,
@@ -202,7 +202,7 @@ def test_what_an_agent_sees_in_a_batch():
         np.testing.assert_allclose(evaluate(env, agent, range(7, 10)), plain, rtol=1e-12)
 
 
-def test_observation_spread():
+def test_observation_std():
     rng, seen = np.random.default_rng(5), []
     with gym.make(ENV) as env:
         seen.append(env.reset(seed=5)[0])
@@ -211,7 +211,7 @@ def test_observation_spread():
             if terminated or truncated:
                 break
             seen.append(observation)
-    np.testing.assert_allclose(observation_spread(ENV, 5, 1), np.std(seen, axis=0), rtol=1e-5)
+    np.testing.assert_allclose(observation_std(ENV, 5, 1), np.std(seen, axis=0), rtol=1e-5)
 
 
 @pytest.mark.parametrize("env_id", TASKS)
@@ -274,7 +274,7 @@ def command(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
-    monkeypatch.setattr(results, "observation_spread", lambda env_id, seed: np.array([0.5, 0.1]))
+    monkeypatch.setattr(results, "observation_std", lambda env_id, seed: np.array([0.5, 0.1]))
 
     def run(*arguments):
         folders = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]

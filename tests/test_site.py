@@ -25,7 +25,7 @@ from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import Scenery, picture
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.picture import Picture
-from lag_envs.scenes.shapes import Arrow, Circle, Lens, Line, Moment, Polygon
+from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Magnifier, Polygon
 from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline
 from tests import board_pages
 
@@ -470,7 +470,7 @@ def flat(shape):
             return ["arrow", np.array(points), role]
         case Circle(centre, radius, role):
             return ["circle", np.array([*centre, radius]), role]
-        case Lens(centre, radius):
+        case Magnifier(centre, radius):
             return ["lens", np.array([*centre, radius]), None]
 
 
@@ -485,7 +485,7 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
             state = (task.centre + rng.uniform(-3, 3, len(task.centre)) * task.half_widths).tolist()
             controls = task.wanted(rng.uniform(-1, 1, (1, task.formulas.actions)))[0]
             target, turned = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-3, 3))
-            now = Moment(state, controls, task.share(controls), target, turned)
+            now = Frame(state, controls, task.share(controls), target, turned)
             poses = shown.poses(now)
             window = page.evaluate(f"lagEnvs.windowOf({described}, {json.dumps(poses)})")
             assert window == pytest.approx(shown.window(poses)[:4], abs=1e-4 * size)

@@ -30,8 +30,8 @@ from lag_envs.report.closed_forms import elliptic, linear
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar, StepRefused
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.pendulum import Drive
-from lag_envs.stepping.slope import Pull, Turn
+from lag_envs.stepping.pendulum import Coefficients
+from lag_envs.stepping.slope import FixedSlope, TurningSlope
 from lag_envs.tasks import TASKS
 
 KINDS = "task", "damped", "stiff", "extreme"
@@ -69,7 +69,7 @@ def advance_of(scene, dt):
     """Return the scene's compiled step, and what it takes behind state, control and step."""
     numbers = scene._constants()
     code = scene._form.stepper(dt, frozenset(name for name, value in numbers.items() if value == 0.0))
-    return code.compile(), [scene._form.largest_x(dt), *(v for v in numbers.values() if v)]
+    return code.compile(), [scene._form.largest_majorant(dt), *(v for v in numbers.values() if v)]
 
 
 # --- the series -----------------------------------------------------------------------------------
@@ -81,7 +81,7 @@ def random_drive(rng, ramp=True):
     size = 10.0 ** rng.uniform(-3, 0, 5) * rng.choice([0.0, 1.0], 5, p=[0.2, 0.8])
     a, b, gamma, d, r = (mpf(v) for v in size * rng.uniform(-1, 1, 5) * [0.3, 0.3, 1, 0.3, 1])
     w = mpf(rng.uniform(-1, 1) * 10.0 ** rng.uniform(-3, 0))
-    return w, mp.cos(angle), mp.sin(angle), Drive(a, b, gamma, d, r if ramp else 0.0)
+    return w, mp.cos(angle), mp.sin(angle), Coefficients(a, b, gamma, d, r if ramp else 0.0)
 
 
 def test_coefficients_are_derivatives():
@@ -99,7 +99,7 @@ def test_coefficients_are_derivatives():
             sum(derivative.diff(z) * rate for z, rate in zip(symbols, rates, strict=True))
         )
     floats = (float(point[z]) for z in (w, c, s))
-    W, _ = pendulum.taylor_coefficients(*floats, Drive(*map(float, numbers)), 8)
+    W, _ = pendulum.taylor_coefficients(*floats, Coefficients(*map(float, numbers)), 8)
     assert pytest.approx(expected, rel=1e-13) == W
 
 
@@ -123,7 +123,7 @@ def test_energy_identity():
 @pytest.mark.parametrize("order", [3, 6, 10, 16, 20])
 def test_order(order):
     """The error of one step of theta' falls as h^(N+1), that of theta as h^(N+2)."""
-    drive = Drive(mpf(20), mpf(-7), mpf(3), mpf(5), mpf(40))
+    drive = Coefficients(mpf(20), mpf(-7), mpf(3), mpf(5), mpf(40))
     start = mpf(0.3), mpf(2.5), mp.cos(0.3), mp.sin(0.3)
 
     def errors(h):
@@ -140,7 +140,7 @@ def least_x(w, drive):
     low, high = 0.0, 64.0
     for _ in range(60):
         x = 0.5 * (low + high)
-        good = pendulum.certified(float(w), Drive(*map(float, drive)), 1.0, x, np)
+        good = pendulum.certified(float(w), Coefficients(*map(float, drive)), 1.0, x, np)
         low, high = (low, x) if good else (x, high)
     return high
 
@@ -173,7 +173,7 @@ def test_bound_is_never_broken(order):
 
 def test_bound_is_not_far_off():
     """How loose the bound is: less than a factor of 3 per power where drive and field pull together."""
-    w, drive = mpf(0.0), Drive(mpf(0.02), 0.0, 0.0, mpf(0.02), 0.0)
+    w, drive = mpf(0.0), Coefficients(mpf(0.02), 0.0, 0.0, mpf(0.02), 0.0)
     W, _ = pendulum.taylor_coefficients(w, mpf(0), mpf(-1), drive, 25)
     x = least_x(w, drive)
     assert (abs(W[25]) / x) ** (1 / 25) > x / 2 / 3
@@ -327,7 +327,7 @@ def any_pendulum():
 def pendulum_errors(theta, omega, drive, dt):
     """Return errors of theta and theta' as shares of what is asked for, and the substeps."""
     c, s = math.cos(theta), math.sin(theta)
-    x = pendulum.largest_x(dt)
+    x = pendulum.largest_majorant(dt)
     *end, substeps = any_pendulum()(theta, omega, c, s, *map(float, drive), dt, x)
     scene, control = driven(drive)
     exact = exact_ends.once(oracle_of(scene), [0.0, 0.0, theta, omega], control, dt, 40)[2:]
@@ -356,7 +356,7 @@ def test_heavy_damping_at_its_thresholds(decay, share):
             (0.5, (0.0, 0.0, -1.0, 0.0)),
         ):
             a, b, d, r = (field * part for part in parts)
-            *errors, _ = pendulum_errors(theta, omega, Drive(a, b, gamma, d, r / dt), dt)
+            *errors, _ = pendulum_errors(theta, omega, Coefficients(a, b, gamma, d, r / dt), dt)
             assert max(errors) < 0.1, (omega, parts)
 
 
@@ -369,7 +369,7 @@ def test_heavy_damping_of_a_fast_drive(decay, share):
     push = share * gamma * gamma
     for field in (1e-4 * push, 0.05 * push):
         for d, r in ((1.0, 0.0), (-0.3, 0.7)):
-            drive = Drive(field, -0.5 * field, gamma, d * push, r * push / dt)
+            drive = Coefficients(field, -0.5 * field, gamma, d * push, r * push / dt)
             *errors, substeps = pendulum_errors(0.4, -2.0, drive, dt)
             assert max(errors) < 1e-2 and substeps > 1
 
@@ -440,7 +440,7 @@ def test_very_heavy_damping(decay):
     gamma = decay / dt
     for omega, field in ((1e4, 25.0), (-3.0, 5e3), (0.0, 1e-5 * gamma * decay)):
         *errors, substeps = pendulum_errors(
-            2.5, omega, Drive(field, -0.5 * field, gamma, 0.3 * field, field / dt), dt
+            2.5, omega, Coefficients(field, -0.5 * field, gamma, 0.3 * field, field / dt), dt
         )
         assert max(errors) < 1e-2
         assert 0 < substeps < 1000
@@ -754,14 +754,14 @@ def formulas():
     h = 0.02
 
     def swing(theta, omega, c, s, *drive):
-        return pendulum.step(theta, omega, c, s, Drive(*drive), h)
+        return pendulum.step(theta, omega, c, s, Coefficients(*drive), h)
 
     theta, omega, *drive = batch(200, [3, 10, 30, 10, 5, 5, 20], 7)
     yield swing, [theta, omega, np.cos(theta), np.sin(theta), *drive]
-    yield lambda x, v, pull, drag: slope.slide(x, v, Pull(pull, drag), h), batch(200, [1, 3, 9, 5], 8)
+    yield lambda x, v, pull, drag: slope.slide(x, v, FixedSlope(pull, drag), h), batch(200, [1, 3, 9, 5], 8)
     x, v, phi, *turn = batch(200, [1, 3, 1, 1, 9, 1, 1], 9)
     yield (
-        lambda x, v, c, s, *rest: slope.turn_series(x, v, c, s, Turn(*rest), h),
+        lambda x, v, c, s, *rest: slope.turn_series(x, v, c, s, TurningSlope(*rest), h),
         [x, v, np.cos(phi), np.sin(phi), *turn],
     )
 
@@ -782,7 +782,7 @@ def test_compiled_is_the_formula():
     """Fused operations change the last places only."""
     formula, columns = next(iter(formulas()))
     plain = np.array(formula(*columns))
-    x = pendulum.largest_x(0.02)
+    x = pendulum.largest_majorant(0.02)
     for i, row in enumerate(np.transpose(columns).tolist()):
         *compiled, substeps = any_pendulum()(*row, 0.02, x)
         assert substeps == 1

@@ -174,7 +174,7 @@ def energies(task: str, given: dict[str, Any], n: int) -> Run:
     envs = LagrangianVectorEnv(f"lag_envs.benchmark_tasks:{task}", n, **given)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
-    spread_out(envs, actions)
+    stagger_episodes(envs, actions)
     return batch(envs.step, actions)
 
 
@@ -238,11 +238,11 @@ def ours(id: str, n: int) -> Run:
     envs = gym.make_vec(id, num_envs=n)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
-    spread_out(envs, actions)
+    stagger_episodes(envs, actions)
     return batch(envs.step, actions)
 
 
-def spread_out(envs: VectorEnv, actions: Sequence[Any]) -> None:
+def stagger_episodes(envs: VectorEnv, actions: Sequence[Any]) -> None:
     """Shift the episodes against each other, so that every sample has its share of endings."""
     limit = envs.spec.max_episode_steps if envs.spec else None
     length = limit or round(envs.task.limit)  # type: ignore[attr-defined]

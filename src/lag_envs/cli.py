@@ -499,7 +499,7 @@ examples:
     Command(
         "report",
         "measure errors, and write a page about them",
-        """Measure the error of every environment and scene against high precision, beside the usual steppers
+        """Measure the error of every environment and scene against high precision, beside usual integrators
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
 Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
 Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.

@@ -31,7 +31,7 @@ import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.leaderboard.policies import bin_centres
 
 
-def make_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any) -> VecEnv:
+def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any) -> VecEnv:
     """Return a native vector environment for Stable-Baselines3.
 
     Parameters
@@ -40,7 +40,7 @@ def make_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any)
         Id of an environment.
     num_envs : int
         Number of environments.
-    spread : int, default 0
+    stagger : int, default 0
         See `VecEnv`.
     **options
         Parameters of the environment.
@@ -52,7 +52,7 @@ def make_vec_env(env_id: str, num_envs: int, *, spread: int = 0, **options: Any)
     >>> env.reset().shape
     (3, 5)
     """
-    return VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), spread=spread)
+    return VecEnv(gym.make_vec(env_id, num_envs, autoreset_mode="SameStep", **options), stagger=stagger)
 
 
 class VecEnv(vec_env.VecEnv):
@@ -65,7 +65,7 @@ class VecEnv(vec_env.VecEnv):
     ----------
     env : VectorEnv
         A vector environment that resets in the same step.
-    spread : int, default 0
+    stagger : int, default 0
         Steps over which the beginnings of the first episodes are spread; the length of an episode is a good
         choice. A reset then takes so many steps with random actions and restarts the environments one after
         the other. Else, where episodes are equally long, a learner's roll-out shows one phase of them.
@@ -76,12 +76,12 @@ class VecEnv(vec_env.VecEnv):
         For an environment with another autoreset mode.
     """
 
-    def __init__(self, env: VectorEnv, *, spread: int = 0) -> None:
+    def __init__(self, env: VectorEnv, *, stagger: int = 0) -> None:
         mode = env.metadata.get("autoreset_mode")
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(f'the environment must be made with autoreset_mode="SameStep", got {mode}')
         self.env = env
-        self._spread = spread
+        self._stagger = stagger
         self._actions: NDArray[np.floating] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -91,8 +91,8 @@ class VecEnv(vec_env.VecEnv):
         """Begin an episode in every environment, with the seeds and options that were set."""
         seeds: Any = self._seeds  # Gymnasium's types know of one seed only
         observations, infos = self.env.reset(seed=seeds, options=self._stacked_options())
-        if self._spread:
-            observations, infos = self._spread_starts()
+        if self._stagger:
+            observations, infos = self._stagger_starts()
         self.reset_infos = self._split(infos)
         self._reset_seeds()
         self._reset_options()
@@ -153,11 +153,11 @@ class VecEnv(vec_env.VecEnv):
 
     # --- the rest -------------------------------------------------------------------------------------------
 
-    def _spread_starts(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        last = np.arange(self.num_envs) * self._spread // self.num_envs
+    def _stagger_starts(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        last = np.arange(self.num_envs) * self._stagger // self.num_envs
         space = self.env.action_space
         space.seed(None if self._seeds[0] is None else int(self._seeds[0]))
-        for t in range(self._spread):
+        for t in range(self._stagger):
             if t and (last == t).any():
                 self.env.reset(options={"reset_mask": last == t})
             observations, *_, infos = self.env.step(space.sample())

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from lag_envs.tasks.measured import measured
 
 
-class Known(NamedTuple):
+class KnownReturns(NamedTuple):
     """Mean returns that are known of an environment with its default parameters.
 
     The first two are the scale, set once: what is measured later, and more precisely, does not change them.
@@ -39,10 +39,10 @@ class Known(NamedTuple):
     optimum: float | None = None
 
 
-def known_returns(env_id: str) -> Known | None:
+def known_returns(env_id: str) -> KnownReturns | None:
     """Return what is known of an environment; None where nothing was measured."""
     scale = measured(env_id).get("scale")
-    return scale and Known(**scale)
+    return scale and KnownReturns(**scale)
 
 
 def score(env_id: str, mean_return: float) -> float | None:

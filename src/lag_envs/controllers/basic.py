@@ -124,7 +124,7 @@ def at_random(task: Task, seed: int = 0) -> Random | Choice:
     return Random(seed, task.formulas.actions)
 
 
-class Law:
+class FeedbackController:
     """Base of the controllers without memory: a control for each state.
 
     A subclass defines `control`. Controls beyond the task's limit are clipped.
@@ -137,7 +137,7 @@ class Law:
 
     def __init__(self, task: Task) -> None:
         self.task = task
-        self.read = Reader(task)
+        self.read = ObservationDecoder(task)
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the control [SI unit] for states (..., n_state) and targets (...)."""
@@ -155,7 +155,7 @@ def as_actions(values: Array) -> NDArray[np.float32]:
     return np.clip(values, -1.0, 1.0)[..., None].astype(np.float32)
 
 
-class Reader:
+class ObservationDecoder:
     """Reads states and targets from observations.
 
     What a task observes is linear in the lifted state and the target; so it is inverted from the values at

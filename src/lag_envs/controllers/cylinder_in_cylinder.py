@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
 
 
-class TiltLQR(Law):
+class TiltLQR(FeedbackController):
     """Hold a cylinder at an angle by a linear-quadratic regulator about the shell's rate that holds it there.
 
     That rate follows from the equation of motion at rest.
@@ -43,7 +43,7 @@ class TiltLQR(Law):
         return (wanted - state) @ self.gain
 
 
-class EnergyPump(Law):
+class EnergyPump(FeedbackController):
     """Pump the swing to the wanted energy, and make good what the drag takes.
 
     Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes by θ' (push u - drag (θ' - ψ')); so there
@@ -68,15 +68,15 @@ class EnergyPump(Law):
             )
         self.pump, self.centring = pump, centring
         drive = task.coefficients([0.0, 0.0, 0.0], [1.0], np)
-        self.weight, self.drag, self.push = drive.alpha, drive.gamma, drive.delta
+        self.omega0_squared, self.damping_rate, self.push = drive.alpha, drive.gamma, drive.delta
         self.wanted = task.energies([0.0, 0.0, 0.0], np)[1]
 
     def control(self, state: Array, target: Array) -> Array:
         """Return the shell's acceleration."""
         theta, theta_dot, psi_dot = np.moveaxis(state, -1, 0)
-        energy = 0.5 * theta_dot**2 + self.weight * (1.0 - np.cos(theta))
+        energy = 0.5 * theta_dot**2 + self.omega0_squared * (1.0 - np.cos(theta))
         missing = 1.0 - energy / self.wanted
-        keeping = self.drag / self.push * (theta_dot - psi_dot)
+        keeping = self.damping_rate / self.push * (theta_dot - psi_dot)
         pumping = self.pump * self.task.limit_control * missing * theta_dot / np.sqrt(2.0 * self.wanted)
         return keeping + pumping - self.centring * psi_dot
 
@@ -94,11 +94,11 @@ def plan_pumping(task: Pump, *, opening: float = 0.25) -> ILQR:
         For how many periods of a small swing the shell is first pushed to one side or the other.
     """
     follow = EnergyPump(task, pump=5.0, centring=0.3)
-    steps = round(opening * 2.0 * math.pi / math.sqrt(follow.weight) / task.dt)
+    steps = round(opening * 2.0 * math.pi / math.sqrt(follow.omega0_squared) / task.dt)
     return ILQR(task, [Opening(side, max(steps, 1), follow) for side in (-1.0, 1.0)])
 
 
-class BrakingLine(Law):
+class BrakingLine(FeedbackController):
     """Brake hard away from the bottom, roll freely towards it, and brake along a line into it.
 
     Under full brake the cylinder is overdamped: near the bottom it creeps along the slow direction of its

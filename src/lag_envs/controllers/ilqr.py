@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, Reader, as_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
 from lag_envs.envs.model import REACH, Model
 from lag_envs.tasks.base import Task
 
@@ -79,7 +79,7 @@ class ILQR:
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
         self.iterations, self.tolerance = iterations, tolerance
         self.flat = FLAT * task.dt / task.interval
-        self.model, self.read = Model(task), Reader(task)
+        self.model, self.read = Model(task), ObservationDecoder(task)
         self._k = SimpleNamespace(**task.formulas.constants())
 
     def predict(

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.controllers.linear import regulator
 from lag_envs.envs.model import Model
-from lag_envs.stepping.slope import Pull, crossing_time
+from lag_envs.stepping.slope import FixedSlope, crossing_time
 from lag_envs.tasks.incline import Brake, Tilt
 
 #: Points of the curve along which a cylinder is braked.
 POINTS = 20_000
 
 
-class TiltCascade(Law):
+class TiltCascade(FeedbackController):
     """Hold a cylinder at a mark: a linear-quadratic regulator, written as a cascade.
 
     The regulator's u = -K (x - x*, w, φ) is the same as a control of the tilt, u = K_φ (φ_wanted - φ), behind
@@ -40,9 +40,9 @@ class TiltCascade(Law):
         extra = {"u": effort / task.limit_control**2}
         self.gain, _ = regulator(task, [0.0] * len(task.scene.state_names), extra=extra)
         if task.quasi_static:
-            steepest = task.coefficients([0.0, 0.0], [task.largest_tilt], np).pull
+            steepest = task.coefficients([0.0, 0.0], [task.largest_tilt], np).acceleration
         else:
-            steepest = task.coefficients([0.0] * 3, [0.0], np).weight * np.sin(task.largest_tilt)
+            steepest = task.coefficients([0.0] * 3, [0.0], np).gravity * np.sin(task.largest_tilt)
         self.acceleration = braking * steepest
 
     def control(self, state: Array, target: Array) -> Array:
@@ -60,7 +60,7 @@ class TiltCascade(Law):
         return tilt if self.task.quasi_static else gain[2] * (tilt - state[..., 2])
 
 
-class SwitchingLine(Law):
+class SwitchingLine(FeedbackController):
     """Let a cylinder roll freely, then brake fully, along the curve that ends at the line at a wanted speed.
 
     The curve is one run of the scene under full brake: its equation does not depend on the place. In the
@@ -143,16 +143,16 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     -1.7373
     """
     free, full = (task.coefficients([0.0, 0.0], [c], np) for c in (0.0, task.limit_control))
-    if not free.pull > 0.0:
+    if not free.acceleration > 0.0:
         raise ValueError(
             f"tilt={task.scene.tilt:g} rad and gravity={task.scene.gravity:g} m/s² pull nothing to the line"
         )
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 
-    def crossing(place: Array, speed: Array, force: Pull) -> tuple[Array, Array]:
+    def crossing(place: Array, speed: Array, force: FixedSlope) -> tuple[Array, Array]:
         """Return when 0 is passed, and how fast: the integral of x'' = pull - drag x' over the way."""
         time = crossing_time(place, speed, force, np.inf, np)
-        return time, speed + force.pull * time + force.drag * place
+        return time, speed + force.acceleration * time + force.damping_rate * place
 
     early, late = x, np.zeros_like(x)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # in branches that are not taken
@@ -161,7 +161,7 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
             _, fast = crossing(x - switch, v, free)
             time, slow = crossing(switch, fast, full)
             # Seconds saved by a m/s more at the line, where the brake sets in that much later.
-            saved = (slow / fast * np.exp(full.drag * time) - 1.0) / full.pull
+            saved = (slow / fast * np.exp(full.damping_rate * time) - 1.0) / full.acceleration
             later = (slow <= task.gentle) | (saved > task.price)
             early, late = np.where(later, switch, early), np.where(later, late, switch)
         first, fast = crossing(x - late, v, free)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, Law
+from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.tasks.cylinder_in_cylinder import Tilt as ShellTilt
 from lag_envs.tasks.incline import Tilt as InclineTilt
 
@@ -12,7 +12,7 @@ from lag_envs.tasks.incline import Tilt as InclineTilt
 TUNED = {InclineTilt: (2.5, 0.07), ShellTilt: (17.0, 0.49)}
 
 
-class PD(Law):
+class PD(FeedbackController):
     """Bring place or angle to its target like a critically damped spring.
 
     The acceleration ω² (q* - q) - 2ω q' is asked for. What is moved, the tilt of the plane or the rate of the
@@ -42,7 +42,9 @@ class PD(Law):
         rest = task.coefficients([0.0] * len(task.scene.state_names), [0.0], np)
         if isinstance(task, InclineTilt):
             steepest = task.coefficients([0.0] * len(task.scene.state_names), [task.largest_tilt], np)
-            strength = steepest.pull / np.sin(task.largest_tilt) if task.quasi_static else rest.weight
+            strength = (
+                steepest.acceleration / np.sin(task.largest_tilt) if task.quasi_static else rest.gravity
+            )
         else:
             strength = rest.gamma
         if not strength > 0.0:
@@ -55,7 +57,7 @@ class PD(Law):
         wanted = self.frequency**2 * (target - place) - 2.0 * self.frequency * speed
         if isinstance(self.task, InclineTilt):  # wanted = strength sin(tilt) - drag speed
             limit = np.sin(self.task.largest_tilt)
-            sine = (wanted + self.rest.drag * speed) / self.strength
+            sine = (wanted + self.rest.damping_rate * speed) / self.strength
             moved = np.arcsin(np.clip(sine, -limit, limit))
             if self.task.quasi_static:
                 return moved

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, Law, Reader, as_actions
+from lag_envs.controllers.basic import Array, FeedbackController, ObservationDecoder, as_actions
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.pivoted_bar import Balance, SwingUp
@@ -61,8 +61,8 @@ class EnergyShapingLQR:
         self.pump = tuned[1] if pump is None else pump
         self.lose, self.centring = lose, centring
         self.gain, self.cost = lqr(task)
-        self.weight = task.coefficients([0.0] * len(self.scene.state_names), [0.0], np).alpha
-        self.read = Reader(task)
+        self.omega0_squared = task.coefficients([0.0] * len(self.scene.state_names), [0.0], np).alpha
+        self.read = ObservationDecoder(task)
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -85,11 +85,11 @@ class EnergyShapingLQR:
     def swing(self, x: Array) -> Array:
         """Return the support's acceleration [m/s²] that brings the bar's energy to that of the upright rest.
 
-        Per moment of inertia the energy is E = θ'²/2 - weight·cosθ, and u changes it in proportion to
+        Per moment of inertia the energy is E = θ'²/2 - ω₀² cosθ, and u changes it in proportion to
         -u θ' cosθ.
         """
         theta_dot, cosine = x[..., -1], np.cos(x[..., -2])
-        missing = self.weight - (0.5 * theta_dot * theta_dot - self.weight * cosine)
+        missing = self.omega0_squared - (0.5 * theta_dot * theta_dot - self.omega0_squared * cosine)
         work = np.where(theta_dot * cosine < 0.0, 1.0, -1.0)  # never 0: a bar at rest must be set going
         u = self.pump * missing * work
         if self.task.has_track:
@@ -97,7 +97,7 @@ class EnergyShapingLQR:
         return u
 
 
-class BalanceLQR(Law):
+class BalanceLQR(FeedbackController):
     """Keep a bar upright by a linear-quadratic regulator.
 
     The reward alone would have the control as hard as can be; what is added has the regulator ready for
@@ -139,7 +139,7 @@ def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16)
         depends on the start, and iLQR does not get from one to the other.
     """
     follow = EnergyShapingLQR(task)
-    steps = 2.0 * math.pi / math.sqrt(max(follow.weight, 1.0)) / task.dt
+    steps = 2.0 * math.pi / math.sqrt(max(follow.omega0_squared, 1.0)) / task.dt
     return ILQR(
         task,
         [Opening(side, max(round(opening * steps), 1), follow) for side in (-1.0, 1.0)],

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lag_envs.scenes import shapes as s
 from lag_envs.scenes.picture import Picture, turning
-from lag_envs.scenes.shapes import Moment, Point, Reading, Role, Shape, Window
+from lag_envs.scenes.shapes import Frame, Point, Reading, Role, Shape, Window
 from lag_envs.tasks.base import Task
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class Viewer:
             return None
         values = state.tolist()
         self._turn(values)
-        now = Moment(values, control, self._task.share(control), target, self._turned)
+        now = Frame(values, control, self._task.share(control), target, self._turned)
         picture = paint(self._task, now, self._picture)
         if self._human:
             _desk.show(self, picture)
@@ -149,7 +149,7 @@ class Viewer:
         self._before = (state, rate)
 
 
-def paint(task: Task, now: Moment, shown: Picture | None = None) -> pygame.Surface:
+def paint(task: Task, now: Frame, shown: Picture | None = None) -> pygame.Surface:
     """Return a picture with its read-out; `shown` is the task's `Picture`, where it was made before."""
     pygame, shown = _pygame(), shown or Picture(task)
     poses = shown.poses(now)
@@ -191,8 +191,8 @@ class Pen:
                     self._disc(centre, radius, STYLES[role])
                 case s.Arrow(points, role):
                     self._arrow(self._place(points), STYLES[role])
-                case s.Lens():
-                    self._magnify(shape, [x for x in shapes if not isinstance(x, s.Lens)])
+                case s.Magnifier():
+                    self._magnify(shape, [x for x in shapes if not isinstance(x, s.Magnifier)])
 
     def _place(self, points: Sequence[Point]) -> list[Point]:
         return _near([(self._left + self.scale * x, self._top - self.scale * y) for x, y in points])
@@ -262,7 +262,7 @@ class Pen:
         draw.polygon(self._surface, colour, points)
         draw.aalines(self._surface, colour, True, points)
 
-    def _magnify(self, lens: s.Lens, shapes: Sequence[Shape]) -> None:
+    def _magnify(self, lens: s.Magnifier, shapes: Sequence[Shape]) -> None:
         """Show a part of the picture in its upper right corner."""
         pygame = _pygame()
         size = FINE * 150

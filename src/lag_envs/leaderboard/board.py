@@ -437,7 +437,7 @@ def shown_episodes(result: Mapping[str, Any]) -> tuple[int, dict[str, int]]:
 def finish(
     board: Board,
     only: Sequence[str] | None = None,
-    spread: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
+    parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
     tell: Callable[[Entry, str], Any] = lambda entry, what: None,
 ) -> int:
     """Verify what is pending and has a nonce.
@@ -448,7 +448,7 @@ def finish(
         The board.
     only : sequence of str, optional
         The ids that may be verified; by default all.
-    spread : callable, optional
+    parallel_map : callable, optional
         Like `map_submissions`, with all but its first two arguments given; by default one after the other.
     tell : callable
         Told each entry and what became of it.
@@ -458,7 +458,7 @@ def finish(
     int
         How many could not be verified for a reason that is not their own; they stay pending.
     """
-    from lag_envs.leaderboard.spread import map_submissions
+    from lag_envs.leaderboard.parallel import map_submissions
     from lag_envs.leaderboard.submission import Refused
 
     failed = 0
@@ -485,7 +485,7 @@ def finish(
         work = Check({id: (entry.digest, nonce) for id, (entry, nonce) in ours.items()})
         folders = [board.submission(id) for id in ours]
         neighbours = Neighbours(board)
-        for folder, result in (spread or partial(map_submissions, jobs=1))(work, folders):
+        for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
             entry = ours[folder.name][0]
             if isinstance(result, Refused):
                 board.rejected(entry.id, str(result))
@@ -662,13 +662,13 @@ def _environment(
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
-    from lag_envs.scores import Known, known_returns
+    from lag_envs.scores import KnownReturns, known_returns
 
     found = known_returns(env_id)
     known = found and found._asdict()
     if scale is None:
         return known
-    return (known or dict.fromkeys(Known._fields)) | scale.model_dump()
+    return (known or dict.fromkeys(KnownReturns._fields)) | scale.model_dump()
 
 
 def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:

@@ -37,7 +37,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
             "--source", metavar="URL", default="", help="https address at which anybody finds the nonce"
         )
 
-    def spread_over(one: argparse.ArgumentParser) -> None:
+    def parallel_options(one: argparse.ArgumentParser) -> None:
         one.add_argument(
             "--jobs",
             metavar="N",
@@ -55,7 +55,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="a submission")
     one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after they are added")
     source(one)
-    spread_over(one)
+    parallel_options(one)
     one = action("nonce", "publish a nonce, and verify what was added before", _nonce)
     one.add_argument(
         "value",
@@ -65,7 +65,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         " of the last commit, which has to hold the board as it is)",
     )
     source(one)
-    spread_over(one)
+    parallel_options(one)
     one = action("list", "show the ranking, and the state of all others", _list)
     one.add_argument("env", metavar="ENV", nargs="?", help="only this environment")
     one = action("show", "show all about one submission", _show)
@@ -179,10 +179,10 @@ def _finish(board: Board, args: argparse.Namespace) -> int:
     def tell(entry: Entry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
 
-    def spread(check: Check, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
+    def parallel_map(check: Check, folders: Sequence[Path]) -> Iterator[tuple[Path, Any]]:
         from tqdm import tqdm
 
-        from lag_envs.leaderboard.spread import map_submissions
+        from lag_envs.leaderboard.parallel import map_submissions
 
         jobs = min(args.jobs, len(folders))
         if args.ray is not None or jobs > 1:
@@ -201,7 +201,7 @@ def _finish(board: Board, args: argparse.Namespace) -> int:
 
         yield from map_submissions(one, folders)
 
-    return finish(board, spread=spread, tell=tell)
+    return finish(board, parallel_map=parallel_map, tell=tell)
 
 
 # --- list, show, withdraw -----------------------------------------------------------------------------------

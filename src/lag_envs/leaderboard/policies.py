@@ -364,13 +364,13 @@ class _LookUp:
     """Acts by a table; its state is the number of steps taken."""
 
     def __init__(self, about: Table, axes: list[Array], values: Array) -> None:
-        from lag_envs.controllers.basic import Reader
+        from lag_envs.controllers.basic import ObservationDecoder
         from lag_envs.envs.model import Model
 
         self.about, self.axes = about, axes
         self.strides = np.array([math.prod(values.shape[j + 1 :]) for j in range(values.ndim)])
         self.values = np.ascontiguousarray(values).reshape(-1)
-        self.read = Reader(about.task)
+        self.read = ObservationDecoder(about.task)
         self.model = Model(about.task) if about.kind == "value" else None
         #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
         self.pace = 1.0

@@ -428,7 +428,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
     """Verify here, with a progress bar, or where it was asked for."""
-    from lag_envs.leaderboard.spread import map_submissions
+    from lag_envs.leaderboard.parallel import map_submissions
     from lag_envs.workers import SpreadError
 
     if args.jobs == 1 and args.ray is None:

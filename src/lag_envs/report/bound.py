@@ -19,7 +19,7 @@ from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.stepping import pendulum
-from lag_envs.stepping.pendulum import Drive
+from lag_envs.stepping.pendulum import Coefficients
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -55,7 +55,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 class Driven(Scene):
-    """The driven pendulum of `pendulum.Drive`, with its coefficients as parameters."""
+    """The driven pendulum of `pendulum.Coefficients`, with its coefficients as parameters."""
 
     alpha: float = parameter(0.0, "rad/s²")
     beta: float = parameter(0.0, "rad/s²")
@@ -83,14 +83,14 @@ class Driven(Scene):
         return {"theta": self.delta + v.turn}
 
 
-def driven(drive: Drive) -> tuple[Scene, list[float]]:
+def driven(drive: Coefficients) -> tuple[Scene, list[float]]:
     """Return the scene of a drive, and its control."""
     alpha, beta, gamma, delta, ramp = map(float, drive)
     return Driven(alpha=alpha, beta=beta, gamma=gamma, delta=delta), [ramp]
 
 
 def truncation(
-    theta: float, omega: float, drive: Drive, h: float, order: int, digits: int = DIGITS
+    theta: float, omega: float, drive: Coefficients, h: float, order: int, digits: int = DIGITS
 ) -> tuple[float, float]:
     """Return what one step of the series leaves out of θ [rad] and of θ' [rad/s]; infinite if it diverges.
 
@@ -108,16 +108,16 @@ def truncation(
         return sums[0], sums[1]
 
 
-def random_problem(rng: np.random.Generator) -> tuple[float, float, Drive]:
+def random_problem(rng: np.random.Generator) -> tuple[float, float, Coefficients]:
     """Return θ, θ' and a drive, from calm to violent, each term present four times out of five."""
     exponents = rng.uniform([-1, -1, -2, -1, -1], [3, 3, 2, 3, 4])
     sizes = 10.0**exponents * rng.uniform(-1, 1, 5) * (rng.random(5) < 0.8)
     sizes[2] = abs(sizes[2])
     omega = rng.uniform(-1, 1) * 10.0 ** rng.uniform(-1, 1.5)
-    return float(rng.uniform(-4, 4)), float(omega), Drive(*map(float, sizes))
+    return float(rng.uniform(-4, 4)), float(omega), Coefficients(*map(float, sizes))
 
 
-def step_at(omega: float, drive: Drive, x: float) -> float:
+def step_at(omega: float, drive: Coefficients, x: float) -> float:
     """Return the longest step [s] that the bound certifies with this x."""
     low, high = -40.0, 5.0
     for _ in range(60):
@@ -173,7 +173,13 @@ def cost(n: int, seed: int) -> Iterator[Row]:
 
 
 def _enough(
-    theta: float, omega: float, drive: Drive, dt: float, n: int, exact: Sequence[mpf], limits: Sequence[float]
+    theta: float,
+    omega: float,
+    drive: Coefficients,
+    dt: float,
+    n: int,
+    exact: Sequence[mpf],
+    limits: Sequence[float],
 ) -> bool:
     """Tell whether n substeps, in float64, are as accurate as asked for."""
     h = dt / n
@@ -199,7 +205,7 @@ def environment(id: str, n: int) -> Iterator[Row]:
 
     def left_out(theta: float, speed: float, u: float, digits: int = DIGITS) -> tuple[float, float]:
         y = stepped.lift(np.array(_state(task, theta, speed)))
-        drive = Drive(*map(float, stepped.drive(y, u, stepped.numbers(), np)))
+        drive = Coefficients(*map(float, stepped.drive(y, u, stepped.numbers(), np)))
         return truncation(theta, speed, drive, dt, stepped.flow.order, digits)
 
     for _ in range(n):

@@ -20,7 +20,7 @@ class Variant(NamedTuple):
     kind: type[Scene]
     parameters: dict[str, Any]
     dt: float  #: control step [s]
-    spread: Sequence[float]  #: states lie within, in the scene's units
+    state_range: Sequence[float]  #: states lie within, in the scene's units
     controls: tuple[float, float]
 
     def scene(self, **changes: Any) -> Scene:
@@ -84,7 +84,7 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
     cases = []
     for i in range(n):
         rng = np.random.default_rng([seed, i])
-        state = tuple(float(rng.uniform(-s, s)) for s in variant.spread)
+        state = tuple(float(rng.uniform(-s, s)) for s in variant.state_range)
         control = float(rng.uniform(*variant.controls))
         changes = {}
         for field in dataclasses.fields(base):  # type: ignore[arg-type]
@@ -110,7 +110,7 @@ def scales(case: Case, dt: float) -> list[float]:
     y, k = stepped.lift(np.asarray(state)), stepped.numbers()
     coefficients = stepped.drive(y, u, k, np)
     q, v = (float(x) for x in stepped.unpack(y, u, k)[:2])
-    if isinstance(coefficients, pendulum.Drive):
+    if isinstance(coefficients, pendulum.Coefficients):
         gain = math.sqrt(math.hypot(coefficients.alpha, coefficients.beta))
     else:
         gain = getattr(scene, "gravity", 0.0) * dt

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from lag_envs.report import reference
 from lag_envs.report.cases import VARIANTS
 from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.integrators import METHODS, comparison
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import METHODS, comparison
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function
@@ -121,7 +121,7 @@ def march(scene: Stepped) -> Callable:
 def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the lifted states after these numbers of steps; fewer rows where a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
-    largest = stepped.largest_x(problem.dt)
+    largest = stepped.largest_majorant(problem.dt)
     if method != OURS:
         stepped = Stepped(problem.scene, comparison(method, stepped.flow))
     out = np.empty((len(at) + 1, stepped.width))
@@ -187,7 +187,7 @@ def balance(variant: str, steps: int) -> Iterator[Row]:
     about = VARIANTS[variant]
     scene = about.scene()
     rng = np.random.default_rng(1)
-    state = np.array([0.5 * s for s in about.spread])
+    state = np.array([0.5 * s for s in about.state_range])
     total, absolute, largest, size, turnover = 0.0, 0.0, 0.0, 0.0, 0.0
     for control in rng.uniform(*about.controls, steps):
         found = scene.energy_balance(state, float(control), about.dt)
@@ -231,7 +231,7 @@ def worst(values: Sequence[float | None]) -> float | None:
 TEXT = (
     "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is taken from the cosine and"
     " sine that are stepped; its drift is relative to kinetic plus potential energy at the start, or to the"
-    " kinetic energy where that has grown beyond. The comparison steppers take one step per control step.",
+    " kinetic energy where that has grown beyond. The comparison integrators take one step per control step.",
     "The growth of our error is held against the closed form, Jacobi's elliptic functions or a parabola, in"
     " 30 digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53"
     " of its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n"

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.report.cases import Case
+from lag_envs.report.integrators import METHODS, comparison, explicit, rate
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import METHODS, comparison, explicit, rate
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import SLIDE, TURN, pendulum_flow
 
@@ -85,12 +85,12 @@ class NormalForm(Equation):
     @property
     def lifted(self) -> int:  # type: ignore[override]
         """Number of the flow's variables."""
-        return 2 if self.kind is slope.Pull else 4
+        return 2 if self.kind is slope.FixedSlope else 4
 
     @property
     def parameters(self) -> int:  # type: ignore[override]
         """Number of coefficients that are there, and the angle."""
-        return sum(self.present) + (self.kind is slope.Turn)
+        return sum(self.present) + (self.kind is slope.TurningSlope)
 
     def coefficients(self, p: Sequence) -> Any:
         """Return the flow's coefficients; those that are not there are a literal 0.0."""
@@ -107,14 +107,14 @@ class NormalForm(Equation):
 
         def move(y: Sequence, p: Sequence, t: Any, h: Any, xp: Any) -> Sequence:
             k = self.coefficients(p)
-            if self.kind is pendulum.Drive:
+            if self.kind is pendulum.Coefficients:
                 k = k._replace(delta=k.delta + k.ramp * t)
             return step(y, k, h, xp)
 
         return move
 
 
-FLOWS = {pendulum.Drive: pendulum_flow(), slope.Pull: SLIDE, slope.Turn: TURN}
+FLOWS = {pendulum.Coefficients: pendulum_flow(), slope.FixedSlope: SLIDE, slope.TurningSlope: TURN}
 
 
 class Problems:
@@ -142,7 +142,7 @@ class Problems:
         #: What is solved.
         self.equation: Equation = NormalForm(flow.coefficients, present)
         rows = [row for row, there in zip(coefficients, present, strict=True) if there]
-        if flow.coefficients is slope.Turn:
+        if flow.coefficients is slope.TurningSlope:
             assert scene.angle is not None
             rows.append(states[:, scene.angle])
         #: Parameters, shape (parameters, problems).

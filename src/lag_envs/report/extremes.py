@@ -183,7 +183,7 @@ def substeps(case: Case, dt: float) -> int:
     stepped = Stepped(scene, dt=dt)
     y = map(float, stepped.lift(np.asarray(state, dtype=np.float64)))
     advance = stepped.stepper().compile()
-    *_, status = advance(*y, control, dt, stepped.largest_x(dt), *stepped.present())
+    *_, status = advance(*y, control, dt, stepped.largest_majorant(dt), *stepped.present())
     return int(status)
 
 

@@ -12,9 +12,9 @@ from lag_envs import TASKS
 from lag_envs.envs.program import Program, constants_of
 from lag_envs.report.cases import Case
 from lag_envs.report.content import Claim, Content, Picture, Table
+from lag_envs.report.integrators import plain_series
 from lag_envs.report.runner import Job, Result, Row
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import plain_series
 from lag_envs.report.timing import Kernels, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
@@ -129,9 +129,13 @@ def carried(task: Task) -> Row:
 def stages(flow: Flow) -> str:
     """Say how a step is taken."""
     kind = flow.coefficients
-    if kind is pendulum.Drive:
+    if kind is pendulum.Coefficients:
         return f"one Taylor series of order {flow.order}, no trigonometry"
-    return "closed form" if kind is slope.Pull else f"series of order {slope.TURN_ORDER}, summed to rounding"
+    return (
+        "closed form"
+        if kind is slope.FixedSlope
+        else f"series of order {slope.TURN_ORDER}, summed to rounding"
+    )
 
 
 def made(line: str) -> list[str]:

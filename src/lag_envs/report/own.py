@@ -218,7 +218,7 @@ def exact(s: Subject, quick: bool) -> tuple[Array, Array, tuple[Array, Array]]:
 
 
 def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield errors and times of ours and the usual steppers."""
+    """Yield errors and times of ours and the usual integrators."""
     s = subject(file, name)
     starts, controls, truth = exact(s, quick)
     if not len(starts):

@@ -19,7 +19,7 @@ import numpy as np
 
 from lag_envs.report.cases import Case
 from lag_envs.report.equations import Array, Equation, Problems
-from lag_envs.report.steppers import METHODS, Arithmetic
+from lag_envs.report.integrators import METHODS, Arithmetic
 from lag_envs.report.timing import BLOCK, Kernels, Sample, at_once, one_by_one
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping.compiling import compile_function, record_block
@@ -147,7 +147,7 @@ class Ours(Rival):
 
 
 class Compiled(Rival):
-    """A stepper of `METHODS`, compiled as ours is: the same recorder, compiler and vector width.
+    """An integrator of `METHODS`, compiled as ours is: the same recorder, compiler and vector width.
 
     Coefficients come ready, so that nothing but the method is timed. Alone: one compiled loop over steps and
     trajectories. In a batch: one compiled loop over blocks of states.

@@ -11,6 +11,7 @@ import numpy as np
 from lag_envs.report import extremes, reference
 from lag_envs.report.cases import Case, scales
 from lag_envs.report.extremes import EXACT
+from lag_envs.report.integrators import comparison
 from lag_envs.report.runner import Job, Row, describe
 from lag_envs.report.stability_maps import MAPS
 from lag_envs.report.stability_results import (
@@ -25,7 +26,6 @@ from lag_envs.report.stability_results import (
     content,
 )
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import comparison
 from lag_envs.scenes.checks import StepRefused
 
 __all__ = ["cases", "cells", "content", "jobs", "judge", "march", "methods"]
@@ -91,7 +91,7 @@ def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
 
 
 def cases(names: Sequence[str]) -> Iterator[Row]:
-    """Yield what comes of the named stiff and extreme cases, beside the comparison steppers."""
+    """Yield what comes of the named stiff and extreme cases, beside the comparison integrators."""
     for name in names:
         row: Row = {"kind": "case", "name": name, "peers": {}}
         try:

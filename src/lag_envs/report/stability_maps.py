@@ -41,7 +41,7 @@ def _drag(scene: Scene) -> float:
     """Return the rate at which drag alone would slow the motion down, without control [1/s]."""
     stepped = Stepped(scene)
     found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
-    return float(found.gamma if isinstance(found, pendulum.Drive) else found.drag)
+    return float(found.gamma if isinstance(found, pendulum.Coefficients) else found.damping_rate)
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:

@@ -44,11 +44,11 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         "Stiff and extreme cases",
         [
             "Each cell of a map is one control step from one start with the control held, once with our step "
-            "and once with each comparison stepper, which takes the step at once (or in 16 parts, where that "
-            "is said). The error is the largest of the state's entries, each relative to its scale: max(1, "
-            "|q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means a "
-            f"result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has 30 "
-            "digits; where it cannot vouch for itself, the cell says so.",
+            "and once with each comparison integrator, which takes the step at once (or in 16 parts, where "
+            "that is said). The error is the largest of the state's entries, each relative to its scale: "
+            "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means "
+            f"a result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has "
+            "30 digits; where it cannot vouch for itself, the cell says so.",
             "Maps in float32 run the same formulas on float32 numbers. Ours then takes the substeps that the "
             f"bound asks for, up to {MOST_SUBSTEPS:,}; the jump along the slow manifold, which spares most "
             "of them where damping is heavy, exists in float64 only.",

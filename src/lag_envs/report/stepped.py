@@ -27,7 +27,7 @@ class Stepped:
 
     Examples
     --------
-    >>> from lag_envs.report.steppers import comparison
+    >>> from lag_envs.report.integrators import comparison
     >>> from lag_envs.scenes import PivotedBar
     >>> bar = PivotedBar(track=None)
     >>> rk4 = Stepped(bar, comparison("RK4", Stepped(bar).flow))
@@ -67,9 +67,9 @@ class Stepped:
         """Return the lifted state at the end."""
         return self.form.pack(moved, y, [u], dt, k)
 
-    def largest_x(self, dt: float) -> float:
+    def largest_majorant(self, dt: float) -> float:
         """Return the bound's x up to which one series is certified."""
-        return pendulum.largest_x(dt, self.flow.order or pendulum.ORDER, self.flow.tolerance)
+        return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER, self.flow.tolerance)
 
     def stepper(self) -> Stepper:
         """Return the code of a step; constants that are zero leave none."""
@@ -85,5 +85,7 @@ class Stepped:
         given = np.asarray(controls, np.float64)
         trajectory = np.full((len(given) + 1, self.width - (2 if self.angle is not None else 0)), np.nan)
         trajectory[0] = state
-        self.stepper().compile_simulate()(trajectory, given[:, None], dt, self.largest_x(dt), *self.present())
+        self.stepper().compile_simulate()(
+            trajectory, given[:, None], dt, self.largest_majorant(dt), *self.present()
+        )
         return trajectory

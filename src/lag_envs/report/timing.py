@@ -33,7 +33,7 @@ class Kernels:
     scene : Scene
         Which of its constants are zero decides the code; problems on the same kind of scene share it.
     flow : Flow, optional
-        Ours for steps of `dt`, or a comparison stepper.
+        Ours for steps of `dt`, or a comparison integrator.
     dt : float
         Control step [s].
 
@@ -52,7 +52,7 @@ class Kernels:
         self.stepped = Stepped(scene, flow, dt)
         self._code = self.stepped.stepper()
         self._names = [name.removeprefix("k_") for name in self._code.constants]
-        #: Whether every step is an ordinary one, as those of the comparison steppers.
+        #: Whether every step is an ordinary one, as those of the comparison integrators.
         self.plain = any(line == "within = True" for line in self._code.fast)
 
     def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
@@ -61,7 +61,7 @@ class Kernels:
         present = [name for name, value in constants.items() if value != 0.0]
         if present != self._names:
             raise ValueError(f"compiled for the constants {self._names}, got {present}")
-        return (dt, self.stepped.largest_x(dt), *(float(constants[name]) for name in present))
+        return (dt, self.stepped.largest_majorant(dt), *(float(constants[name]) for name in present))
 
     @cached_property
     def simulate(self) -> Callable:

@@ -197,7 +197,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "that "
         "`simulate` divides ('lag_envs, one call'). The test whether a step is certified is part of it.",
         "Everybody is given the scene's own equation and the fastest form there is, and the errors are those "
-        "of the calls that are timed. The usual steppers are compiled by the same compiler at the same "
+        "of the calls that are timed. The usual integrators are compiled by the same compiler at the same "
         "vector width as ours, with coefficients that come ready; 'carried' ones have cosine and sine as "
         "unknowns, or turn them by short polynomials, and call no function. Where a control is held for "
         "long they also take one step for several control steps. heyoka runs with fast_math; single steps "

@@ -1,4 +1,4 @@
-"""Error against time: the stepping that is shipped, the usual steppers, other libraries.
+"""Error against time: the stepping that is shipped, the usual integrators, other libraries.
 
 Every rival runs in the fastest form that it has (`rivals`, `peers`), alone and in a batch, and the errors are
 those of the calls that are timed. What is measured here is compared and told in `verdicts` and drawn in
@@ -20,10 +20,10 @@ import numpy as np
 from lag_envs.report import peers, reference
 from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
+from lag_envs.report.integrators import METHODS, comparison, plain_series
 from lag_envs.report.rivals import Compiled, Ours, Rival
 from lag_envs.report.runner import Job, Row, describe
 from lag_envs.report.stepped import Stepped
-from lag_envs.report.steppers import METHODS, comparison, plain_series
 from lag_envs.report.timing import Kernels, Sample, interleaved
 from lag_envs.report.verdicts import MODES, ROUNDING, content
 from lag_envs.scenes.base import Scene
@@ -42,7 +42,7 @@ class Horizon(NamedTuple):
 
     seconds: float | None  #: None: one control step
     members: int  #: problems
-    substeps: Sequence[float]  #: of the steppers that we compile, per control step
+    substeps: Sequence[float]  #: of the integrators that we compile, per control step
     batch: int  #: states of a batch
 
     def steps(self, dt: float) -> int:
@@ -78,7 +78,7 @@ def control_step(variant: str) -> float:
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Return the jobs: references, then points of ours and of the usual steppers, then of libraries."""
+    """Return the jobs: references, then points of ours and of the usual integrators, then of libraries."""
     names = QUICK_VARIANTS if quick else tuple(VARIANTS)
     horizons = QUICK if quick else HORIZONS
     made = [
@@ -124,7 +124,7 @@ def problems(variant: str, horizon: str, cases: Sequence[Case]) -> list[Case]:
 
 
 def _undamped(scene: Scene) -> Scene:
-    if Stepped(scene).flow.coefficients is not pendulum.Drive:
+    if Stepped(scene).flow.coefficients is not pendulum.Coefficients:
         return scene
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
 
@@ -353,9 +353,9 @@ class Series(NamedTuple):
 
 
 def series(scene: Scene, quick: bool = False) -> list[Series]:
-    """Return all methods that have an order: the series of ours at several, and the usual steppers."""
+    """Return all methods that have an order: the series of ours at several, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
-    if flow.coefficients is pendulum.Drive:
+    if flow.coefficients is pendulum.Coefficients:
         found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
     forms = {"": False, Compiled.CARRIED: True}
     found += [

@@ -421,7 +421,7 @@ class Scene(metaclass=SceneType):
 
     def _limit(self, dt: float) -> float:
         """Return what a step takes besides dt: the largest x of one series, or the order of the series."""
-        return self._form.largest_x(dt) if self._form else float(self._order(dt))
+        return self._form.largest_majorant(dt) if self._form else float(self._order(dt))
 
     def _code(self, dt: float) -> Any:
         """Return the code of a control step."""

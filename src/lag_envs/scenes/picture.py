@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics.algebra import Expr, FormulaError
 from lag_envs.mechanics.evaluation import Numeric
 from lag_envs.mechanics.recording import Values, formula
-from lag_envs.scenes.shapes import Moment, Pose, Shape, Window, extent, placed
+from lag_envs.scenes.shapes import Frame, Pose, Shape, Window, extent, placed
 
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
@@ -81,7 +81,7 @@ class Picture:
         self._of, self._scene = of, getattr(of, "scene", of)
         self._targets = [t.name for t in of.formulas.target_boxes] if of is not self._scene else []
         bodies, window = of.bodies(), of.window()
-        found = self._poses(Moment([0.0] * len(self._scene.state_names)))
+        found = self._poses(Frame([0.0] * len(self._scene.state_names)))
         self.frames = list(found)
         for frame in [*bodies, *filter(None, [window.frame])]:
             if frame not in found:
@@ -90,7 +90,7 @@ class Picture:
         self.shapes = [(self.frames.index(frame), shape) for frame in bodies for shape in bodies[frame]]
         self.view = window
 
-    def poses(self, now: Moment) -> list[Pose]:
+    def poses(self, now: Frame) -> list[Pose]:
         """Return where the frames are."""
         return [Pose(*map(float, pose)) for pose in self._poses(now).values()]
 
@@ -117,7 +117,7 @@ class Picture:
         for rate in turning(self._scene, columns):
             rates = np.broadcast_to(rate, n)
             turned.append(np.concatenate([[0.0], np.cumsum(0.5 * dt * (rates[1:] + rates[:-1]))]))
-        now = Moment(columns, list(held.T), self._of.share(list(held.T)), target, turned)
+        now = Frame(columns, list(held.T), self._of.share(list(held.T)), target, turned)
         found = self._poses(now).values()
         return np.stack([np.stack([np.broadcast_to(x, n) for x in pose], -1) for pose in found], 1)
 
@@ -128,13 +128,13 @@ class Picture:
         frame = poses[self.frames.index(self.view.frame)]
         return self.view.moved(frame[0], frame[1])
 
-    def placed(self, now: Moment) -> list[Shape]:
+    def placed(self, now: Frame) -> list[Shape]:
         """Return what is to be seen at a moment, from back to front."""
         poses = self.poses(now)
         view = self.window(poses)
         return [part for frame, shape in self.shapes for part in placed(shape, poses[frame], view)]
 
-    def _poses(self, now: Moment) -> dict[str, tuple]:
+    def _poses(self, now: Frame) -> dict[str, tuple]:
         scene = self._scene
         q = _places(scene, now)
         found = {GROUND: (0.0, 0.0)} | dict(scene.poses(Values("coordinate", q), Numeric))
@@ -183,7 +183,7 @@ def indicated(of: Any, now: Now) -> dict[str, tuple]:
 
 def at_rest(scene: Scene) -> Now:
     """Return a moment at which all numbers are zero."""
-    zero = Moment([0.0] * len(scene.state_names))
+    zero = Frame([0.0] * len(scene.state_names))
     return Now(
         Values("coordinate", _places(scene, zero)),
         Values("entry of the state", dict.fromkeys(scene.state_names, 0.0)),
@@ -205,7 +205,7 @@ def _filled(names: Sequence[str], given: Any) -> dict[str, Any]:
     return dict.fromkeys(names, 0.0) | dict(zip(names, values, strict=False))
 
 
-def _places(scene: Scene, now: Moment) -> dict[str, Any]:
+def _places(scene: Scene, now: Frame) -> dict[str, Any]:
     """Return the places of all coordinates."""
     layout = scene._layout
     controls = _filled(layout.controls, now.control)

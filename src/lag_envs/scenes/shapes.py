@@ -56,14 +56,14 @@ class Ruler(NamedTuple):
     role: Role = "ground"
 
 
-class Lens(NamedTuple):
+class Magnifier(NamedTuple):
     """A round part of the picture [m] that is shown once more, magnified."""
 
     centre: Point
     radius: float
 
 
-Shape = Line | Polygon | Circle | Arrow | Ruler | Lens
+Shape = Line | Polygon | Circle | Arrow | Ruler | Magnifier
 
 #: Shapes by frame, from back to front.
 Bodies = dict[str, Sequence[Shape]]
@@ -103,7 +103,7 @@ class Window(NamedTuple):
         return Window(self.left + x, self.bottom + y, self.right + x, self.top + y)
 
 
-class Moment(NamedTuple):
+class Frame(NamedTuple):
     """What a picture shows; with arrays in place of numbers it is many moments.
 
     Attributes
@@ -157,7 +157,7 @@ def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
         return x + c * a - s * b, y + s * a + c * b
 
     match shape:
-        case Circle() | Lens():
+        case Circle() | Magnifier():
             return [shape._replace(centre=move(shape.centre))]
         case Polygon():
             return [shape._replace(points=[move(point) for point in shape.points])]
@@ -189,7 +189,7 @@ def extent(shapes: Sequence[Shape]) -> float:
     """Return the largest distance of shapes from the origin of their frame [m]."""
     sizes = [0.0]
     for shape in shapes:
-        if isinstance(shape, Circle | Lens):
+        if isinstance(shape, Circle | Magnifier):
             sizes.append(math.hypot(*shape.centre) + shape.radius)
         elif not isinstance(shape, Ruler):
             sizes += [math.hypot(*point) for point in shape.points]

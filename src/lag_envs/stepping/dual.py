@@ -33,14 +33,14 @@ class Dual:
         The values.
     wide : Target
         The derivatives, vectors with an entry per column.
-    spread : callable
+    broadcast : callable
         Makes of a value the vector whose entries are all this value.
     tangents : mapping
         For each input that has a derivative the vector that is 1 in its column.
     """
 
-    def __init__(self, target: Any, wide: Any, spread: Callable, tangents: Mapping[str, Any]) -> None:
-        self._t, self._wide, self._spread, self._tangents = target, wide, spread, tangents
+    def __init__(self, target: Any, wide: Any, broadcast: Callable, tangents: Mapping[str, Any]) -> None:
+        self._t, self._wide, self._broadcast, self._tangents = target, wide, broadcast, tangents
 
     def number(self, value: float) -> Number:
         return Number(self._t.number(value))
@@ -62,7 +62,7 @@ class Dual:
         """Return slopes times a value, plus a total; either may be zero."""
         if slopes is None:
             return total
-        w, every = self._wide, self._spread(factor)
+        w, every = self._wide, self._broadcast(factor)
         return w.mul(slopes, every) if total is None else w.fma(slopes, every, total)
 
     def mul(self, a: Number, b: Number) -> Number:
@@ -77,7 +77,7 @@ class Dual:
         value = self._t.div(a.value, b.value)
         slopes = self._times(b.slopes, self._t.neg(value), a.slopes)
         if slopes is not None:
-            slopes = self._wide.div(slopes, self._spread(b.value))
+            slopes = self._wide.div(slopes, self._broadcast(b.value))
         return Number(value, slopes)
 
     def sqrt(self, a: Number) -> Number:

@@ -36,7 +36,7 @@ class Flow(NamedTuple):
     """
 
     size: int
-    coefficients: type[pendulum.Drive | slope.Pull | slope.Turn]
+    coefficients: type[pendulum.Coefficients | slope.FixedSlope | slope.TurningSlope]
     order: int
     fast: Callable
     within: Callable
@@ -49,13 +49,13 @@ class Flow(NamedTuple):
 def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLERANCE) -> Flow:
     """Return the flow of (θ, θ', cosθ, sinθ) by Taylor series of the given order."""
 
-    def fast(variables: Sequence, drive: pendulum.Drive, dt: Any, xp: Any) -> tuple:
+    def fast(variables: Sequence, drive: pendulum.Coefficients, dt: Any, xp: Any) -> tuple:
         theta, omega, c, s = variables
         return pendulum.step(theta, omega, c, s, drive, dt, order)
 
     return Flow(
         4,
-        pendulum.Drive,
+        pendulum.Coefficients,
         order,
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
@@ -65,14 +65,14 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
     )
 
 
-def _turn(variables: Sequence, turn: slope.Turn, dt: Any, xp: Any) -> tuple:
+def _turn(variables: Sequence, turn: slope.TurningSlope, dt: Any, xp: Any) -> tuple:
     x, v, c, s = variables
     return *slope.turn_series(x, v, c, s, turn, dt), *slope.rotate(c, s, turn.rate * dt)
 
 
 SLIDE = Flow(
     2,
-    slope.Pull,
+    slope.FixedSlope,
     0,
     lambda variables, pull, dt, xp: slope.slide(variables[0], variables[1], pull, dt),
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
@@ -81,7 +81,7 @@ SLIDE = Flow(
 )
 TURN = Flow(
     4,
-    slope.Turn,
+    slope.TurningSlope,
     0,
     _turn,
     lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp),

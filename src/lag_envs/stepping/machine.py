@@ -117,7 +117,7 @@ class Machine:
         return self._b.not_(condition)
 
     def real(self, k: Any) -> ir.Value:
-        return self.spread(self._b.sitofp(k, _DOUBLE))
+        return self.broadcast(self._b.sitofp(k, _DOUBLE))
 
     def reciprocal(self, k: Any) -> ir.Value:
         table = self._b.module.globals.get("reciprocals")
@@ -127,9 +127,9 @@ class Machine:
             table = ir.GlobalVariable(self._b.module, kind, "reciprocals")
             table.linkage, table.global_constant = "internal", True
             table.initializer = ir.Constant(kind, values)
-        return self.spread(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
+        return self.broadcast(self._b.load(self._b.gep(table, [ir.Constant(_INT, 0), k])))
 
-    def spread(self, value: Any) -> ir.Value:
+    def broadcast(self, value: Any) -> ir.Value:
         return value if self._lanes == 1 else primitives.splat(self._b, value, self._lanes)
 
     def index(self, k: int) -> ir.Value:
@@ -393,7 +393,7 @@ def _write_tangent(
         return numbers[0] if width == 1 else ir.Constant(wide.kind, numbers)
 
     tangents = {source: unit(i) for i, source in enumerate(columns) if source in layout.inputs}
-    t: Any = Dual(plain, wide, wide.spread, tangents)
+    t: Any = Dual(plain, wide, wide.broadcast, tangents)
 
     def at(row: int) -> ir.Value:
         return builder.gep(rows, [ir.Constant(_INT, row)])

@@ -3,8 +3,8 @@
 With one free coordinate of constant inertia there are three of them (`lag_envs.stepping.flows`)::
 
     driven pendulum   q'' = -alpha sin(q) - beta cos(q) - gamma q' + delta + ramp t
-    fixed slope       x'' = pull - drag x'
-    turning slope     x'' = weight sin(phi) + carry phi'² x - drag x',  phi' held
+    fixed slope       x'' = acceleration - damping_rate x'
+    turning slope     x'' = gravity sin(phi) + centrifugal phi'² x - damping_rate x',  phi' held
 
 Each coefficient is a sum of constants, which the parameters make, times what is held during the step. Any
 other equation is stepped by the general series (`lag_envs.stepping.general`).
@@ -52,7 +52,7 @@ class NormalForm:
     layout : Layout
         Names of coordinates, controls and state.
     kind : type
-        `pendulum.Drive`, `slope.Pull` or `slope.Turn`.
+        `pendulum.Coefficients`, `slope.FixedSlope` or `slope.TurningSlope`.
     terms : mapping
         For each coefficient of the kind its terms.
     expressions : mapping
@@ -75,9 +75,9 @@ class NormalForm:
     @property
     def angle(self) -> int | None:
         """Index of the state whose cosine and sine travel along, or None."""
-        if self.kind is slope.Pull:
+        if self.kind is slope.FixedSlope:
             return None
-        moving = self.layout.free[0] if self.kind is pendulum.Drive else self.layout.at("rate")[0].name
+        moving = self.layout.free[0] if self.kind is pendulum.Coefficients else self.layout.at("rate")[0].name
         return self._index(moving, "place")
 
     @property
@@ -96,7 +96,7 @@ class NormalForm:
         With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
         strong, call for order 20: with it one of 0.05 s is certified up to 9.5 rad/s, where 16 takes two.
         """
-        if self.kind is not pendulum.Drive:
+        if self.kind is not pendulum.Coefficients:
             return 0
         brakes = any(term.held.number is None for term in self.terms["gamma"])
         return 20 if brakes or dt > 0.03 else 14
@@ -132,7 +132,7 @@ class NormalForm:
                 held = evaluate([term.held], values, xp)[0]
                 total = total + (constant if term.held.number == 1.0 else constant * held)
             found[name] = total
-        if self.kind is slope.Turn:
+        if self.kind is slope.TurningSlope:
             found["rate"] = self._rate(u)
         return self.kind(**found)
 
@@ -144,7 +144,7 @@ class NormalForm:
         """Return the flow's variables: place and velocity, and cosine and sine of the angle."""
         free = self.layout.free[0]
         q, v = y[self._index(free, "place")], y[self._index(free, "velocity", "momentum")]
-        if self.kind is slope.Turn:
+        if self.kind is slope.TurningSlope:
             v = v - k.shift * self._rate(u)
         return [q, v, *y[len(self.layout.state) :]]
 
@@ -185,7 +185,7 @@ class NormalForm:
         found = np.empty((*states.shape, states.shape[1] + controls.shape[1]))
         numbers = (constants[name.removeprefix("k_")] for name in stepper.constants)
         jacobian = stepper.compile_jacobian(by)
-        refused = jacobian(states, controls, found, dt, self.largest_x(dt), *numbers)
+        refused = jacobian(states, controls, found, dt, self.largest_majorant(dt), *numbers)
         if not refused and not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
         return found, refused
@@ -196,9 +196,9 @@ class NormalForm:
         """Return the flow's coefficients as numbers, or arrays for states of shape (..., n_state)."""
         return self.drive(self.lift(state), controls, SimpleNamespace(**constants), np)
 
-    def largest_x(self, dt: float) -> float:
+    def largest_majorant(self, dt: float) -> float:
         """Return the bound's x up to which one series is certified; closed forms do without."""
-        return pendulum.largest_x(dt, self.order(dt) or pendulum.ORDER)
+        return pendulum.largest_majorant(dt, self.order(dt) or pendulum.ORDER)
 
     def certified_speed(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
@@ -209,9 +209,9 @@ class NormalForm:
         is below 0 where drive, drag or field are too strong for one series at any speed, and None for a form
         that is stepped to rounding.
         """
-        if self.kind is not pendulum.Drive:
+        if self.kind is not pendulum.Coefficients:
             return None
-        drive = pendulum.Drive(*map(float, self.coefficients(state, controls, constants)))
+        drive = pendulum.Coefficients(*map(float, self.coefficients(state, controls, constants)))
         return pendulum.certified_speed(drive, dt, self.order(dt))
 
     def step_bound(
@@ -219,9 +219,9 @@ class NormalForm:
     ) -> StepBound:
         """Return what is known of a step before it is taken; see `Scene.step_bound`."""
         bounds = dict.fromkeys(self.state_names, 0.0)
-        if self.kind is not pendulum.Drive:
+        if self.kind is not pendulum.Coefficients:
             return StepBound(1, 0, bounds, "stepped to rounding")
-        drive = pendulum.Drive(*map(float, self.coefficients(state, controls, constants)))
+        drive = pendulum.Coefficients(*map(float, self.coefficients(state, controls, constants)))
         free = self.layout.free[0]
         moving = [self._index(free, kind) for kind in ("place", "velocity")]
         found = pendulum.truncation_bound(float(np.asarray(state)[moving[1]]), drive, dt, self.order(dt))
@@ -236,7 +236,7 @@ class NormalForm:
 
 @cache
 def _stepper(form: NormalForm, order: int, absent: frozenset[str]) -> Stepper:
-    flow = {slope.Pull: SLIDE, slope.Turn: TURN}.get(form.kind) or pendulum_flow(order)
+    flow = {slope.FixedSlope: SLIDE, slope.TurningSlope: TURN}.get(form.kind) or pendulum_flow(order)
     return Stepper(form, flow, absent)
 
 
@@ -276,15 +276,15 @@ def _recognised(m: Mechanics) -> NormalForm | None:
     }
     of |= {velocity(p.name): p.name for p in m.layout.at("acceleration")}
     if rates:
-        of |= {Atom("function", "sin", Expr.of(place(rates[0].name))): "weight", q: "carry"}
+        of |= {Atom("function", "sin", Expr.of(place(rates[0].name))): "gravity", q: "centrifugal"}
     parts = _split(m.force[0], of)
     if parts is None:
         return None
     if rates:
         return _turning(m, parts)
     if parts.keys() <= {"", "gamma"}:
-        terms = {"pull": parts.get("", {}), "drag": _negative(parts.get("gamma", {}))}
-        return _form(m, slope.Pull, terms)
+        terms = {"acceleration": parts.get("", {}), "damping_rate": _negative(parts.get("gamma", {}))}
+        return _form(m, slope.FixedSlope, terms)
     if not parts.keys() & {"alpha", "beta"}:
         return None
     delta, ramp = dict(parts.get("", {})), {}
@@ -295,7 +295,7 @@ def _recognised(m: Mechanics) -> NormalForm | None:
             delta[Expr.of(velocity(p.name)).text] = Expr.of(velocity(p.name)), constant[1]
             ramp[Expr.of(control(p.control or "")).text] = Expr.of(control(p.control or "")), constant[1]
     terms = {name: _negative(parts.get(name, {})) for name in ("alpha", "beta", "gamma")}
-    return _form(m, pendulum.Drive, terms | {"delta": delta, "ramp": ramp})
+    return _form(m, pendulum.Coefficients, terms | {"delta": delta, "ramp": ramp})
 
 
 #: What is held, by its text, with the constant that multiplies it.
@@ -343,7 +343,7 @@ def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
     """Return the turning slope's form, where the rate of one coordinate is held."""
     (rate, *others), one = m.layout.at("rate"), Expr.of(1).text
     held = Expr.of(control(rate.control or ""))
-    wanted = {"weight": one, "carry": (held * held).text, "gamma": one}
+    wanted = {"gravity": one, "centrifugal": (held * held).text, "gamma": one}
     if (
         others
         or not all(list(part) == [wanted.get(name)] for name, part in parts.items())
@@ -352,11 +352,11 @@ def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
     ):
         return None
     terms = {
-        "carry": _unheld(parts.get("carry", {})),
-        "weight": parts.get("weight", {}),
-        "drag": _negative(parts.get("gamma", {})),
+        "centrifugal": _unheld(parts.get("centrifugal", {})),
+        "gravity": parts.get("gravity", {}),
+        "damping_rate": _negative(parts.get("gamma", {})),
     }
-    return _form(m, slope.Turn, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
+    return _form(m, slope.TurningSlope, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
 
 
 def _form(

@@ -47,7 +47,7 @@ _SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(8)]
 _COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(9)]
 
 
-class Drive(NamedTuple):
+class Coefficients(NamedTuple):
     """Coefficients of the normal form while a control is held; a literal 0.0 drops the term."""
 
     alpha: Any  # [1/s²]
@@ -57,30 +57,32 @@ class Drive(NamedTuple):
     ramp: Any = 0.0  # [rad/s³]
 
 
-def acceleration(theta_dot: Any, c: Any, s: Any, drive: Drive) -> Any:
+def acceleration(theta_dot: Any, c: Any, s: Any, coeffs: Coefficients) -> Any:
     """Return theta'' at the start of the step, where t = 0."""
-    return drive.delta - drive.alpha * s - drive.beta * c - drive.gamma * theta_dot
+    return coeffs.delta - coeffs.alpha * s - coeffs.beta * c - coeffs.gamma * theta_dot
 
 
-def scaled(drive: Drive, h: Any) -> Drive:
+def scaled(coeffs: Coefficients, h: Any) -> Coefficients:
     """Return the coefficients with time measured in steps: A, B, Γ, D, R."""
     hh = h * h
-    return Drive(drive.alpha * hh, drive.beta * hh, drive.gamma * h, drive.delta * hh, drive.ramp * (hh * h))
+    return Coefficients(
+        coeffs.alpha * hh, coeffs.beta * hh, coeffs.gamma * h, coeffs.delta * hh, coeffs.ramp * (hh * h)
+    )
 
 
-def taylor_coefficients(w: Any, c: Any, s: Any, drive: Drive, order: int) -> tuple[list, list]:
+def taylor_coefficients(w: Any, c: Any, s: Any, coeffs: Coefficients, order: int) -> tuple[list, list]:
     """Return the Taylor coefficients W_0 ... W_order of hθ', and H_0 ... of (hθ')²/2 up to order - 1.
 
     Parameters
     ----------
     w, c, s : number
         hθ', cosθ and sinθ at the start.
-    drive : Drive
+    coeffs : Coefficients
         Scaled coefficients.
     order : int
         The highest coefficient of W.
     """
-    a, b, gamma, d, r = drive
+    a, b, gamma, d, r = coeffs
     W, Q, H = [w], [a * c - b * s], [0.5 * (w * w)]
     W.append(d - (a * s + b * c) - gamma * w)
     for k in range(1, order):
@@ -109,15 +111,15 @@ def rotate(c: Any, s: Any, angle: Any, polynomial: Callable = polynomial) -> tup
     return c + (c * less - s * sine), s + (s * less + c * sine)
 
 
-def step_change(omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
+def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order: int = ORDER) -> tuple:
     """Return by how much θ and hθ' change in one step of the series, and (cosθ, sinθ) after it."""
-    W, _ = taylor_coefficients(omega * h, c, s, scaled(drive, h), order)
+    W, _ = taylor_coefficients(omega * h, c, s, scaled(coeffs, h), order)
     change = pairwise_sum(W[1:])
     angle = pairwise_sum([w * (1.0 / (k + 1)) for k, w in enumerate(W)])
     return angle, change, *rotate(c, s, angle)
 
 
-def substep(w: Twofold, c: Twofold, s: Twofold, drive: Drive, order: int = ORDER) -> tuple:
+def substep(w: Twofold, c: Twofold, s: Twofold, coeffs: Coefficients, order: int = ORDER) -> tuple:
     """Return hθ', cosθ and sinθ after one of many steps, and by how much θ changes, with twice the digits.
 
     Errors of many steps add up, at best like a random walk. They change a pendulum's energy, so its rate, and
@@ -127,27 +129,27 @@ def substep(w: Twofold, c: Twofold, s: Twofold, drive: Drive, order: int = ORDER
     ----------
     w, c, s : Twofold
         hθ', cosθ and sinθ at the start.
-    drive : Drive
+    coeffs : Coefficients
         Scaled coefficients, each a `Twofold`.
     order : int
         The highest coefficient of the series.
     """
-    large, _ = taylor_coefficients(w, c, s, drive, min(TWOFOLD, order))
-    W, _ = taylor_coefficients(w.high, c.high, s.high, Drive(*(x.high for x in drive)), order)
+    large, _ = taylor_coefficients(w, c, s, coeffs, min(TWOFOLD, order))
+    W, _ = taylor_coefficients(w.high, c.high, s.high, Coefficients(*(x.high for x in coeffs)), order)
     W[: len(large)] = large
     angle = pairwise_sum([x * (1.0 / (k + 1)) for k, x in enumerate(W)])
     c, s = rotate(c, s, angle, partial(mixed_polynomial, twofold=3))
     return pairwise_sum(W), c, s, angle
 
 
-def step(theta: Any, omega: Any, c: Any, s: Any, drive: Drive, h: Any, order: int = ORDER) -> tuple:
+def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order: int = ORDER) -> tuple:
     """Advance (θ, θ', cosθ, sinθ) by one step of the series."""
-    angle, change, c, s = step_change(omega, c, s, drive, h, order)
+    angle, change, c, s = step_change(omega, c, s, coeffs, h, order)
     return theta + angle, omega + change * (1.0 / h), c, s
 
 
 def step_slopes(
-    omega: Any, c: Any, s: Any, drive: Drive, h: Any, elapsed: Any, columns: Sequence[str], order: int
+    omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, elapsed: Any, columns: Sequence[str], order: int
 ) -> list:
     """Return the derivatives of what one step of the series adds to θ, then of what it adds to θ'.
 
@@ -155,7 +157,7 @@ def step_slopes(
     ----------
     omega, c, s : number
         θ', cosθ and sinθ at the start.
-    drive : Drive
+    coeffs : Coefficients
         Coefficients, those at the time 0.
     h, elapsed : number
         The step, and the time at which it begins.
@@ -165,13 +167,15 @@ def step_slopes(
         The highest coefficient of W.
     """
     number = partial(Variable.of_column, columns)
-    a, b, gamma, delta, ramp = (number(name, value) for name, value in zip(Drive._fields, drive, strict=True))
+    a, b, gamma, delta, ramp = (
+        number(name, value) for name, value in zip(Coefficients._fields, coeffs, strict=True)
+    )
     theta = number("theta", 0.0).slopes
     W, _ = taylor_coefficients(
         number("omega", omega) * h,
         Variable(c, -(theta * s)),
         Variable(s, theta * c),
-        scaled(Drive(a, b, gamma, delta + ramp * elapsed, ramp), h),
+        scaled(Coefficients(a, b, gamma, delta + ramp * elapsed, ramp), h),
         order,
     )
     turned = [w.slopes for w in W]
@@ -179,9 +183,9 @@ def step_slopes(
     return [*angle, *(pairwise_sum(turned[1:]) * (1.0 / h))]
 
 
-def certified(omega: Any, drive: Drive, h: Any, x: Any, xp: Any) -> Any:
+def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
     """Tell whether the three conditions of the bound hold for this x; written without a root."""
-    a, b, gamma, d, r = scaled(drive, h)
+    a, b, gamma, d, r = scaled(coeffs, h)
     half, loss = 0.5 * (x * x), xp.abs(gamma) * x
     room = half - loss - xp.abs(d)
     if not (isinstance(r, float) and r == 0.0):
@@ -189,14 +193,14 @@ def certified(omega: Any, drive: Drive, h: Any, x: Any, xp: Any) -> Any:
     return (xp.abs(omega * h) <= x) & (room >= 0.0) & (a * a + b * b <= room * room)
 
 
-def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
+def largest_majorant(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
     """Return the largest x for which one step of length dt is exact to the tolerance in θ' [rad/s].
 
     Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2, and stays below by more than rounding.
 
     Examples
     --------
-    >>> round(largest_x(0.02) / 2, 3)
+    >>> round(largest_majorant(0.02) / 2, 3)
     0.165
     """
     x = 0.3
@@ -206,10 +210,12 @@ def largest_x(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> fl
     return x * (1.0 - 1e-14)
 
 
-def certified_speed(drive: Drive, dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
+def certified_speed(
+    coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
+) -> float:
     """Return the |θ'| up to which one series is enough [rad/s]; below 0 where it never is."""
-    x = largest_x(dt, order, tolerance)
-    if not certified(0.0, drive, dt, x, np):
+    x = largest_majorant(dt, order, tolerance)
+    if not certified(0.0, coeffs, dt, x, np):
         return -1.0
     speed = x / dt
     return speed if speed * dt <= x else math.nextafter(speed, 0.0)
@@ -225,7 +231,7 @@ class Bound(NamedTuple):
 
 
 def truncation_bound(
-    omega: float, drive: Drive, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
+    omega: float, coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
 ) -> Bound:
     """Return the number of substeps of a step and the proved bound on what they leave out.
 
@@ -237,12 +243,12 @@ def truncation_bound(
     earlier substeps left out. Where `flow` jumps along the slow manifold (heavy damping) the count is that
     of plain substeps, which the jump replaces.
     """
-    largest = largest_x(dt, order, tolerance)
-    one = certified(omega, drive, dt, largest, np)
-    n = 1.0 if one else min(float(_substeps(omega, *drive, dt, order, tolerance)), 1e15)
+    largest = largest_majorant(dt, order, tolerance)
+    one = certified(omega, coeffs, dt, largest, np)
+    n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order, tolerance)), 1e15)
     h = dt / n
     # One step needs the bound at its start only, several need it all the way.
-    x = _rate(omega, *drive, 0.0 if one else dt) * h
+    x = _rate(omega, *coeffs, 0.0 if one else dt) * h
     if one:
         x = min(x, largest)
     tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0) if x < 2.0 else math.inf
@@ -441,7 +447,7 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
     Parameters
     ----------
     present : tuple of bool
-        For each coefficient of `Drive`, whether it is there; the others leave no code behind.
+        For each coefficient of `Coefficients`, whether it is there; the others leave no code behind.
     order : int, default 16
         Order of the series.
     tolerance : float, default 1e-12
@@ -462,18 +468,18 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
 @cache
 def _compile_parts(present: tuple[bool, ...], order: int) -> tuple[Callable, Callable]:
     """Compile the condition of the bound, and one step of the series."""
-    absent = frozenset(name for name, there in zip(Drive._fields, present, strict=True) if not there)
+    absent = frozenset(name for name, there in zip(Coefficients._fields, present, strict=True) if not there)
     coefficients = "alpha, beta, gamma, delta, ramp"
     series = compile_traced(
         "series",
         f"omega, c, s, {coefficients}, h",
-        lambda xp, omega, c, s, *rest: step_change(omega, c, s, Drive(*rest[:5]), rest[5], order),
+        lambda xp, omega, c, s, *rest: step_change(omega, c, s, Coefficients(*rest[:5]), rest[5], order),
         absent,
     )
     holds = compile_traced(
         "holds",
         f"omega, {coefficients}, h, x",
-        lambda xp, omega, *rest: (certified(omega, Drive(*rest[:5]), rest[5], rest[6], xp),),
+        lambda xp, omega, *rest: (certified(omega, Coefficients(*rest[:5]), rest[5], rest[6], xp),),
         absent,
     )
     return holds, series
@@ -493,19 +499,19 @@ def _compile_slow_motion() -> Callable:
 @cache
 def _divided_parts(order: int) -> tuple[Callable, Callable]:
     """Compile what `_divided` calls, once for all pendulums; what is zero adds nothing."""
-    coefficients = ", ".join(Drive._fields)
-    pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Drive._fields))
+    coefficients = ", ".join(Coefficients._fields)
+    pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Coefficients._fields))
 
     def scale(xp: Any, omega: Any, *numbers: Any) -> tuple:
-        *drive, h, h_low = numbers
+        *coeffs, h, h_low = numbers
         step = Twofold(h, h_low)
-        return twofold_parts(step * omega, *scaled(Drive(*map(Twofold, drive)), step))
+        return twofold_parts(step * omega, *scaled(Coefficients(*map(Twofold, coeffs)), step))
 
     def one(xp: Any, *numbers: Any) -> tuple:
         *halves, i = numbers
-        w, c, s, turned, *drive = map(Twofold, halves[::2], halves[1::2])
-        a, b, gamma, d, r = drive
-        w, c, s, angle = substep(w, c, s, Drive(a, b, gamma, d + r * i, r), order)
+        w, c, s, turned, *coeffs = map(Twofold, halves[::2], halves[1::2])
+        a, b, gamma, d, r = coeffs
+        w, c, s, angle = substep(w, c, s, Coefficients(a, b, gamma, d + r * i, r), order)
         return twofold_parts(w, c, s, turned + angle)
 
     return (
@@ -576,27 +582,27 @@ def compile_tangent(
     Parameters
     ----------
     present : tuple of bool
-        For each coefficient of `Drive`, whether it is there.
+        For each coefficient of `Coefficients`, whether it is there.
     by : tuple of str
         Coefficients that have derivatives.
     order, tolerance : int, float
         As for `compile_flow`.
     """
-    absent = frozenset(name for name, there in zip(Drive._fields, present, strict=True) if not there)
+    absent = frozenset(name for name, there in zip(Coefficients._fields, present, strict=True) if not there)
     columns, n = ("theta", "omega", *by), len(by) + 2
-    numbers = ("omega", "c", "s", *Drive._fields, "h", "elapsed")
+    numbers = ("omega", "c", "s", *Coefficients._fields, "h", "elapsed")
     trace = Trace()
     omega, c, s, *rest, h, elapsed = (
         trace.zero() if name in absent else trace.inputs(name)[0] for name in numbers
     )
-    found = step_slopes(omega, c, s, Drive(*rest), h, elapsed, columns, order)
+    found = step_slopes(omega, c, s, Coefficients(*rest), h, elapsed, columns, order)
     lines, entries = record_block(trace, {f"out{i}": x for i, x in enumerate(found)})
     body = [
         f"def local(change, {', '.join(numbers)}):",
         *lines,
         *(f"change[{i // n}, {i % n}] = {x}" for i, x in enumerate(entries)),
     ]
-    rows = (0, 1, *(4 + Drive._fields.index(name) for name in by))
+    rows = (0, 1, *(4 + Coefficients._fields.index(name) for name in by))
     holds, _ = _compile_parts(present, order)
     return compile_python(
         "tangent",

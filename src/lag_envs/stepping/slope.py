@@ -1,15 +1,16 @@
 """The rolling cylinder on a slope: both of its equations are linear, so both are stepped by their exact flow.
 
 Fixed slope
-    ``x'' = pull - drag x'``, solved by φ-functions, φ₁(z) = (e^z - 1)/z and φ₂(z) = (e^z - 1 - z)/z² [1]_::
+    ``x'' = a - Γx'``, acceleration less damping rate times speed, solved by φ-functions, with
+    φ₁(z) = (e^z - 1)/z and φ₂(z) = (e^z - 1 - z)/z² [1]_::
 
-        x₁ = x + vT φ₁(-drag T) + pull T² φ₂(-drag T),   v₁ = v e^(-drag T) + pull T φ₁(-drag T)
+        x₁ = x + vT φ₁(-ΓT) + aT² φ₂(-ΓT),   v₁ = v e^(-ΓT) + aT φ₁(-ΓT)
 
-    A sum of terms without cancellation for any drag >= 0; without drag it is the quadratic.
+    A sum of terms without cancellation for any Γ >= 0; without damping it is the quadratic.
 Turning slope
-    ``x'' = weight sin(φ) + kΩ²x - drag x'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor
-    series has the factorial bound |V_k| <= M σ^k/k! with σ = h (2 drag + 2 √k |Ω| + |Ω|). Where σ is large,
-    short steps are taken one after the other; where that is for the drag, the matrix of a short step is
+    ``x'' = kg sin(φ) + kΩ²x - Γx'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series has
+    the factorial bound |V_k| <= M σ^k/k! with σ = h (2Γ + 2 √k |Ω| + |Ω|). Where σ is large, short steps are
+    taken one after the other; where that is due to the damping, the matrix of a short step is
     squared until it spans the whole one ("scaling and squaring").
 
 References
@@ -38,37 +39,37 @@ TURN_ORDER = 12
 SMALL_TURN = 0.25  # .25^13/13! = 2e-18
 
 
-class Pull(NamedTuple):
+class FixedSlope(NamedTuple):
     """Coefficients of the fixed slope while a control is held; a literal 0.0 drops the term."""
 
-    pull: Any  # [m/s²]
-    drag: Any = 0.0  # [1/s]
+    acceleration: Any  # [m/s²]
+    damping_rate: Any = 0.0  # [1/s]
 
 
-def sliding(v: Any, force: Pull) -> Any:
+def sliding(v: Any, force: FixedSlope) -> Any:
     """Return x'' on a fixed slope."""
-    return force.pull - force.drag * v
+    return force.acceleration - force.damping_rate * v
 
 
-def slide(x: Any, v: Any, force: Pull, dt: Any) -> tuple:
-    """Advance (x, x') by dt for drag·dt up to `SMALL_DECAY` in size."""
-    decay = force.drag * dt
+def slide(x: Any, v: Any, force: FixedSlope, dt: Any) -> tuple:
+    """Advance (x, x') by dt for a damping rate times dt up to `SMALL_DECAY` in size."""
+    decay = force.damping_rate * dt
     phi2 = polynomial(_PHI2, decay) if not (isinstance(decay, float) and decay == 0.0) else 0.5
     phi1 = 1.0 - decay * phi2
-    push = force.pull * dt
+    push = force.acceleration * dt
     return x + dt * (v * phi1 + push * phi2), v * (1.0 - decay * phi1) + push * phi1
 
 
-def slides(force: Pull, dt: Any) -> Any:
+def slides(force: FixedSlope, dt: Any) -> Any:
     """Tell whether `slide` is exact to rounding."""
-    decay = force.drag * dt
+    decay = force.damping_rate * dt
     return (decay <= SMALL_DECAY) & (decay >= -SMALL_DECAY)
 
 
-def _slide_any(x, v, pull, drag, dt, _):  # type: ignore[no-untyped-def]
-    """Advance by dt for any drag; return the state and 1, or -2 where there is no finite result."""
-    if not holds(pull, drag, dt):
-        z = drag * dt
+def _slide_any(x, v, acceleration, damping_rate, dt, _):  # type: ignore[no-untyped-def]
+    """Advance by dt at any damping; return the state and 1, or -2 where there is no finite result."""
+    if not holds(acceleration, damping_rate, dt):
+        z = damping_rate * dt
         if abs(z) < 1.5:  # where 1 - phi1 would cancel
             phi2 = 0.5
             term = 0.5
@@ -79,20 +80,20 @@ def _slide_any(x, v, pull, drag, dt, _):  # type: ignore[no-untyped-def]
         else:
             phi1 = -math.expm1(-z) / z
             phi2 = (1.0 - phi1) / z
-        x, v = x + dt * (v * phi1 + pull * dt * phi2), v * math.exp(-z) + pull * dt * phi1
+        x, v = x + dt * (v * phi1 + acceleration * dt * phi2), v * math.exp(-z) + acceleration * dt * phi1
     else:
-        x, v = slide(x, v, pull, drag, dt)
+        x, v = slide(x, v, acceleration, damping_rate, dt)
     return x, v, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
 
 
-def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
+def crossing_time(x: Any, v: Any, force: FixedSlope, dt: Any, xp: Any) -> Any:
     """Return the time at which a cylinder rolling down from x < 0 passes 0, if it does so within dt.
 
     Parameters
     ----------
     x, v : number
         Place (below 0) and speed (not below 0) at the step's start.
-    force : Pull
+    force : FixedSlope
         The coefficients.
     dt : number
         The step.
@@ -101,29 +102,29 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 
     Notes
     -----
-    Newton's method on the closed form, from below: from the time that it would take without drag, or on the
-    line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the former. For
-    one that slows down Newton's method is monotone but may advance by no more than 1/drag at a time, so there
-    it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone too, and the
-    later of both times is taken.
+    Newton's method on the closed form, from below: from the time that it would take without damping, or on
+    the line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the former.
+    For one that slows down Newton's method is monotone but may advance by no more than 1/Γ at a time, so
+    there it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone too, and
+    the later of both times is taken.
     """
-    pull, drag = force
-    excess = drag * v - pull
+    acceleration, damping_rate = force
+    excess = damping_rate * v - acceleration
     slower = excess > 0.0
-    free = -2.0 * x / (v + xp.sqrt(v * v - 2.0 * pull * x))
-    line = -(drag * drag * x + excess) / (drag * xp.maximum(pull, 1e-300))
+    free = -2.0 * x / (v + xp.sqrt(v * v - 2.0 * acceleration * x))
+    line = -(damping_rate * damping_rate * x + excess) / (damping_rate * xp.maximum(acceleration, 1e-300))
     time = xp.minimum(xp.where(slower, xp.maximum(free, line), free), dt)
     for _ in range(7):
-        z = drag * time
+        z = damping_rate * time
         small = z <= SMALL_DECAY
         phi1 = xp.where(small, 1.0 - z * polynomial(_PHI2, z), (1.0 - xp.exp(-z)) / z)
         phi2 = xp.where(small, polynomial(_PHI2, z), (1.0 - phi1) / z)
-        place = x + time * (v * phi1 + pull * time * phi2)
-        speed = v * (1.0 - z * phi1) + pull * time * phi1
-        layer = 1.0 + drag * (drag * x + pull * time) / excess
+        place = x + time * (v * phi1 + acceleration * time * phi2)
+        speed = v * (1.0 - z * phi1) + acceleration * time * phi1
+        layer = 1.0 + damping_rate * (damping_rate * x + acceleration * time) / excess
         valid = slower & (z > SMALL_DECAY) & (layer > 0.0)
         layer = xp.where(valid, layer, 1.0)
-        later = (z - (z + xp.log(layer)) / (1.0 + pull / (excess * layer))) / drag
+        later = (z - (z + xp.log(layer)) / (1.0 + acceleration / (excess * layer))) / damping_rate
         later = xp.where(valid, later, 0.0)
         time = clip(xp.maximum(time - place / speed, later), 0.0, dt, xp)
     return time
@@ -131,19 +132,27 @@ def crossing_time(x: Any, v: Any, force: Pull, dt: Any, xp: Any) -> Any:
 
 @cache
 def compile_slide(present: tuple[bool, ...]) -> Callable:
-    """Compile ``flow(x, v, pull, drag, dt, _)`` to ``(x, v, 1)``; the last is negative if refused."""
-    absent = frozenset(name for name, there in zip(Pull._fields, present, strict=True) if not there)
+    """Compile ``flow(x, v, acceleration, damping_rate, dt, _)`` to ``(x, v, 1)``, negative if refused."""
+    absent = frozenset(name for name, there in zip(FixedSlope._fields, present, strict=True) if not there)
     fast = compile_traced(
-        "slide", "x, v, pull, drag, dt", lambda xp, x, v, p, d, dt: slide(x, v, Pull(p, d), dt), absent
+        "slide",
+        "x, v, acceleration, damping_rate, dt",
+        lambda xp, x, v, p, d, dt: slide(x, v, FixedSlope(p, d), dt),
+        absent,
     )
-    holds = compile_traced("holds", "pull, drag, dt", lambda xp, p, d, dt: (slides(Pull(p, d), dt),), absent)
+    holds = compile_traced(
+        "holds",
+        "acceleration, damping_rate, dt",
+        lambda xp, p, d, dt: (slides(FixedSlope(p, d), dt),),
+        absent,
+    )
     return compile_python("flow", _slide_any, fast, holds)
 
 
 def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
-    """Differentiate a step; see `pendulum._tangent`. The values are x, x', pull and drag."""
-    _x, v, pull, drag = values
-    z = drag * dt
+    """Differentiate a step; see `pendulum._tangent`. The values are x, x', acceleration and damping_rate."""
+    _x, v, acceleration, damping_rate = values
+    z = damping_rate * dt
     if abs(z) <= SMALL_DECAY:
         phi2, slope2 = short(z)
     else:
@@ -161,7 +170,10 @@ def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-d
         phi2 = (1.0 - phi1) / z
         slope1 = (decay - phi1) / z
         slope2 = -(slope1 + phi2) / z
-    far, fast = dt * dt * (v * slope1 + pull * dt * slope2), dt * (pull * dt * slope1 - v * decay)
+    far, fast = (
+        dt * dt * (v * slope1 + acceleration * dt * slope2),
+        dt * (acceleration * dt * slope1 - v * decay),
+    )
     for j in range(slopes.shape[1]):
         dv, d_pull, d_drag = slopes[1, j], slopes[2, j], slopes[3, j]
         slopes[0, j] += dt * (dv * phi1 + d_pull * dt * phi2) + far * d_drag
@@ -181,38 +193,38 @@ def compile_slide_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Cal
     return compile_python("tangent", _slide_tangent, helper, SMALL_DECAY=SMALL_DECAY)
 
 
-class Turn(NamedTuple):
+class TurningSlope(NamedTuple):
     """Coefficients of the turning slope while a control is held."""
 
-    carry: Any  # k
-    weight: Any  # k g [m/s²]
-    drag: Any  # [1/s]
+    centrifugal: Any  # k
+    gravity: Any  # k g [m/s²]
+    damping_rate: Any  # [1/s]
     rate: Any  # Ω [rad/s]
 
 
-def turning(x: Any, v: Any, s: Any, turn: Turn) -> Any:
+def turning(x: Any, v: Any, s: Any, turn: TurningSlope) -> Any:
     """Return x'' on a turning slope; s is sinφ."""
-    return turn.weight * s + turn.carry * (turn.rate * turn.rate) * x - turn.drag * v
+    return turn.gravity * s + turn.centrifugal * (turn.rate * turn.rate) * x - turn.damping_rate * v
 
 
 def turn_coefficients(
-    x: Any, w: Any, c: Any, s: Any, turn: Turn, h: Any, order: int = TURN_ORDER
+    x: Any, w: Any, c: Any, s: Any, turn: TurningSlope, h: Any, order: int = TURN_ORDER
 ) -> tuple[list, list]:
     """Return the Taylor coefficients of x and hx'; w is hx' at the start, (c, s) are cosφ and sinφ there."""
     rate = turn.rate * h
-    carry = turn.carry * (rate * rate)
-    weight = turn.weight * (h * h)
-    drag = turn.drag * h
-    X, V, S, C = [x], [w], [weight * s], [weight * c]
+    centrifugal = turn.centrifugal * (rate * rate)
+    gravity = turn.gravity * (h * h)
+    damping_rate = turn.damping_rate * h
+    X, V, S, C = [x], [w], [gravity * s], [gravity * c]
     for k in range(order):
-        V.append((carry * X[k] + S[k] - drag * V[k]) * (1.0 / (k + 1)))
+        V.append((centrifugal * X[k] + S[k] - damping_rate * V[k]) * (1.0 / (k + 1)))
         X.append(V[k] * (1.0 / (k + 1)))
         S.append(rate * C[k] * (1.0 / (k + 1)))
         C.append(rate * S[k] * (-1.0 / (k + 1)))
     return X, V
 
 
-def turn_change(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+def turn_change(x: Any, v: Any, c: Any, s: Any, turn: TurningSlope, h: Any) -> tuple[Any, Any]:
     """Return by how much (x, x') change, by the Taylor series; (c, s) are cosφ and sinφ at the start."""
     X, V = turn_coefficients(x, h * v, c, s, turn, h)
     return _sum(X[1:]), _sum(V[1:]) * (1.0 / h)
@@ -223,16 +235,16 @@ def _sum(terms: list) -> Any:
     return reduce(lambda total, term: total + term, reversed(terms))
 
 
-def turn_series(x: Any, v: Any, c: Any, s: Any, turn: Turn, h: Any) -> tuple[Any, Any]:
+def turn_series(x: Any, v: Any, c: Any, s: Any, turn: TurningSlope, h: Any) -> tuple[Any, Any]:
     """Advance (x, x') by `turn_change`."""
     dx, dv = turn_change(x, v, c, s, turn, h)
     return x + dx, v + dv
 
 
-def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: Turn, h: Twofold) -> tuple:
+def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: TurningSlope, h: Twofold) -> tuple:
     """Advance (x, hx', cosφ, sinφ) by one of many steps, with twice the digits (see `pendulum.substep`)."""
     ends = []
-    plain = Turn(*(number.high for number in turn))
+    plain = TurningSlope(*(number.high for number in turn))
     for large, W in zip(
         turn_coefficients(x, w, c, s, turn, h, TWOFOLD),
         turn_coefficients(x.high, w.high, c.high, s.high, plain, h.high),
@@ -243,23 +255,23 @@ def turn_substep(x: Twofold, w: Twofold, c: Twofold, s: Twofold, turn: Turn, h: 
     return *ends, *rotate(c, s, turn.rate * h, partial(mixed_polynomial, twofold=3))
 
 
-def turns(turn: Turn, h: Any, xp: Any) -> Any:
+def turns(turn: TurningSlope, h: Any, xp: Any) -> Any:
     """Tell whether one step of the series is exact to rounding."""
-    return h * (2.0 * turn.drag + spread(turn.carry, xp) * xp.abs(turn.rate)) <= SMALL_TURN
+    return h * (2.0 * turn.damping_rate + rate_factor(turn.centrifugal, xp) * xp.abs(turn.rate)) <= SMALL_TURN
 
 
-def spread(carry: Any, xp: Any) -> Any:
+def rate_factor(centrifugal: Any, xp: Any) -> Any:
     """Return 2 √k + 1, at least 3: a rolling cylinder's k lies below 1."""
-    return 1.0 + 2.0 * xp.sqrt(xp.maximum(xp.abs(carry), 1.0))
+    return 1.0 + 2.0 * xp.sqrt(xp.maximum(xp.abs(centrifugal), 1.0))
 
 
-def _turn_any(x, v, c, s, carry, weight, drag, rate, dt, _):  # type: ignore[no-untyped-def]
+def _turn_any(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt, _):  # type: ignore[no-untyped-def]
     """Advance by dt for any coefficients; return x, x', cosφ, sinφ, and 1, or -1 or -2 if refused."""
-    growth = dt * (2.0 * drag + (1.0 + 2.0 * math.sqrt(max(abs(carry), 1.0))) * abs(rate))
+    growth = dt * (2.0 * damping_rate + (1.0 + 2.0 * math.sqrt(max(abs(centrifugal), 1.0))) * abs(rate))
     n = np.ceil(max(1.0, growth / SMALL_TURN))
-    if n == 1.0 or (drag <= abs(rate) and n <= 1e5):
+    if n == 1.0 or (damping_rate <= abs(rate) and n <= 1e5):
         if n == 1.0:
-            x, v = series(x, v, c, s, carry, weight, drag, rate, dt)
+            x, v = series(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt)
             c, s = turn_pair(c, s, rate * dt)
         else:
             h = dt / n
@@ -268,7 +280,7 @@ def _turn_any(x, v, c, s, carry, weight, drag, rate, dt, _):  # type: ignore[no-
             x_low = c_low = s_low = 0.0
             for _i in range(int(n)):
                 x, x_low, w, w_low, c, c_low, s, s_low = substep(
-                    x, x_low, w, w_low, c, c_low, s, s_low, carry, weight, drag, rate, h, h_low
+                    x, x_low, w, w_low, c, c_low, s, s_low, centrifugal, gravity, damping_rate, rate, h, h_low
                 )
             v = w / h
             v += (fma(-v, h, w) + (w_low - v * h_low)) / h
@@ -285,10 +297,10 @@ def _turn_any(x, v, c, s, carry, weight, drag, rate, dt, _):  # type: ignore[no-
     # unit matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose
     # a bit with each squaring.
     m = np.empty((2, 4))
-    m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, carry, weight, drag, rate, h)
-    m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, carry, weight, drag, rate, h)
-    m[0, 2], m[1, 2] = change(0.0, 0.0, 1.0, 0.0, carry, weight, drag, rate, h)
-    m[0, 3], m[1, 3] = change(0.0, 0.0, 0.0, 1.0, carry, weight, drag, rate, h)
+    m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, centrifugal, gravity, damping_rate, rate, h)
+    m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, centrifugal, gravity, damping_rate, rate, h)
+    m[0, 2], m[1, 2] = change(0.0, 0.0, 1.0, 0.0, centrifugal, gravity, damping_rate, rate, h)
+    m[0, 3], m[1, 3] = change(0.0, 0.0, 0.0, 1.0, centrifugal, gravity, damping_rate, rate, h)
     for i in range(doublings):
         angle = rate * (dt * 0.5 ** (doublings - i))
         p, q = math.cos(angle), math.sin(angle)
@@ -311,14 +323,14 @@ def _turn_any(x, v, c, s, carry, weight, drag, rate, dt, _):  # type: ignore[no-
 
 @cache
 def compile_turn(present: tuple[bool, ...]) -> Callable:
-    """Compile ``flow(x, v, c, s, carry, weight, drag, rate, dt, _)`` to ``(x, v, c, s, 1)``."""
-    absent = frozenset(name for name, there in zip(Turn._fields, present, strict=True) if not there)
-    arguments = "x, v, c, s, carry, weight, drag, rate, h"
+    """Compile ``flow(x, v, c, s, *TurningSlope, dt, _)`` to ``(x, v, c, s, 1)``."""
+    absent = frozenset(name for name, there in zip(TurningSlope._fields, present, strict=True) if not there)
+    arguments = "x, v, c, s, centrifugal, gravity, damping_rate, rate, h"
     series, change = (
         compile_traced(
             name,
             arguments,
-            lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, Turn(*rest[:4]), rest[4]),
+            lambda xp, x, v, c, s, *rest, f=f: f(x, v, c, s, TurningSlope(*rest[:4]), rest[4]),
             absent,
         )
         for name, f in (("series", turn_series), ("change", turn_change))
@@ -328,7 +340,9 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
     def substep(xp: Any, *numbers: Any) -> tuple:
         *halves, h, h_low = numbers
         x, w, c, s = map(Twofold, halves[:8:2], halves[1:8:2])
-        return twofold_parts(*turn_substep(x, w, c, s, Turn(*map(Twofold, halves[8:])), Twofold(h, h_low)))
+        return twofold_parts(
+            *turn_substep(x, w, c, s, TurningSlope(*map(Twofold, halves[8:])), Twofold(h, h_low))
+        )
 
     names = ", ".join(f"{name}, {name}_low" for name in "xwcs")
     return compile_python(
@@ -338,7 +352,9 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
         change,
         pair,
         compile_traced("start", "v, h, h_low", lambda xp, v, *h: twofold_parts(Twofold(*h) * v)),
-        compile_traced("substep", f"{names}, carry, weight, drag, rate, h, h_low", substep, absent),
+        compile_traced(
+            "substep", f"{names}, centrifugal, gravity, damping_rate, rate, h, h_low", substep, absent
+        ),
         SMALL_TURN=SMALL_TURN,
     )
 
@@ -349,12 +365,12 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
 def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
     """Differentiate a step; see `pendulum._tangent`.
 
-    The values are x, x', cosφ, sinφ, carry, weight, drag and rate; carry, weight and drag have no
-    derivatives. A long step is made of a short one by squaring, as in `_turn_any`.
+    The values are x, x', cosφ, sinφ, centrifugal, gravity, damping_rate and rate; the three before the rate
+    have no derivatives. A long step is made of a short one by squaring, as in `_turn_any`.
     """
-    x, v, c, s, carry, weight, drag, rate = values
+    x, v, c, s, centrifugal, gravity, damping_rate, rate = values
     m, by_rate = scratch[:2], scratch[2:]
-    growth = dt * (2.0 * drag + (1.0 + 2.0 * math.sqrt(max(abs(carry), 1.0))) * abs(rate))
+    growth = dt * (2.0 * damping_rate + (1.0 + 2.0 * math.sqrt(max(abs(centrifugal), 1.0))) * abs(rate))
     doublings = 0
     h = dt
     while growth > SMALL_TURN:
@@ -365,7 +381,9 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
             return -1
     for j in range(4):
         one = 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0, 1.0 if j == 3 else 0.0
-        m[0, j], m[1, j], by_rate[0, j], by_rate[1, j] = change(*one, carry, weight, drag, rate, h)
+        m[0, j], m[1, j], by_rate[0, j], by_rate[1, j] = change(
+            *one, centrifugal, gravity, damping_rate, rate, h
+        )
     for _d in range(doublings):
         p, q = math.cos(rate * h), math.sin(rate * h)
         a, b = m.copy(), by_rate.copy()
@@ -394,13 +412,13 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
 @cache
 def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; it takes any terms."""
-    names = ("x", "v", "c", "s", *Turn._fields, "h")
+    names = ("x", "v", "c", "s", *TurningSlope._fields, "h")
 
     def change(xp: Any, *numbers: Any) -> tuple:
         x, v, c, s, *rest, h = (
             Variable.of_column(["rate"], name, number) for name, number in zip(names, numbers, strict=True)
         )
-        dx, dv = turn_change(x, v, c, s, Turn(*rest), h)
+        dx, dv = turn_change(x, v, c, s, TurningSlope(*rest), h)
         return dx.value, dv.value, *dx.slopes, *dv.slopes
 
     return compile_python(

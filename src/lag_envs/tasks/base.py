@@ -22,7 +22,7 @@ from lag_envs.scenes.base import ORDER, Scene
 from lag_envs.scenes.checks import StepRefused, check_number, check_state, real_array
 from lag_envs.scenes.declaring import complete
 from lag_envs.scenes.door import is_own
-from lag_envs.scenes.shapes import Bodies, Moment, Reading, Shape, Window
+from lag_envs.scenes.shapes import Bodies, Frame, Reading, Shape, Window
 from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
@@ -267,7 +267,7 @@ class Task:
 
         Returns
         -------
-        pendulum.Drive, slope.Pull or slope.Turn
+        pendulum.Coefficients, slope.FixedSlope or slope.TurningSlope
             See `lag_envs.stepping.normal_forms`. In a formula they are those that the step uses.
         """
         form = self.scene._form if self._recording is None else self._recording.form
@@ -415,7 +415,7 @@ class Task:
         """Return the part of the plane to look at [m]."""
         return self.scene.window()
 
-    def shapes(self, now: Moment) -> list[Shape]:
+    def shapes(self, now: Frame) -> list[Shape]:
         """Return what is to be seen at a moment, from back to front."""
         return picture.Picture(self).placed(now)
 
@@ -436,14 +436,14 @@ class Task:
             for name, value in zip(self.scene.control_names, values, strict=True)
         ]
 
-    def control_readings(self, now: Moment) -> list[Reading]:
+    def control_readings(self, now: Frame) -> list[Reading]:
         """Return what the read-out tells of the controls."""
         names = zip(
             self.scene.control_names, np.atleast_1d(now.control), self.scene.control_units, strict=True
         )
         return [Reading(name, float(value), unit, "action") for name, value, unit in names]
 
-    def readings(self, now: Moment) -> list[Reading]:
+    def readings(self, now: Frame) -> list[Reading]:
         """Return what the read-out tells besides state and controls: the targets."""
         given: Any = [] if now.target is None else np.atleast_1d(now.target)
         return [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lag_envs.scenes import CylinderInCylinder
-from lag_envs.scenes.shapes import Bodies, Circle, Line, Moment, Reading
+from lag_envs.scenes.shapes import Bodies, Circle, Frame, Line, Reading
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
@@ -498,7 +498,7 @@ then spends more on keeping it; PPO is later there, but for one seed, and keeps 
         shapes = super().bodies()
         return {**shapes, "limits": [*shapes["limits"], *marks]}
 
-    def readings(self, now: Moment) -> list[Reading]:
+    def readings(self, now: Frame) -> list[Reading]:
         """Tell the energy per inertia, and the wanted one."""
         energy, wanted = self.energies(now.state, np)
         return [Reading("E", float(energy), "1/s²"), Reading("E*", float(wanted), "1/s²", "target")]
@@ -672,28 +672,28 @@ with the action that lets go all the time.
         if self.scene.control != "damping":
             raise ValueError(f"this task is controlled by 'damping', got control={self.scene.control!r}")
 
-    def weight(self, xp: Any = np) -> Any:
+    def omega0_squared(self, xp: Any = np) -> Any:
         """Return ω₀², the square of small swings' angular frequency [1/s²]."""
         return self.coefficients([0.0] * 4, [0.0], xp).alpha
 
     @property
     def fastest(self) -> float:
         """Speed of a fall [rad/s]."""
-        return 2.0 * math.sqrt(self.weight())
+        return 2.0 * math.sqrt(self.omega0_squared())
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return exp(-√(θ² + θ'²/ω₀²)/0.1)."""
         theta, rate = after.theta, after.theta_dot
-        return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self.weight(xp))))
+        return xp.exp(-10.0 * xp.sqrt(theta * theta + (rate * rate) * (1.0 / self.omega0_squared(xp))))
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the cylinder is near rest."""
-        return after.theta * after.theta + after.theta_dot * after.theta_dot / self.weight() <= 0.1**2
+        return after.theta * after.theta + after.theta_dot * after.theta_dot / self.omega0_squared() <= 0.1**2
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
         """Return how much of the time the cylinder is near rest, and nearer."""
         theta, rate = played.states[1:, :, 0], played.states[1:, :, 1]
-        distance = np.hypot(theta, rate / np.sqrt(self.weight()))
+        distance = np.hypot(theta, rate / np.sqrt(self.omega0_squared()))
         going_on = np.arange(len(theta))[:, None] < played.steps
         shares = {size: 100.0 * float((distance[going_on] <= size).mean()) for size in (0.1, 0.01)}
         return {f"time within {size:g} of rest [%]": share for size, share in shares.items()}
@@ -715,7 +715,7 @@ with the action that lets go all the time.
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds: θ' grows by at most ω₀² a second and 3 rad/s a kick."""
-        swing = FASTEST_START + self.weight() * self.duration + 3.0 * self.limit
+        swing = FASTEST_START + self.omega0_squared() * self.duration + 3.0 * self.limit
         return {"theta": 1e3 + swing * self.duration, "theta_dot": swing}
 
     def bodies(self) -> Bodies:

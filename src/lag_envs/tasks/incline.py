@@ -13,9 +13,9 @@ from lag_envs.scenes.shapes import (
     Arrow,
     Bodies,
     Circle,
-    Lens,
+    Frame,
     Line,
-    Moment,
+    Magnifier,
     Polygon,
     Reading,
     Window,
@@ -244,11 +244,13 @@ the cascade. PPO is later at the mark than the cascade, and stops beside it wher
         reach, speed = self.edge + 1.0, FASTEST_START
         if self.quasi_static:
             plane = self.coefficients([0.0, 0.0], [self.largest_tilt], np)
-            speed += plane.pull * self.duration
+            speed += plane.acceleration * self.duration
         else:
             rate, carried = self.largest_rate, self.scene.radius * self.largest_rate
             turn = self.coefficients([0.0, 0.0, 0.0], [rate], np)
-            push = turn.weight * math.sin(self.largest_tilt) + reach * rate * rate + turn.drag * carried
+            push = (
+                turn.gravity * math.sin(self.largest_tilt) + reach * rate * rate + turn.damping_rate * carried
+            )
             speed += carried + push * self.duration
         tilt = self.largest_tilt * (1.0 + 1e-6)
         x, v = self.scene.state_names[:2]
@@ -485,7 +487,7 @@ little sooner and too fast, and what that costs is more than the time it saves.
         force = self.coefficients(before, control, xp)
         time = slope.crossing_time(before.x, before.x_dot, force, dt, xp)
         # The integral of x'' = pull - drag x' over the way to the line gives the speed there.
-        return time, before.x_dot + force.pull * time + force.drag * before.x
+        return time, before.x_dot + force.acceleration * time + force.damping_rate * before.x
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return minus the time to the line, and minus the price of the speed there above the gentle one."""
@@ -522,14 +524,14 @@ little sooner and too fast, and what that costs is more than the time it saves.
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds; a start may lie at most 1000 m away."""
-        speed = FASTEST_START + self.coefficients([0.0, 0.0], [0.0], np).pull * self.duration
+        speed = FASTEST_START + self.coefficients([0.0, 0.0], [0.0], np).acceleration * self.duration
         return {"distance": 1e3 + speed * self.duration, "v": speed}
 
     def bodies(self) -> Bodies:
         """Return the slope with the line, and the cylinder magnified."""
         radius, shapes = self.scene.radius, self.scene.bodies(-3.0, self._length + 3.0)
         line = Line([(0.0, 0.0), (0.0, 6.0 * radius)], "target")
-        return {**shapes, "line": [line], "glass": [Lens((0.0, 0.0), 2.2 * radius)]}
+        return {**shapes, "line": [line], "glass": [Magnifier((0.0, 0.0), 2.2 * radius)]}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
         """Return where they are; the ground begins before the line, or before a cylinder farther away."""
@@ -550,7 +552,7 @@ little sooner and too fast, and what that costs is more than the time it saves.
         near, far = (self.scene.place(x, self.scene.radius, self.scene.tilt) for x in (0.0, self._length))
         return Window(near[0], far[1], far[0], near[1], "hill")
 
-    def readings(self, now: Moment) -> list[Reading]:
+    def readings(self, now: Frame) -> list[Reading]:
         """Tell the speed at which the line should be crossed."""
         return [Reading("x_dot*", self.gentle, "m/s", "target")]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.picture import Picture
-from lag_envs.scenes.shapes import Circle, Lens, Ruler, Shape
+from lag_envs.scenes.shapes import Circle, Magnifier, Ruler, Shape
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
@@ -164,7 +164,7 @@ def _shape(frame: int, shape: Shape) -> list[Any]:
             return [kind, frame, _short(centre), *_short([radius]), role]
         case Ruler(step, size, role):
             return [kind, frame, *_short([step, size]), role]
-        case Lens(centre, radius):
+        case Magnifier(centre, radius):
             return [kind, frame, _short(centre), *_short([radius])]
         case _:
             return [kind, frame, [_short(point) for point in shape.points], shape.role]

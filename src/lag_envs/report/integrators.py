@@ -1,8 +1,8 @@
-"""The steppers that people would otherwise use, as flows: any scene can be stepped by them.
+"""The integrators that people would otherwise use, as flows: any scene can be stepped by them.
 
 Each is written once, on generic numbers, for q'' = a(q, v, t), and compiled by the machinery that compiles
-ours, so that times compare methods and not compilers. A comparison stepper takes one step per control step;
-`n` substeps are `n` control steps of a length n times smaller.
+ours, so that times compare methods and not compilers. A comparison integrator takes one step per control
+step; `n` substeps are `n` control steps of a length n times smaller.
 
 Cosine and sine are computed at every stage, or *carried*: an explicit Runge-Kutta method has them as two more
 unknowns, c' = -s q' and s' = c q', and calls no function at all; the others turn the pair that the step began
@@ -31,7 +31,7 @@ def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
     """Return cosine and sine to rounding, for angles up to some 1e5 rad.
 
     Arithmetic only, so that a compiled loop over a batch becomes vector instructions as ours does; with calls
-    of the C library the comparison steppers would be ten times slower.
+    of the C library the comparison integrators would be ten times slower.
     """
     quarter = xp.floor(angle * (2.0 / math.pi) + 0.5)
     r = angle - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]
@@ -66,7 +66,7 @@ def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> t
 
     Parameters
     ----------
-    coefficients : pendulum.Drive, slope.Pull or slope.Turn
+    coefficients : pendulum.Coefficients, slope.FixedSlope or slope.TurningSlope
         Of the flow, at t = 0.
     t : number
         The time [s].
@@ -78,9 +78,9 @@ def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> t
         The turning plane's angle at t = 0, if its cosine and sine are no unknowns [rad].
     """
     q, v, *pair = y
-    if isinstance(coefficients, slope.Pull):
+    if isinstance(coefficients, slope.FixedSlope):
         return v, slope.sliding(v, coefficients) + 0.0 * q
-    if isinstance(coefficients, slope.Turn):
+    if isinstance(coefficients, slope.TurningSlope):
         turn = coefficients.rate
         if pair:
             return v, slope.turning(q, v, pair[1], coefficients), -(turn * pair[1]), turn * pair[0]
@@ -91,16 +91,16 @@ def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> t
 
 
 class Problem(NamedTuple):
-    """One step's equation of motion, q'' = force(q, t) - drag q'."""
+    """One step's equation of motion, q'' = force(q, t) - damping_rate q'."""
 
     force: Callable[[Any, Any], Any]
     gradient: Callable[[Any, Any], Any]  # of the force by q
-    drag: Any
+    damping_rate: Any
     linear: bool  # whether the gradient is the same everywhere, so that Newton's method needs one iteration
 
     def acceleration(self, q: Any, v: Any, t: Any) -> Any:
         """Return q''."""
-        return self.force(q, t) - self.drag * v
+        return self.force(q, t) - self.damping_rate * v
 
 
 def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = False) -> Problem:
@@ -108,9 +108,9 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
 
     If carried, cosines and sines are turned from those at the start: exact to rounding up to 0.6 rad.
     """
-    if isinstance(coefficients, pendulum.Drive):
+    if isinstance(coefficients, pendulum.Coefficients):
         push = coefficients._replace(gamma=0.0)
-        turn = pendulum.Drive(coefficients.alpha, coefficients.beta)
+        turn = pendulum.Coefficients(coefficients.alpha, coefficients.beta)
         start, *pair = variables[0], *variables[2:]
 
         def cos_sin(q: Any) -> Sequence:
@@ -127,10 +127,10 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
             return pendulum.acceleration(0.0, -s, c, turn)
 
         return Problem(force, gradient, coefficients.gamma, False)
-    if isinstance(coefficients, slope.Pull):
-        pull = coefficients.pull
-        return Problem(lambda q, t: pull, lambda q, t: 0.0, coefficients.drag, True)
-    plane = coefficients._replace(drag=0.0)
+    if isinstance(coefficients, slope.FixedSlope):
+        pull = coefficients.acceleration
+        return Problem(lambda q, t: pull, lambda q, t: 0.0, coefficients.damping_rate, True)
+    plane = coefficients._replace(damping_rate=0.0)
 
     def rolling(q: Any, t: Any) -> Any:
         if carried:
@@ -140,7 +140,9 @@ def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = Fal
             s = variables[3] * c + variables[2] * s
         return slope.turning(q, 0.0, s, plane)
 
-    return Problem(rolling, lambda q, t: plane.carry * plane.rate * plane.rate, coefficients.drag, True)
+    return Problem(
+        rolling, lambda q, t: plane.centrifugal * plane.rate * plane.rate, coefficients.damping_rate, True
+    )
 
 
 # --- methods: (q, v) after one step of length h ---
@@ -156,7 +158,7 @@ def verlet(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     """Velocity Verlet; drag is treated explicitly before and implicitly after the drift."""
     half = v + 0.5 * h * p.acceleration(q, v, 0.0)
     q = q + h * half
-    return q, (half + 0.5 * h * p.force(q, h)) / (1.0 + 0.5 * h * p.drag)
+    return q, (half + 0.5 * h * p.force(q, h)) / (1.0 + 0.5 * h * p.damping_rate)
 
 
 def implicit_midpoint(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
@@ -166,13 +168,13 @@ def implicit_midpoint(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any,
     for _ in range(1 if p.linear else 4):
         place = q + half * middle
         residual = middle - v - half * p.acceleration(place, middle, half)
-        middle = middle - residual / (1.0 + half * p.drag - half * half * p.gradient(place, half))
+        middle = middle - residual / (1.0 + half * p.damping_rate - half * half * p.gradient(place, half))
     return q + h * middle, 2.0 * middle - v
 
 
 def etd4rk(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
     """Exponential Runge-Kutta method of order 4 (Cox, Matthews 2002): the drag is solved exactly."""
-    one, half = phis(p.drag * h, xp), phis(0.5 * (p.drag * h), xp)
+    one, half = phis(p.damping_rate * h, xp), phis(0.5 * (p.damping_rate * h), xp)
     k = 0.5 * h
 
     def free(start: tuple[Any, Any], h: Any, phi: Sequence) -> tuple[Any, Any]:
@@ -237,8 +239,8 @@ def radau(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
         rows = []
         for i in range(3):
             slope_at = p.gradient(places[i], h * c[i])
-            wrong = p.force(places[i], h * c[i]) - p.drag * speed(a[i]) - pushed[i]
-            matrix = [p.drag * (h * a[i][j]) - slope_at * (hh * twice[i][j]) for j in range(3)]
+            wrong = p.force(places[i], h * c[i]) - p.damping_rate * speed(a[i]) - pushed[i]
+            matrix = [p.damping_rate * (h * a[i][j]) - slope_at * (hh * twice[i][j]) for j in range(3)]
             matrix[i] = 1.0 + matrix[i]
             rows.append([*matrix, wrong])
         pushed = [x + dx for x, dx in zip(pushed, _solve(rows), strict=True)]
@@ -304,7 +306,7 @@ def dop853() -> Tableau:
 
 
 class Method(NamedTuple):
-    """A comparison stepper, and its order of convergence."""
+    """A comparison integrator, and its order of convergence."""
 
     step: Callable | None  #: of a `Problem`, or None where the tableau is all there is to know
     order: int
@@ -328,11 +330,11 @@ METHODS = {
 
 @cache
 def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
-    """Return the comparison stepper of that name for the equation of a flow."""
+    """Return the comparison integrator of that name for the equation of a flow."""
     method = METHODS[name]
 
     def fast(variables: Sequence, coefficients: Any, dt: Any, xp: Any) -> tuple:
-        if method.tableau and carried and not isinstance(coefficients, slope.Pull):
+        if method.tableau and carried and not isinstance(coefficients, slope.FixedSlope):
             return _lifted(method.tableau(), variables, coefficients, dt)
         p = problem(coefficients, variables, xp, carried)
         start = variables[:2]
@@ -341,12 +343,12 @@ def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
         else:
             assert method.step
             q, v = method.step(p, *start, dt, xp)
-        if isinstance(coefficients, pendulum.Drive):
+        if isinstance(coefficients, pendulum.Coefficients):
             turned = (
                 pendulum.rotate(variables[2], variables[3], q - start[0]) if carried else cosine_sine(q, xp)
             )
             return q, v, *turned
-        if isinstance(coefficients, slope.Turn):
+        if isinstance(coefficients, slope.TurningSlope):
             return q, v, *slope.rotate(variables[2], variables[3], coefficients.rate * dt)
         return q, v
 
