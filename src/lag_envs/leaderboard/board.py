@@ -512,6 +512,7 @@ class Neighbours:
 
     def __init__(self, board: Board) -> None:
         self.board = board
+        self._protocols = board.read().protocols
         self._loaded: dict[str, Submission] = {}
         self._likeness: dict[tuple[str, str], Any] = {}
 
@@ -520,7 +521,7 @@ class Neighbours:
         from lag_envs.leaderboard.alike import Likeness
         from lag_envs.leaderboard.ranking import policy_error
 
-        reference = self.board.read().protocols[entry.protocol].references.get(entry.env)
+        reference = self._protocols[entry.protocol].references.get(entry.env)
         results = (result, self.board.result(other))
         error = max(policy_error(reference, each["policies"]) for each in results)
         likeness = self._likeness.setdefault(
