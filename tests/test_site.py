@@ -471,7 +471,7 @@ def flat(shape):
         case Circle(centre, radius, role):
             return ["circle", np.array([*centre, radius]), role]
         case Magnifier(centre, radius):
-            return ["lens", np.array([*centre, radius]), None]
+            return ["magnifier", np.array([*centre, radius]), None]
 
 
 def test_scenes_are_drawn_as_python_draws_them(open_page):
@@ -493,8 +493,8 @@ def test_scenes_are_drawn_as_python_draws_them(open_page):
             wanted = [flat(shape) for shape in shown.placed(now)]
             assert [s[0] for s in found] == [w[0] for w in wanted], env_id
             for shape, (what, points, role) in zip(found, wanted, strict=True):
-                round_one = what in ("circle", "lens")
-                assert (shape[3] if what == "circle" else shape[2] if what != "lens" else None) == role
+                round_one = what in ("circle", "magnifier")
+                assert (shape[3] if what == "circle" else shape[2] if what != "magnifier" else None) == role
                 own = [*shape[1], shape[2]] if round_one else shape[1]
                 np.testing.assert_allclose(own, points, atol=1e-4 * size)
 

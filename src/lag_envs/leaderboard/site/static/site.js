@@ -132,7 +132,7 @@
       const [x, y, angle, part] = poses[frame];
       const [cos, sin, way] = [Math.cos(angle), Math.sin(angle), part < 0 ? -1 : 1];
       const move = ([a, b]) => [x + cos * a - sin * way * b, y + sin * a + cos * way * b];
-      if (what === "circle" || what === "lens") return [[what, move(given[0]), ...given.slice(1)]];
+      if (what === "circle" || what === "magnifier") return [[what, move(given[0]), ...given.slice(1)]];
       if (what === "ruler") {
         const [step, size, role] = given;
         const [left, bottom, right, top] = view;
@@ -201,7 +201,7 @@
     pen.lineJoin = "round";
     for (const [what, a, b, c] of shapes) {
       const role = what === "circle" ? c : b;
-      if (what === "lens") {
+      if (what === "magnifier") {
         if (!only) magnify(pen, box, at(a), scale, a, b, shapes);
         continue;
       }
@@ -257,7 +257,7 @@
     pen.clip();
     const [x, y] = centre;
     const glass = { x: middle[0] - size / 2, y: middle[1] - size / 2, width: size, height: size };
-    const near = shapes.filter((shape) => shape[0] !== "lens");
+    const near = shapes.filter((shape) => shape[0] !== "magnifier");
     paint(pen, glass, [x - radius, y - radius, x + radius, y + radius], near);
     pen.restore();
     pen.strokeStyle = ink.roles.guide[1];
@@ -279,7 +279,7 @@
     const at = Array.from({ length: n }, (_, i) => posesAt(poses, picture.units, i));
     const view = windowOf(picture, at[n - 1]);
     const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
-    const shapes = at.map((now) => placed(picture, now, view).filter(([what]) => what !== "lens"));
+    const shapes = at.map((now) => placed(picture, now, view).filter(([what]) => what !== "magnifier"));
     paint(pen, box, view, shapes[n - 1], ["ground", "frame", "guide", "target", "limit", "hole"]);
     shapes.forEach((now, i) => {
       pen.globalAlpha = i === n - 1 ? 1 : mix(0.1, 0.45, i / n);
