@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from fractions import Fraction
 from types import MappingProxyType
 
 import cloudpickle
@@ -22,6 +23,7 @@ import sympy
 from sympy.physics.vector import dynamicsymbols
 
 from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes.acrobot import Acrobot
 from lag_envs.scenes.base import Scene, parameter
 from lag_envs.scenes.cart_pole import CartPole
@@ -408,6 +410,42 @@ def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same(
     assert "width" in Soft().mechanics.text and "width" not in Soft(width=0.0).mechanics.text
     assert Soft(width=0.1).mechanics.key == Soft(width=0.2).mechanics.key != Soft(width=0.0).mechanics.key
     assert Soft(width=0.0).acceleration([1.0, 0.0])["x"] == pytest.approx(-math.sqrt(2.0))
+
+
+class Bowl(Scene):
+    """A sphere that rolls in a bowl of nearly its own radius, on a spring-borne sledge."""
+
+    bowl: float = parameter(1.0, "m", above=0.0)
+    sphere: float = parameter(1.0 - 2.0**-20 + 2.0**-50, "m", above=0.0)
+    coordinates = {"x": "m", "theta": "rad"}
+    controls = {"force": "N"}
+
+    def kinetic(self, q, v, xp):
+        gap = self.bowl - self.sphere
+        along, up = v.x + gap * v.theta * xp.cos(q.theta), gap * v.theta * xp.sin(q.theta)
+        return 0.5 * v.x**2 + 0.5 * (along**2 + up**2) + 0.2 * gap**2 * v.theta**2
+
+    def potential(self, q, xp):
+        return -9.81 * (self.bowl - self.sphere) * xp.cos(q.theta) + 2.0 * q.x**2
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.force}
+
+
+def test_differences_of_parameters_keep_their_digits():
+    """The equations are expanded, (R - r)² too; sums of parameters alone are rounded once."""
+    scene, state, control = Bowl(), [0.1, -0.3, 0.4, 2.0], [0.7]
+    gap = Fraction(scene.bowl) - Fraction(scene.sphere)
+    assert scene.mass_matrix(state)[1, 1] == pytest.approx(float(Fraction(7, 5) * gap**2), rel=1e-15)
+    rolling = CylinderInCylinder(mass=1.0, shell_radius=1.0, radius=scene.sphere)
+    inertia = float(Fraction(3, 2) * gap**2)
+    assert rolling.mass_matrix([0.5, 1.0, 0.3]).item() == pytest.approx(inertia, rel=1e-15)
+    mass, acceleration = oracle_of(scene).at(state, control)
+    np.testing.assert_allclose(scene.mass_matrix(state), mass, rtol=1e-15)
+    found = scene.acceleration(state, control)
+    np.testing.assert_allclose([found["x"], found["theta"]], acceleration, rtol=1e-13)
+    exact = [float(x) for x in oracle_of(scene).flow(state, control, 1e-4)]
+    np.testing.assert_allclose(scene.simulate(state, [control], 1e-4)[-1], exact, rtol=1e-13)
 
 
 def test_what_rests_leaves_no_code():

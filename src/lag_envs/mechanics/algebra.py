@@ -593,37 +593,62 @@ def evaluate(exprs: Iterable[Expr], values: Mapping[Atom, Any], xp: Any) -> list
     exprs : iterable of Expr
         What to evaluate.
     values : mapping from Atom to number
-        A number for every symbol: floats, arrays, mpmath's or SymPy's.
+        A number for every symbol: floats, arrays, mpmath's or SymPy's. What fractions make of a term is added
+        up exactly and rounded once, so that (R - r)² keeps its digits although it is expanded.
     xp : namespace
         Functions for these numbers, named as in NumPy or as here (``arctan`` or ``atan``).
     """
     known: dict[Atom, Any] = dict(values)
+    rational = getattr(xp, "Rational", None)
+
+    def value(atom: Atom) -> Any:
+        if atom not in known:
+            assert atom.argument is not None, f"no value for {atom.text}"
+            inner = of(atom.argument)
+            if atom.function != "sum":
+                if isinstance(inner, Fraction) and rational is not Fraction:
+                    inner = number(inner)
+                inner = _call(xp, atom.function, inner)
+            known[atom] = inner
+        return known[atom]
 
     def of(expr: Expr) -> Any:
-        total: Any = None
+        collected: dict[Monomial, Any] = {}
         for monomial, c in expr.sorted_terms():
+            rest = []
+            for atom, n in monomial:
+                if isinstance(x := value(atom), Fraction):
+                    c = c * x**n
+                else:
+                    rest.append((atom, n))
+            key = tuple(rest)
+            collected[key] = collected.get(key, 0) + c
+        if collected.keys() <= {()}:
+            return collected.get((), 0)
+        total: Any = None
+        for monomial, c in collected.items():
             product: Any = None
             for atom, n in monomial:
-                if atom not in known:
-                    assert atom.argument is not None, f"no value for {atom.text}"
-                    inner = of(atom.argument)
-                    known[atom] = inner if atom.function == "sum" else _call(xp, atom.function, inner)
                 power = known[atom] if n > 0 else 1 / known[atom]
                 for _ in range(abs(n)):
                     product = power if product is None else product * power
-            value = c if isinstance(c, int) else xp_fraction(c)
-            term = value if product is None else (product if c == 1 else product * value)
+            term = number(c) if product is None else (product if c == 1 else product * number(c))
             total = term if total is None else total + term
-        return 0 if total is None else total
+        return total
 
-    def xp_fraction(c: Fraction) -> Any:
-        exact = getattr(xp, "mpf", None)
-        if exact is not None:
+    def number(c: int | Fraction) -> Any:
+        if isinstance(c, int):
+            return c
+        if (exact := getattr(xp, "mpf", None)) is not None:
             return exact(c.numerator) / c.denominator
-        rational = getattr(xp, "Rational", None)
-        return rational(c.numerator, c.denominator) if rational is not None else float(c)
+        if rational is not None:
+            return rational(c.numerator, c.denominator)
+        try:
+            return float(c)
+        except OverflowError:
+            return math.copysign(math.inf, c)
 
-    return [of(expr) for expr in exprs]
+    return [number(x) if isinstance(x, Fraction) else x for x in map(of, exprs)]
 
 
 def _call(xp: Any, name: str, x: Any) -> Any:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import control
+from lag_envs.mechanics.recording import control, parameter
 
 Array = NDArray[np.float64]
 
@@ -37,6 +37,14 @@ class Exact:
 
     def __getattr__(self, name: str) -> Any:
         return lambda x: Fraction(getattr(math, "atan" if name == "arctan" else name)(float(x)))
+
+
+def exactly(parameters: Mapping[str, float]) -> dict[Atom, Any]:
+    """Return the parameters' values by symbol, as fractions: `evaluate` rounds what they make once."""
+    return {
+        parameter(name): Fraction(value) if math.isfinite(value) else np.float64(value)
+        for name, value in parameters.items()
+    }
 
 
 def _bare(x: Any) -> Any:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.mechanics import motion, recording
 from lag_envs.mechanics.algebra import Atom, FormulaError
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point
+from lag_envs.mechanics.evaluation import Carrying, Dual, Lanes, Numeric, OfLanes, Point, exactly
 from lag_envs.mechanics.layout import Layout, make_layout
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import TWIN, Values
@@ -264,9 +264,9 @@ class Scene(metaclass=SceneType):
         y, u = (list(np.moveaxis(array, -1, 0)) for array in (states, controls))
         return Point(self.mechanics, self._symbols(), y, u, Numeric), shape
 
-    def _symbols(self) -> dict[Atom, float]:
+    def _symbols(self) -> dict[Atom, Any]:
         """Return the parameters' values by symbol."""
-        return {recording.parameter(name): np.float64(getattr(self, name)) for name in self._numbers()}
+        return exactly({name: getattr(self, name) for name in self._numbers()})
 
     @_QUIET
     def acceleration(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:

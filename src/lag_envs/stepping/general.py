@@ -16,7 +16,7 @@ import numpy as np
 
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import eliminated
+from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
@@ -176,9 +176,8 @@ class SeriesStepper:
 
 
 def _evaluated(constants: Mapping[str, Expr], parameters: Mapping[str, float]) -> dict[str, float]:
-    """Return the values of a record's constants."""
-    values = {parameter(name): value for name, value in parameters.items()}
-    numbers = evaluate(list(constants.values()), values, math)
+    """Return the values of a record's constants, each rounded once."""
+    numbers = evaluate(list(constants.values()), exactly(parameters), math)
     return {name: float(value) for name, value in zip(constants, numbers, strict=True)}
 
 

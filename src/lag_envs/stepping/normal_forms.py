@@ -25,10 +25,10 @@ from numpy.typing import ArrayLike
 
 from lag_envs.mechanics.algebra import Atom, Expr, Monomial, evaluate
 from lag_envs.mechanics.equations import place, velocity
-from lag_envs.mechanics.evaluation import Exact
+from lag_envs.mechanics.evaluation import Exact, exactly
 from lag_envs.mechanics.layout import Layout
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import control, parameter
+from lag_envs.mechanics.recording import control
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
@@ -107,8 +107,7 @@ class NormalForm:
 
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the constants, each rounded once."""
-        values = {parameter(name): Fraction(value) for name, value in parameters.items() if _used(value)}
-        numbers = evaluate([self.inertia, *self.expressions.values()], values, Exact())
+        numbers = evaluate([self.inertia, *self.expressions.values()], exactly(parameters), Exact())
         return {name: _float(x, numbers[0]) for name, x in zip(self.expressions, numbers[1:], strict=True)}
 
     # --- one control step ----------------------------------------------------------------------------------
@@ -238,10 +237,6 @@ class NormalForm:
 def _stepper(form: NormalForm, order: int, absent: frozenset[str]) -> Stepper:
     flow = {slope.FixedSlope: SLIDE, slope.TurningSlope: TURN}.get(form.kind) or pendulum_flow(order)
     return Stepper(form, flow, absent)
-
-
-def _used(value: float) -> bool:
-    return math.isfinite(value)  # a track without an end is no part of any motion
 
 
 def _float(x: Any, divisor: Any) -> float:
