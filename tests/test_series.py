@@ -573,14 +573,15 @@ def exact_step(system, state, control, dt):
 
 
 def exact_slopes(system, state, control, dt):
-    """Return the derivatives of `exact_step` by states and controls, by differences in 48 digits."""
-    little, n = flint.arb(1e-15), len(state)
-    exact, columns = exact_step(system, state, control, dt), []
-    for j in range(n + len(control)):
-        given = [*state, *control]
-        given[j] += little
-        moved = exact_step(system, given[:n], given[n:], dt)
-        columns.append([float((a - b) / little) for a, b in zip(moved, exact, strict=True)])
+    """Return the derivatives of `exact_step` by states and controls, by differences in 60 digits."""
+    with flint.ctx.workdps(60):
+        little, n = flint.arb(1e-15), len(state)
+        exact, columns = exact_step(system, state, control, dt), []
+        for j in range(n + len(control)):
+            given = [*state, *control]
+            given[j] += little
+            moved = exact_step(system, given[:n], given[n:], dt)
+            columns.append([float((a - b) / little) for a, b in zip(moved, exact, strict=True)])
     return np.array(columns).T
 
 
