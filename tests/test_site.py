@@ -11,15 +11,18 @@ import shutil
 import threading
 import time
 import warnings
+import xml.etree.ElementTree as ElementTree
 from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import sync_playwright
 from toy_pendulum import Swing
 
+from lag_envs.leaderboard.board import Board, board_data
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import Scenery, picture
@@ -77,6 +80,20 @@ def folder(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("site")
     build(data, out)
     return out
+
+
+@pytest.fixture(scope="module")
+def served(folder):
+    """Return the address of the page on a server."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *args):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -222,13 +239,16 @@ def test_what_comes_from_submissions_is_escaped(hostile):
     for name, text in (pages | files).items():
         if "/site-" in name:
             continue
+        assert isinstance(text, str)
         for bad in HOSTILE[:3]:
             assert bad not in text, name
         assert 'href="javascript' not in text and "49{%" not in text
     scripts = re.findall(r"<script[^>]*>(.*?)</script>", pages["PivotedBar-v0.html"], re.DOTALL)
     assert len(scripts) == 2 and not re.search(r"[<>&]", scripts[1])
     assert [row["name"] for row in json.loads(scripts[1])["rows"]] == [clean(name) for name in HOSTILE]
-    assert all("script-src 'self' file:;" in text and "unsafe" not in text for text in pages.values())
+    html = [text for name, text in pages.items() if name.endswith(".html")]
+    assert all("script-src 'self' file:;" in text and "unsafe" not in text for text in html)
+    ElementTree.fromstring(pages["feed.xml"])
 
 
 @pytest.mark.parametrize(
@@ -259,8 +279,8 @@ def test_little_is_enough():
         {"id": "index", "rows": []},
     ]
     pages, _ = render({"protocol": 1, "made": "today", "environments": boards})
-    names = ["-index.html", "Gone-v0-protocol-0.html", "Gone-v0.html", "index-2.html", "index.html"]
-    assert sorted(pages) == names
+    names = ["-index", "Gone-v0", "Gone-v0-protocol-0", "Gone-v0-protocol-0-A", "index", "index-2"]
+    assert sorted(pages) == sorted([*(f"{name}.html" for name in names), "feed.xml"])
     assert "No agent is ranked yet" in pages["Gone-v0.html"]
     assert "protocol 0" in pages["Gone-v0-protocol-0.html"]
 
@@ -276,12 +296,39 @@ def test_who_acts_like_another_or_looks_like_one_is_shown_as_such():
     page = pages[f"{incline.Brake.id}.html"]
     ranks = re.findall(r'class="rank">([^<]*)<', page)
     assert ranks[0] == "–" and page.count(">acts like") == 1 and page.count("though it looks the same") == 1
-    assert 'acts like <span dir="auto">The &lt;first&gt;</span>' in page and "(withdrawn)" in page
+    assert 'acts like <span dir="auto">The &lt;first&gt;</span>' in page
+    assert "(withdrawn)" in pages[f"{incline.Brake.id}-00000000.html"]
     assert (
         'not <span dir="auto">P\u0420O &amp; co</span>' in page and '<span class="remark">reference<' in page
     )
     index = pages["index.html"]
     assert "9 ranked agents" in index and f"<bdi>{rows[1]['name']}</bdi>" in index  # the best with a rank
+
+
+def test_agents_have_pages_and_news_are_fed():
+    found = board_pages.data((incline.Brake.id,), board_pages.AGENTS[:3])
+    for i, row in enumerate(found["environments"][0]["rows"]):
+        row["added"] = f"2026-11-0{i + 1}"
+    pages, files = render(found, "https://example.org/board")
+    env_id, own = incline.Brake.id, f"{incline.Brake.id}-00000001"
+    assert f'href="{own}.html"' in pages[f"{env_id}.html"]
+    page = pages[f"{own}.html"]
+    for part in ("<bdi>iLQR</bdi></h1>", "0.996", "Ada Example", 'href="https://example.org/code"',
+                 f"lag-envs watch {env_id} --agent leaderboard/submissions/{own}",
+                 f'<meta property="og:title" content="iLQR · {env_id}">',
+                 '<meta property="og:description" content="Controller: score 0.996, rank 1">'):  # fmt: skip
+        assert part in page, part
+    assert len(json.loads(re.findall(r'id="data">(.*?)<', page)[0])["rows"]) == 1
+    preview = re.findall(r'og:image" content="https://example.org/board/(assets/[^"]+png)"', page)[0]
+    assert files[preview].startswith(b"\x89PNG")
+    feed = ElementTree.fromstring(pages["feed.xml"])
+    atom = "{http://www.w3.org/2005/Atom}"
+    entries = feed.findall(f"{atom}entry")
+    assert [e.findtext(f"{atom}updated")[:10] for e in entries] == ["2026-11-03", "2026-11-02", "2026-11-01"]
+    assert entries[1].find(f"{atom}link").get("href") == f"https://example.org/board/{own}.html"
+    assert "og:image" not in render(found)[0][f"{env_id}.html"], "a preview needs a whole address"
+    with pytest.raises(ValueError, match="must begin with https:// or http://, got 'javascript:1'"):
+        render(found, "javascript:1")
 
 
 def test_frozen_boards_stand_apart():
@@ -515,39 +562,39 @@ def test_sorting_by_mouse_and_keyboard(open_page, data):
 
     assert sorted_by() == ["Rank ascending"]
     page.click("[data-key=settle]")
-    assert column(page, "summary bdi") == names("settle", True)
+    assert column(page, ".name bdi") == names("settle", True)
     assert sorted_by() == ["Settle ascending"]
     page.click("[data-key=settle]")
-    assert column(page, "summary bdi") == names("settle", False)
+    assert column(page, ".name bdi") == names("settle", False)
     assert "descending" in page.evaluate("document.querySelector('.status').textContent")
-    page.evaluate("document.querySelector('[data-key=effort]').focus()")
+    page.evaluate("document.querySelector('[data-key=return]').focus()")
     page.keyboard.press("Enter")
-    assert column(page, "summary bdi") == names("effort", True)
+    assert column(page, ".name bdi") == names("return", False)
     page.keyboard.press("Space")
-    assert sorted_by() == ["Effort descending"]
+    assert sorted_by() == ["Return ascending"]
     page.click("[data-key=name]")
-    assert column(page, "summary bdi") == sorted((r["name"] for r in rows), key=str.casefold)
+    assert column(page, ".name bdi") == sorted((r["name"] for r in rows), key=str.casefold)
     page.click("[data-key=rank]")
-    assert column(page, "summary bdi") == [r["name"] for r in rows]
+    assert column(page, ".name bdi") == [r["name"] for r in rows]
 
 
 def test_filtering(open_page, data):
     page, rows = open_page(), data["environments"][0]["rows"]
     page.click(".filter [value=controller]")
-    assert column(page, "summary bdi") == [r["name"] for r in rows if r["kind"] == "controller"]
+    assert column(page, ".name bdi") == [r["name"] for r in rows if r["kind"] == "controller"]
     assert page.evaluate("document.querySelector('.status').textContent") == "3 of 10 agents"
     page.keyboard.press("ArrowRight")
-    assert column(page, "summary bdi") == ["Value iteration, 81 nodes"]
+    assert column(page, ".name bdi") == ["Value iteration, 81 nodes"]
     page.click(".filter [value='']")
     page.click(".find input")
     page.keyboard.insert_text("pUmPing lqr")
-    assert column(page, "summary bdi") == ["Energy pumping + LQR"]
+    assert column(page, ".name bdi") == ["Energy pumping + LQR"]
     page.keyboard.insert_text(" nothing like it")
-    assert column(page, "summary bdi") == []
+    assert column(page, ".name bdi") == []
     assert page.evaluate("document.querySelector('.none').hidden") is False
     page.evaluate("document.querySelector('.find input').select()")
     page.keyboard.insert_text(" ")
-    assert len(column(page, "summary bdi")) == 10
+    assert len(column(page, ".name bdi")) == 10
 
 
 def test_intervals_as_pictures(open_page, data):
@@ -648,7 +695,7 @@ def test_pictures_of_the_ranking(open_page):
 def test_hostile_names_stay_names(open_page, hostile, tmp_path):
     build(hostile, tmp_path)
     page = open_page(root=tmp_path.as_uri())
-    names = page.evaluate("[...document.querySelectorAll('.ranking summary bdi')].map(e => e.textContent)")
+    names = page.evaluate("[...document.querySelectorAll('.ranking .name bdi')].map(e => e.textContent)")
     wanted = [clean(name) for name in HOSTILE]
     assert names == wanted
     assert page.evaluate("[...document.querySelectorAll('.legend bdi')].map(e => e.textContent)") == wanted
@@ -685,6 +732,87 @@ def test_narrow_screen(open_page, scheme):
     until(page, "getComputedStyle(document.querySelector('.ranking thead')).display !== 'none'")
 
 
+WIDTHS = (320, 375, 480, 640, 832, 833, 900, 992, 1024, 1280, 1408, 1409, 1440, 1600, 1920)
+
+
+def test_ranking_fits_at_every_width(open_page, tmp_path):
+    names = ["An agent whose authors gave it a name that goes on and on " * 3, "N" * 120]
+    build(board_pages.data(agents=[(name, "controller", 0.5) for name in names]), tmp_path)
+    for root in (None, tmp_path.as_uri()):
+        page = open_page(root=root)
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 800})
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            over = page.evaluate("(() => { const e = document.querySelector('#ranking .scroll');"
+                                 "return e.scrollWidth - e.clientWidth; })()")  # fmt: skip
+            assert over <= 0, (root, width)
+
+
+def test_agents_page(open_page):
+    page = open_page()
+    page.click(".ranking a:has-text('TD3')")
+    until(page, "document.querySelector('h1')?.innerText === 'TD3'")
+    until(page, "document.querySelectorAll('.episode option').length >= 2")
+    page.click(".play")
+    until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.1")
+    assert page.evaluate("document.querySelectorAll('#curves path').length") >= 3
+
+
+def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
+    moved = """new Promise(done => { const c = document.querySelector('.hero canvas');
+        const before = c.toDataURL(); setTimeout(() => done(c.toDataURL() !== before), 400); })"""
+    page = open_page()
+    until(page, "!document.querySelector('.film').hidden")
+    assert page.evaluate(moved)
+    page.click(".film")
+    assert not page.evaluate(moved)
+    page = open_page(reduced_motion="reduce")
+    until(page, "!document.querySelector('.film').hidden")
+    assert not page.evaluate(moved)
+    page.click(".film")
+    assert page.evaluate(moved)
+
+
+def serious(page):
+    """Return what axe finds that is serious: rule and place."""
+    found = Axe().run(page).response["violations"]
+    return [(v["id"], v["nodes"][0]["html"]) for v in found if v["impact"] in ("serious", "critical")]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["index", "PivotedBar-v0", "PivotedBar-v0-00000002"])
+def test_axe_finds_nothing_serious(open_page, served, name, scheme):
+    page = open_page(name, root=served, color_scheme=scheme, bypass_csp=True)
+    assert serious(page) == []
+
+
+@pytest.mark.slow
+def test_axe_finds_nothing_serious_on_the_whole_board(browser, tmp_path):
+    board = Path(__file__).parents[1] / "leaderboard"
+    build(board_data(Board(board)), tmp_path)
+    page = browser.new_page(bypass_csp=True)
+    for file in sorted(tmp_path.glob("*.html")):
+        page.goto(file.as_uri())
+        assert serious(page) == [], file.name
+
+
+def test_page_is_light_and_loads_on_slow_4g(served, browser):
+    """1.6 Mbit/s, 150 ms to and fro, as Lighthouse has it; nothing is played yet."""
+    for name in ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id):
+        page, sizes = browser.new_page(), []
+        page.on("response", lambda answer, sizes=sizes: sizes.append(len(answer.body())))
+        network = page.context.new_cdp_session(page)
+        network.send("Network.enable")
+        network.send("Network.emulateNetworkConditions", {
+            "offline": False, "latency": 150, "downloadThroughput": 2e5, "uploadThroughput": 1e5,
+        })  # fmt: skip
+        page.goto(f"{served}/{name}.html", wait_until="load")
+        shown = page.evaluate("performance.getEntriesByType('navigation')[0].domContentLoadedEventEnd")
+        page.wait_for_load_state("networkidle")
+        assert sum(sizes) < 300_000 and shown < 2_000, (name, sum(sizes), shown)
+        page.close()
+
+
 def test_what_a_screen_reader_meets(open_page):
     page = open_page()
     tree = page.context.new_cdp_session(page)
@@ -696,7 +824,7 @@ def test_what_a_screen_reader_meets(open_page):
         role = node["role"]["value"]
         if role in NAMED:
             assert node["name"]["value"].strip(), node
-    assert roles.count("row") == 11 + 3 and roles.count("columnheader") == 13 + 3
+    assert roles.count("row") == 11 + 3 and roles.count("columnheader") == 8 + 3
     levels = [
         int(x) for x in page.evaluate("[...document.querySelectorAll('h1, h2, h3')].map(e => e.tagName[1])")
     ]
@@ -733,13 +861,6 @@ def test_without_script_the_tables_remain(open_page):
     assert page.evaluate("getComputedStyle(document.querySelector('#watch')).display") == "none"
 
 
-def test_served(open_page, folder):
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *args):
-            pass
-
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        page = open_page(root=f"http://127.0.0.1:{server.server_port}")
-        until(page, "document.querySelectorAll('.readout dd').length > 6")
-        server.shutdown()
+def test_served(open_page, served):
+    page = open_page(root=served)
+    until(page, "document.querySelectorAll('.readout dd').length > 6")

@@ -93,6 +93,9 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one.add_argument(
         "out", metavar="OUT", nargs="?", type=Path, default=Path("site"), help="folder (default: site)"
     )
+    one.add_argument(
+        "--url", metavar="ADDRESS", default="", help="where it will be found; link previews and feed name it"
+    )
     one = action("serve", "write the page into a temporary folder and show it to this machine", _serve)
     one.add_argument(
         "--port", metavar="N", type=int, default=8000, help="port; 0 for any that is free (default: 8000)"
@@ -362,7 +365,7 @@ def _pin(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.site.build import build
 
-    build(board_data(Board(args.board)), args.out)
+    build(board_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 

@@ -96,6 +96,8 @@ class Task:
         The largest return from given starts, where it is known.
     examples : record.Examples
         Cases for tests and pictures.
+    difficulty : str
+        Why it is hard, in a sentence or two, for its page.
     note : str
         What docs/agents.md says of its agents, without numbers: the tables have those.
 
@@ -130,6 +132,7 @@ class Task:
     value_iteration: ClassVar[ValueIteration | None] = None
     optimum: ClassVar[Optimum | None] = None
     examples: ClassVar[Examples] = Examples()
+    difficulty: ClassVar[str] = ""
     note: ClassVar[str] = ""
 
     def __init_subclass__(cls, **keywords: Any) -> None:

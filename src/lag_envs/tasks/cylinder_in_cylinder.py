@@ -258,6 +258,10 @@ class Tilt(_Shell):
         variants={"fixed target": {"target": -0.4}},
         feedback="30.3 * (target - theta) - 3.77 * theta_dot + 0.355 * (16.35 * sin(target) - psi_dot)",
     )
+    difficulty = (
+        "The shell drags the cylinder along only while it turns, and to hold an angle it has to keep "
+        "turning at one rate; the cylinder swings about that place with little damping."
+    )
     note = """
 Best is iLQR; LQR, PD and the greedy policy of value iteration are hardly behind. Among the learners TD3 is
 better than PPO on most seeds, with far fewer steps. Both are nearly as soon at the target as the
@@ -463,6 +467,10 @@ class Pump(_Shell):
         feedback="1.78 * (6.187 - 0.5 * theta_dot**2 - 16.35 * (1 - cos(theta))) * theta_dot"
         " - 0.932 * psi_dot + 0.315 * theta",
     )
+    difficulty = (
+        "The drive is weak: it has to push in time with the swing for many periods, and to stop pumping "
+        "when the energy is right."
+    )
     note = """
 Best is the greedy policy of value iteration. Doing nothing is a trap: every action costs effort before it
 pays. All learners in the table have left it. TD3 gets to the wanted energy as soon as the energy pump, and
@@ -659,6 +667,10 @@ class Damping(Task):
             "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
         feedback="where(theta * theta_dot >= 0, 1, 14.6 * (abs(theta_dot) - 6.94 * abs(theta)))",
+    )
+    difficulty = (
+        "Too little drag lets the cylinder swing on, too much makes it creep, and too much speed makes it "
+        "leave the shell: the best brake changes with the motion."
     )
     note = """
 Best is the greedy policy of value iteration, and the switching line is as good within what these episodes

@@ -184,6 +184,10 @@ class Tilt(Task):
         variants={"quasi-static": {"control": "tilt"}, "fixed target": {"target": 0.2}},
         feedback="43.4 * (clip(-1.45 * (x - target) - 1.28 * w, -0.1, 0.1) - phi)",
     )
+    difficulty = (
+        "Tilting moves the cylinder twice: by the slope and by the plane that carries it, one against the "
+        "other. Whoever tilts too far cannot turn the plane back in time to stop."
+    )
     note = """
 Best is iLQR, before the greedy policy of value iteration, whose values are interpolated between targets, and
 the cascade. PPO is later at the mark than the cascade, and stops beside it where the cascade ends on it.
@@ -465,6 +469,10 @@ class Brake(Task):
             "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
         feedback="14.6 * (v - 0.149 - 2.33 * distance)",
+    )
+    difficulty = (
+        "Braking early wastes time, braking late crosses too fast: the best policy switches once, and "
+        "where it does depends on the speed at the start."
     )
     note = """
 Best is the switching line: roll freely, then brake fully along the curve that ends at the line at the right

@@ -200,6 +200,11 @@ class SwingUp(_Bar):
         },
         variants={"endless track": {"track": math.inf}, "no track": {"track": None}},
     )
+    difficulty = (
+        "The support is too weak to lift the bar in one go, so energy has to be pumped in over several "
+        "swings, within half a metre of track; at the top the bar is unstable and a late catch is a lost "
+        "one."
+    )
     note = """
 Best is iLQR, which plans on the exact model from two sides and leaves the hold to the LQR. Energy shaping
 pumps to the energy of upright and waits for the bar to get there. PPO's seeds are nearly as good, but for one
@@ -327,6 +332,10 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
             "com_distance": [0.3, 1e-2, 1e-4, 1.0, 0.3, 0.1, 5.0],
             "damping": [0.0, 0.0, 0.0, 1.0, 0.1, 0.01, 0.0],
         },
+    )
+    difficulty = (
+        "The support is too weak to lift the bar in one go: energy has to be pumped in over several "
+        "swings, and the unstable upright rest caught at the right speed."
     )
     note = """
 Best is iLQR, and it beats the greedy policy of value iteration, whose moments of switching are smeared over a
@@ -487,6 +496,10 @@ class Balance(_Bar):
             "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5],
         },
         feedback="1.83 * s + 1.43 * s_dot - 12.4 * e - 1.84 * theta_dot",
+    )
+    difficulty = (
+        "The upright rest is unstable, kicks come at random, and to push the bar back the support must "
+        "first move the wrong way: what saves the bar uses up the track."
     )
     note = """
 Best is the LQR whose weights were tuned for the kicks, and PPO is as good within what these episodes tell.

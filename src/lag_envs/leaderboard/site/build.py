@@ -1,4 +1,4 @@
-"""Writes the leaderboard's page: an overview, and a page for every environment.
+"""Writes the leaderboard's page: an overview, a page for every environment and agent, a feed of new entries.
 
 What comes from submissions is untrusted. It reaches HTML through jinja2's escaping only, scripts as JSON
 without ``<``, ``>`` and ``&``, and links only where it is an address of http or https.
@@ -27,6 +27,9 @@ MANIFEST = "site.json"
 STATIC = Path(__file__).parent / "static"
 #: Poses of one episode that an overview's picture shows.
 POSES = 15
+#: Entries of the feed.
+NEWS = 50
+ABOUT = "Leaderboard of lag_envs: every score recomputed from a policy that is data only."
 
 KINDS = {"learned": "Learned", "controller": "Controller", "optimal": "Optimal"}
 
@@ -67,7 +70,7 @@ COLUMNS = (
 )
 
 
-def build(data: Mapping[str, Any], out: Path) -> None:
+def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     """Write the page.
 
     A browser that looks at the old page meanwhile, and a process killed at any moment, leave whole pages:
@@ -80,9 +83,13 @@ def build(data: Mapping[str, Any], out: Path) -> None:
         What `lag_envs.leaderboard.board.board_data` returns.
     out : Path
         Folder of the page; made if it does not exist.
+    url : str, optional
+        Address at which the folder will be found. Previews of links need it for their pictures.
 
     Raises
     ------
+    ValueError
+        If the address is none of http or https.
     FileExistsError
         If the folder holds an ``index.html`` that no earlier build wrote.
     NotADirectoryError, OSError
@@ -90,7 +97,7 @@ def build(data: Mapping[str, Any], out: Path) -> None:
     """
     out = Path(out)
     before = _manifest(out)
-    pages, files = render(data)
+    pages, files = render(data, url)
     wanted = {**files, **pages}
     store.write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
     for name, text in wanted.items():
@@ -102,13 +109,16 @@ def build(data: Mapping[str, Any], out: Path) -> None:
     store.write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
 
 
-def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the pages, the overview last, and the files they refer to: text by path."""
-    files: dict[str, str] = {}
+def render(data: Mapping[str, Any], url: str = "") -> tuple[dict[str, str], dict[str, str | bytes]]:
+    """Return the pages, the overview last, and the files they refer to: content by path."""
+    if url and not safe_url(url):
+        raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
+    files: dict[str, str | bytes] = {}
 
-    def keep(stem: str, kind: str, text: str) -> str:
-        name = f"assets/{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.{kind}"
-        files[name] = text
+    def keep(stem: str, kind: str, content: str | bytes) -> str:
+        found = hashlib.sha256(content.encode() if isinstance(content, str) else content)
+        name = f"assets/{stem}-{found.hexdigest()[:10]}.{kind}"
+        files[name] = content
         return name
 
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
@@ -117,34 +127,71 @@ def render(data: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
     for given in data["environments"]:
         scenery = Scenery(str(given["id"]))
         board = _board(_clean(given), data["protocol"], scenery)
-        while board["page"] in taken:
-            board["page"] += "-2"
-        taken.add(board["page"])
+        board["page"] = _unused(board["page"], taken)
         for i, row in enumerate(board["rows"]):
+            own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")
+            row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
             replays = row.pop("replays")
             row["file"] = None
             if replays:
                 # The script that fetches the file knows it by this key.
                 episodes = _json([scenery.episode(replay) for replay in replays])
                 row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({episodes});\n")
+        board["film"] = next((row["file"] for row in board["rows"] if row["name"] == board["shown"]), None)
+        preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
+        board["preview"] = preview and keep(board["page"], "png", preview)
         boards.append(board)
 
     templates = Environment(
         loader=PackageLoader("lag_envs.leaderboard.site"), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    templates.filters |= {"number": number, "steps": steps, "duration": duration, "percent": percent}
+    filters = {"number": number, "steps": steps, "duration": duration, "percent": percent}
+    templates.filters |= filters | {"about": _about}
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
         "script": script, "protocol": data["protocol"], "value_of": value_of, "embed": _embedded,
+        "url": url and url.rstrip("/") + "/", "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
-    page = templates.get_template("environment.html")
-    pages = {f"{b['page']}.html": page.render(board=b, title=b["id"], now=b["page"]) for b in boards}
-    index = templates.get_template("index.html")
-    pages["index.html"] = index.render(title="Overview", now="index", summary=summary)
+    pages: dict[str, str] = {}
+
+    def page(template: str, name: str, **values: Any) -> None:
+        pages[name] = templates.get_template(template).render(file=name, **values)
+
+    for b in boards:
+        known = {"now": b["page"], "preview": b["preview"]}
+        for row in b["rows"]:
+            alone = b | {"rows": [row]}
+            title = f"{row['name']} · {b['id']}"
+            page("agent.html", f"{row['page']}.html", board=alone, title=title, about=_about(row), **known)
+        page("environment.html", f"{b['page']}.html", board=b, title=b["id"], about=b["title"], **known)
+    news = sorted(
+        ((b, row) for b in boards if not b["frozen"] for row in b["rows"] if row["added"]),
+        key=lambda entry: entry[1]["added"], reverse=True,
+    )  # fmt: skip
+    page("feed.xml", "feed.xml", entries=news[:NEWS])
+    page("index.html", "index.html", title="Overview", about=ABOUT, now="index", summary=summary)
     return pages, files
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", text)[:80]
+
+
+def _unused(name: str, taken: set[str]) -> str:
+    """Return a name that is not taken yet, and take it."""
+    while name in taken:
+        name += "-2"
+    taken.add(name)
+    return name
+
+
+def _about(row: Mapping[str, Any]) -> str:
+    """Return an agent in a sentence."""
+    place = "" if row["rank"] is None else f", rank {row['rank']}"
+    return f"{KINDS.get(row['kind'], row['kind'])}: score {number(row['score'])}{place}"
 
 
 def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:
@@ -160,10 +207,12 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "state_units": [],
         "dt": None,
         "title": given["id"],
+        "about": [],
+        "difficulty": "",
     }
     board |= {"protocol": protocol} | given | describe(given["id"])
     board["rows"] = [_row(dict(row)) for row in given["rows"]]
-    board["page"] = re.sub(r"[^A-Za-z0-9_-]+", "-", str(given["id"]))[:80]
+    board["page"] = _slug(str(given["id"]))
     if board["protocol"] != protocol:
         board["page"] += f"-protocol-{re.sub('[^0-9]+', '-', str(board['protocol']))}"
     known, board["optimum"] = board["known"], None
@@ -176,12 +225,14 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     states = _apart(shown["replays"][0]["states"], board["state_names"]) if shown else scenery.start
     target = shown["replays"][0].get("target") if shown else None
     board["poster"] = scenery.still(states, target) if states else None
+    board |= {"states": states, "goal_of_states": target}
     return board
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     empty: dict[str, Any] = dict.fromkeys(
-        [c.key for c in COLUMNS] + ["interval", "license", "description", "hardware", "id", "above", "alike"]
+        [c.key for c in COLUMNS]
+        + ["interval", "license", "description", "hardware", "id", "above", "alike", "added"]
     )
     empty |= {"looks_like": "", "reference": False}
     row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row
@@ -334,7 +385,7 @@ def _manifest(out: Path) -> set[str]:
     try:
         names = json.loads((out / MANIFEST).read_text("utf-8"))["files"]
         # A manifest that somebody wrote by hand must not remove what lies elsewhere.
-        return {n for n in names if re.fullmatch(r"(assets/)?[\w-]+\.(html|css|js)", n)}
+        return {n for n in names if re.fullmatch(r"(assets/)?[\w-]+\.(html|css|js|png|xml)", n)}
     except FileNotFoundError:
         if (out / "index.html").exists():
             raise FileExistsError(

@@ -7,6 +7,8 @@ written, for these are small; one that never changes is a single number.
 from __future__ import annotations
 
 import inspect
+import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.picture import Picture
-from lag_envs.scenes.shapes import Circle, Magnifier, Ruler, Shape
+from lag_envs.scenes.shapes import Circle, Frame, Magnifier, Ruler, Shape
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
@@ -35,8 +37,9 @@ def describe(env_id: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``title``, ``state_names``, ``state_units``, ``dt`` [s] and ``picture`` (None where the scene has no
-        bodies). Empty for an id that this version does not have, such as that of a frozen board.
+        ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``state_names``, ``state_units``,
+        ``dt`` [s] and ``picture`` (None where the scene has no bodies). Empty for an id that this version
+        does not have, such as that of a frozen board.
 
     Examples
     --------
@@ -48,8 +51,16 @@ def describe(env_id: str) -> dict[str, Any]:
     if env_id not in TASKS:
         return {}
     task = TASKS[env_id]()
+    title, _, text = (inspect.getdoc(type(task)) or env_id).partition("\n")
+    description = re.search(r"## Description\n+(.*?)(?=\n+## |\Z)", text, re.DOTALL)
     return {
-        "title": (inspect.getdoc(type(task)) or env_id).partition("\n")[0],
+        "title": title,
+        "about": [
+            " ".join(paragraph.replace("`", "").split())
+            for paragraph in (description[1] if description else "").split("\n\n")
+            if paragraph.strip()
+        ],
+        "difficulty": task.difficulty,
         "state_names": list(task.scene.state_names),
         "state_units": list(task.scene.state_units),
         "dt": task.dt,
@@ -112,6 +123,21 @@ class Scenery:
     def still(self, states: Sequence[Sequence[float]], target: Any) -> dict[str, Any]:
         """Return the poses of single states."""
         return {"count": len(states), "target": target, "poses": self._poses(states, None, target, 0.0)}
+
+    def preview(self, states: Sequence[Sequence[float]], target: Any) -> bytes | None:
+        """Return the last of some states as a PNG; None without pygame, or with nothing to be seen."""
+        task, shown = self._task, self._shown
+        if task is None or shown is None or not shown.shapes or not states:
+            return None
+        try:
+            import pygame
+        except ImportError:
+            return None
+        from lag_envs.envs.rendering import paint
+
+        png = io.BytesIO()
+        pygame.image.save(paint(task, Frame(list(states[-1]), target=target), shown), png, "preview.png")
+        return png.getvalue()
 
     @property
     def start(self) -> list[list[float]]:

@@ -288,6 +288,48 @@
     pen.globalAlpha = 1;
   }
 
+  /** Show an episode in place of its poster, again and again, unless the reader wants calm. */
+  function startFilm() {
+    const canvas = find(".hero [data-poster]");
+    const button = find(".film");
+    if (!canvas || !button || !board.film || !board.picture) return;
+    let [replay, running, seen, begun] = [null, !calm.matches, true, 0];
+    const frame = (now) => {
+      if (!running || !seen) return;
+      begun ||= now;
+      const length = replay.end * replay.dt;
+      const time = Math.min(((now - begun) / 1000) % (length + 1), length);
+      const at = Math.min(Math.floor(time / replay.dt), replay.end - 1);
+      const poses = posesAt(replay.poses, board.picture.units, at, Math.min(time / replay.dt - at, 1));
+      const { pen, width, height } = fit(canvas);
+      pen.clearRect(0, 0, width, height);
+      const view = windowOf(board.picture, poses);
+      const box = { x: 0.02 * width, y: 0.02 * height, width: 0.96 * width, height: 0.96 * height };
+      if (width) paint(pen, box, view, placed(board.picture, poses, view));
+      requestAnimationFrame(frame);
+    };
+    const show = () => {
+      button.textContent = running ? "Pause" : "Play";
+      begun = 0;
+      if (running && replay) requestAnimationFrame(frame);
+      else poster(canvas, board);
+    };
+    button.addEventListener("click", () => {
+      running = !running;
+      show();
+    });
+    load(board.film).then((replays) => {
+      if (!replays[0]?.poses) return;
+      [replay, button.hidden] = [replays[0], false];
+      new IntersectionObserver(([entry]) => {
+        const before = seen;
+        seen = entry.isIntersecting;
+        if (seen && !before && running) show();
+      }).observe(canvas);
+      show();
+    }, () => {});
+  }
+
   // --- replays ---------------------------------------------------------------------------------------------
 
   const fetched = new Map();
@@ -593,7 +635,7 @@
     const ready = board.rows.map((row, i) => (row.file ? i : -1)).filter((i) => i >= 0);
     const other = ready.find((i) => board.rows[i].kind !== board.rows[ready[0]].kind) ?? ready[1];
     choose(sides[0], ready[0]);
-    choose(sides[1], other ?? null);
+    if (sides[1]) choose(sides[1], other ?? null);
     return () => {
       for (const side of sides) side.background = null;
       show();
@@ -1185,6 +1227,7 @@
     redraw.push(startPlayer(), startCharts(), () => {
       for (const canvas of all("[data-poster]")) poster(canvas, board);
     });
+    startFilm();
   }
   const again = () => redraw.forEach((each) => each?.());
   again();
