@@ -129,8 +129,6 @@ class ValueIteration:
         Share of the grid in which so much is lost that figures need not tell one place from another.
     mirror : str
         Entry of the state, or ``"target"``, on whose sign the submitted table is mirrored; empty: on none.
-    beside : str
-        A controller whose returns in the same episodes are kept beside the numbers; empty: none.
     relaxed : str
         Id whose solution bounds this task from above, in place of a grid of its own; it is looked up at the
         entries `keep` of the state.
@@ -145,7 +143,6 @@ class ValueIteration:
     levels: tuple[float, ...] = (2, 4, 8)
     lost: float = 0.0
     mirror: str = ""
-    beside: str = ""
     relaxed: str = ""
 
 

@@ -11,11 +11,11 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -205,6 +205,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "frozen": False,
         "state_names": [],
         "state_units": [],
+        "pairs": [],
         "dt": None,
         "title": given["id"],
         "about": [],
@@ -269,13 +270,11 @@ def safe_url(url: Any) -> str | None:
 
 def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequence[float]]:
     """Return states of an episode at equal times, while most of it happens."""
-    angle = names.index("theta") if "theta" in names else 0
     if not names or len(states[0]) != len(names):
         return []
-    path = [0.0]
-    for a, b in pairwise(states):
-        path.append(path[-1] + abs(b[angle] - a[angle]))
-    end = max(1, next((i for i, x in enumerate(path) if x >= 0.98 * path[-1]), len(path) - 1))
+    values = np.nan_to_num(np.array(states, np.float64))
+    path = (np.abs(np.diff(values, axis=0)) / np.maximum(np.ptp(values, axis=0), 1e-9)).sum(axis=1).cumsum()
+    end = 1 + int(np.searchsorted(path, 0.98 * path[-1])) if len(path) else 1
     chosen = [round(i * end / (POSES - 1)) for i in range(POSES)]
     return [states[min(i, len(states) - 1)] for i in dict.fromkeys(chosen)]
 

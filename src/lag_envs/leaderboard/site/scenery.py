@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.scenes.base import Scene
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Circle, Frame, Magnifier, Ruler, Shape
 from lag_envs.tasks import TASKS
@@ -38,8 +39,8 @@ def describe(env_id: str) -> dict[str, Any]:
     -------
     dict
         ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``state_names``, ``state_units``,
-        ``dt`` [s] and ``picture`` (None where the scene has no bodies). Empty for an id that this version
-        does not have, such as that of a frozen board.
+        ``pairs`` (which entries are a coordinate and its rate), ``dt`` [s] and ``picture`` (None where the
+        scene has no bodies). Empty for an id that this version does not have, such as a frozen board's.
 
     Examples
     --------
@@ -63,9 +64,22 @@ def describe(env_id: str) -> dict[str, Any]:
         "difficulty": task.difficulty,
         "state_names": list(task.scene.state_names),
         "state_units": list(task.scene.state_units),
+        "pairs": _pairs(task.scene),
         "dt": task.dt,
         "picture": picture(Picture(task)),
     }
+
+
+def _pairs(scene: Scene) -> list[list[int]]:
+    """Return where the state has a coordinate and its rate, free ones first."""
+    state, free = scene._layout.state, scene._layout.free
+    found = [
+        [i, j]
+        for i, a in enumerate(state)
+        for j, b in enumerate(state)
+        if a.kind == "place" and b.kind != "place" and a.coordinate == b.coordinate
+    ]
+    return sorted(found, key=lambda pair: state[pair[0]].coordinate not in free)
 
 
 def picture(shown: Picture) -> dict[str, Any] | None:

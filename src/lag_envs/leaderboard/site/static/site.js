@@ -711,22 +711,15 @@
   // --- phase portraits -------------------------------------------------------------------------------------
 
   /** Which coordinates have a rate in the state; first the pair that the value function is of. */
-  function pairsOf({ state_names: names, state_units: units, value }) {
-    const found = [];
-    names.forEach((name, i) => {
-      // Where the plane turns, the state has w = x' + R phi' in place of the rate of x.
-      const j = names.indexOf(name === "x" && !names.includes("x_dot") ? "w" : `${name}_dot`);
-      if (j >= 0) found.push([i, j]);
-    });
-    // The tilt of a plane and the shell's rate: what is left is drawn against the first coordinate.
+  function pairsOf({ state_names: names, state_units: units, pairs, value }) {
+    const found = [...pairs];
     const labels = (value?.axes ?? []).map((axis) => String(axis.label).replace(/\s*[[(].*$/, ""));
     const own = labels.map((label) => names.findIndex((name) => name === label || symbol(name) === label));
     if (own.length === 2 && own.every((i) => i >= 0) && !found.some(([i, j]) => i === own[0] && j === own[1])) {
       found.push(own);
     }
     const shaded = ([i, j]) => i === own[0] && j === own[1];
-    const angle = ([i]) => names[i] === "theta";
-    found.sort((a, b) => shaded(b) - shaded(a) || angle(b) - angle(a));
+    found.sort((a, b) => shaded(b) - shaded(a));
     return found.map((pair) => ({
       x: pair[0],
       y: pair[1],
