@@ -285,7 +285,7 @@ def test_play_steps_and_starts_anew(name, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "r: start anew" in out
     if name.endswith("Drift"):
-        assert "time is up, sum of rewards" in out
+        assert "time is up: return" in out
 
 
 # --- report ---

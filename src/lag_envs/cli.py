@@ -7,10 +7,11 @@ To add a subcommand, write a function that declares its arguments and one that r
 from __future__ import annotations
 
 import argparse
+import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import date
 from importlib import import_module
 from importlib.util import find_spec
@@ -45,9 +46,14 @@ class Command(NamedTuple):
 
 def run_list(args: argparse.Namespace) -> int:
     """Print a line for every environment."""
-    head = ("id", "observation", "control", "dt", "steps", "length")
-    print("\n".join(columns([head, *(_line(id) for id in TASKS)])))
-    print("\n`lag-envs info ID` tells more about one.")
+    head, *rows = columns([("id", "control", "dt", "steps", "length"), *(_line(id) for id in TASKS)])
+    print(head)
+    for id, row in zip(TASKS, rows, strict=True):
+        print(f"{row}\n  {(inspect.getdoc(TASKS[id]) or '').partition(chr(10))[0]}")
+    print(
+        "\n`lag-envs info ID` tells more about one, `lag-envs play ID` lets you drive, "
+        "`lag-envs watch ID` shows how it is done."
+    )
     return 0
 
 
@@ -55,7 +61,6 @@ def _line(id: str) -> tuple[str, ...]:
     task = _task(id)
     return (
         id,
-        ", ".join(task.observation),
         ", ".join(_range(task, acting) for acting in task.formulas.acting),
         f"{task.dt:g} s",
         f"{task.limit:g}",
@@ -90,7 +95,27 @@ def run_info(args: argparse.Namespace) -> int:
         name = _known(args.id)
         task = _task(name)
     print("\n".join(facts(task, name)))
+    print("\n".join(_agents(task, name, args.id)))
     return 0
+
+
+def _agents(task: Task, name: str, given: str) -> list[str]:
+    """Return what there is to see of an environment."""
+    from lag_envs.scores import known_returns
+    from lag_envs.watch import known
+
+    lines = ["", "Agents by name, and how to see them", *_rows(known(task, name))]
+    lines += [f"  lag-envs watch {given} --agent NAME, or drive yourself: lag-envs play {given}"]
+    if scale := known_returns(name):
+        lines += [
+            "",
+            f"Returns: random actions {scale.random:.4g}, the best known {scale.best:.4g} ({scale.policy})",
+        ]
+    return lines
+
+
+def _rows(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    return [f"  {line}" for line in columns(rows)]
 
 
 # --- bench ---
@@ -331,39 +356,174 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     return "", folders[0] if folders else "report"
 
 
-# --- play ---
+# --- play, watch ---
 
 
 def declare_play(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``play``."""
-    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN}")
-    parser.add_argument(
-        "--seed", metavar="N", type=int, help="seed of the starts (default: another each time)"
-    )
-    parser.add_argument("--steps", metavar="N", type=_count, help="end after so many steps")
+    _declare_shown(parser, "seed of the starts")
 
 
 def run_play(args: argparse.Namespace) -> int:
     """Let the user drive."""
     from gymnasium.error import Error
 
-    if find_spec("pygame") is None:
-        raise UserError('pygame is missing: pip install "lag-envs[render]"')
-    from lag_envs import own_files
+    _needs("render", "pygame")
     from lag_envs.play import play
 
-    if args.seed is not None and args.seed < 0:
-        raise UserError(f"--seed must be at least 0, got {args.seed}")
-    if is_file(args.id):
-        task, path = own_files.one(args.id), own_files.split(args.id)[0]
-        (id,) = own_files.registered(f"{path}:{task.__name__}")
-    else:
-        id = _known(args.id)
+    id, _ = _shown(args)
     try:
         play(id, steps=args.steps, seed=args.seed)
     except Error as error:
         raise UserError(str(error)) from error
     return 0
+
+
+def declare_watch(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``watch``."""
+    _declare_shown(parser, "seed of the first episode, the others' follow it")
+    parser.add_argument(
+        "--agent",
+        metavar="NAME|FILE",
+        help="its name, as `lag-envs info ID` lists them, or on the board; a submission's folder; or a model"
+        " of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the policy"
+        " that comes with the package)",
+    )
+    parser.add_argument(
+        "--episodes", metavar="N", type=_count, help="how many (default: 1 in a video, else endless)"
+    )
+    parser.add_argument(
+        "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif in place of opening a window"
+    )
+    parser.add_argument(
+        "--board",
+        metavar="FOLDER",
+        type=Path,
+        help="whose agents go by name too (default: the folder leaderboard, if there is one here)",
+    )
+
+
+def run_watch(args: argparse.Namespace) -> int:
+    """Show what an agent does."""
+    import secrets
+
+    from gymnasium.error import Error
+
+    _needs("render", *(["moviepy", "PIL"] if args.video else []), "pygame")
+    _needs("leaderboard", "pydantic", "safetensors", "scipy", "sympy", "tomli_w")
+    from lag_envs import watch
+
+    id, task = _shown(args)
+    board = Path("leaderboard") if args.board is None else args.board
+    if args.board is None and not (board / "board.jsonl").is_file():
+        board = None
+    try:
+        name, agent = watch.load(id, task, args.agent, board)
+        seed = secrets.randbelow(2**31) if args.seed is None else args.seed
+        print(f"{id}: {name}", flush=True)
+        watch.watch(id, agent, seed=seed, episodes=args.episodes, steps=args.steps, video=args.video)
+    except Error as error:
+        raise UserError(f"{error}, and --video FILE neither") from error
+    return 0
+
+
+def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
+    """Declare what all that shows an environment takes."""
+    parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
+    parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
+    parser.add_argument("--steps", metavar="N", type=_count, help="end after so many steps")
+
+
+def _shown(args: argparse.Namespace) -> tuple[str, Task]:
+    """Return id and task of what is to be shown."""
+    from lag_envs import own_files
+    from lag_envs.tasks.registration import make_task
+
+    if args.seed is not None and args.seed < 0:
+        raise UserError(f"--seed must be at least 0, got {args.seed}")
+    if not is_file(args.id):
+        return (id := _known(args.id)), _task(id)
+    task, path = own_files.one(args.id), own_files.split(args.id)[0]
+    (id,) = own_files.registered(f"{path}:{task.__name__}")
+    return id, make_task(id)
+
+
+def _needs(extra: str, *packages: str) -> None:
+    """Raise a UserError that names what is missing, and its remedy."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise UserError(f'{package} is missing: pip install "lag-envs[{extra}]"')
+
+
+# --- new ---
+
+
+def declare_new(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``new``."""
+    parser.add_argument("file", metavar="FILE", help="the file to write, such as my_scene.py")
+
+
+def run_new(args: argparse.Namespace) -> int:
+    """Write a scene and a task to start from."""
+    from lag_envs.starter import start
+
+    path = start(Path(args.file))
+    print(
+        f"{path} is written: a pendulum, its energies and a task. Change them, then:\n"
+        f"  lag-envs info {path}       what follows from the energies\n"
+        f"  lag-envs play {path}       drive it\n"
+        f"  lag-envs report {path}     measure its errors"
+    )
+    return 0
+
+
+# --- completion ---
+
+
+def declare_completion(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``completion``."""
+    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help=" or ".join(SHELLS))
+
+
+def run_completion(args: argparse.Namespace) -> int:
+    """Print the script with which a shell completes the command."""
+    _needs("completion", "shtab")
+    import shtab
+
+    whole = parser()
+    for one in _parsers(whole):
+        for argument in one._actions:
+            name = argument.metavar if isinstance(argument.metavar, str) else ""
+            if argument.choices is not None:
+                continue
+            if argument.dest in ("id", "ids", "env"):
+                argument.complete = COMPLETE_ID  # type: ignore[attr-defined]
+            elif any(word in name for word in ("FOLDER", "PROJECT", "OUT")):
+                argument.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
+            elif "FILE" in name:
+                argument.complete = shtab.FILE  # type: ignore[attr-defined]
+    ids = " ".join(TASKS)
+    preamble = {
+        "bash": f'_lag_envs_ids() {{ compgen -W "{ids}" -- "$1"; compgen -f -X "!*.py" -- "$1"; }}',
+        "zsh": "_lag_envs_ids() { _alternative "
+        f"'ids:environment:({ids})' 'files:file:_files -g \"*.py\"' }}",
+    }
+    print(shtab.complete(whole, shell=args.shell, preamble=preamble))  # type: ignore[arg-type]
+    return 0
+
+
+SHELLS = ("bash", "zsh", "tcsh")
+#: Environments and a user's own files, for the shells in which functions complete.
+COMPLETE_ID = {"bash": "_lag_envs_ids", "zsh": "_lag_envs_ids", "tcsh": "f:*.py"}
+
+
+def _parsers(whole: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield a parser and those of its subcommands."""
+    yield whole
+    for action in whole._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for one in action.choices.values():
+                yield from _parsers(one)
 
 
 # --- hyperparams ---
@@ -450,7 +610,11 @@ COMMANDS: tuple[Command, ...] = (
     Command(
         "list",
         "list the environments",
-        "List the environments: observation, control, control interval, steps and length of an episode.",
+        """List the environments: what to do, control, control interval, steps and length of an episode.
+
+examples:
+  lag-envs list
+  lag-envs list | grep Incline""",
         lambda parser: None,
         run_list,
     ),
@@ -516,15 +680,57 @@ examples:
     ),
     Command(
         "play",
-        "drive an environment by keys",
-        """Drive an environment by keys, in a window, at the pace of its control interval: the arrow keys are
-for the first two controls, a, d, s and w for two more.
+        "drive an environment by keys or gamepad",
+        """Drive an environment in a window, in real time: the arrow keys are for the first two controls,
+a, d, s and w for two more; the sticks of a gamepad do the same, little by little. At an episode's end it
+tells the return, and the score on the leaderboard's scale.
 
 examples:
   lag-envs play PivotedBar-v0
+  lag-envs play PivotedBar-v0 --seed 1       the same start each time
   lag-envs play ball_on_beam.py              a task of your own; this runs the file""",
         declare_play,
         run_play,
+    ),
+    Command(
+        "watch",
+        "watch an agent, in a window or as a video",
+        """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
+that comes with the package, the best of the leaderboard; controllers go by name.
+
+examples:
+  lag-envs watch PivotedBar-v0
+  lag-envs watch PivotedBar-v0 --agent "energy shaping + LQR"
+  lag-envs watch PivotedBar-v0 --seed 1 --video episode.mp4
+  lag-envs watch InclineTilt-v0 --agent leaderboard/submissions/InclineTilt-v0-ppo-b9d778e2
+  lag-envs watch ball_on_beam.py --agent model.zip     a task and a model of your own; this runs both""",
+        declare_watch,
+        run_watch,
+    ),
+    Command(
+        "new",
+        "write a scene and a task to start from",
+        """Write a file with a scene and a task of your own to start from, with comments. A file that is there
+is left as it is.
+
+examples:
+  lag-envs new my_scene.py
+  lag-envs info my_scene.py""",
+        declare_new,
+        run_new,
+    ),
+    Command(
+        "completion",
+        "print a script that completes this command in a shell",
+        """Print a script with which a shell completes commands, options, environments and files (extra
+`completion`).
+
+examples:
+  lag-envs completion bash > ~/.local/share/bash-completion/completions/lag-envs
+  lag-envs completion zsh > ~/.zfunc/_lag-envs                  a folder of $fpath
+  lag-envs completion tcsh > ~/.lag-envs.tcsh                   and in ~/.tcshrc: source ~/.lag-envs.tcsh""",
+        declare_completion,
+        run_completion,
     ),
     Command(
         "hyperparams",
@@ -601,6 +807,9 @@ examples:
 EXAMPLES = """examples:
   lag-envs list                      what environments there are
   lag-envs info PivotedBar-v0        all about one of them
+  lag-envs play PivotedBar-v0        drive it
+  lag-envs watch PivotedBar-v0       see how it is done
+  lag-envs new my_scene.py           begin one of your own
   lag-envs bench --quick             how fast they are beside others
   lag-envs report --quick            how wrong they are beside others
   lag-envs leaderboard list          who is best at them

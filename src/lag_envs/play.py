@@ -1,4 +1,4 @@
-"""Drive an environment by keys; the command ``lag-envs play``."""
+"""Drive an environment by keys or gamepad; the command ``lag-envs play``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import gymnasium as gym
 import numpy as np
 
 from lag_envs.scenes import StepRefused
+from lag_envs.scores import in_words
 
 #: Keys of the controls, in order: towards the lower and towards the upper end.
 PAIRS = (("left", "right"), ("down", "up"), ("a", "d"), ("s", "w"))
+#: What of a gamepad does the same.
+STICKS = ("left stick, to the sides", "left stick, up and down", "right stick, to the sides", "right stick")
+#: Below this a stick is at rest.
+DEAD = 0.12
 
 
 def keys_of(space: gym.Space) -> list[tuple[str, str]]:
@@ -24,8 +29,13 @@ def keys_of(space: gym.Space) -> list[tuple[str, str]]:
     return list(PAIRS[:count])
 
 
-def action_of(space: gym.Space, pressed: Callable[[str], bool], rest: Sequence[float]) -> Any:
-    """Return the action that the pressed keys mean.
+def action_of(
+    space: gym.Space,
+    pressed: Callable[[str], bool],
+    rest: Sequence[float],
+    sticks: Sequence[float] = (),
+) -> Any:
+    """Return the action that the pressed keys, or else the sticks, mean.
 
     Parameters
     ----------
@@ -35,41 +45,86 @@ def action_of(space: gym.Space, pressed: Callable[[str], bool], rest: Sequence[f
         Tells whether the key of a name is pressed.
     rest : sequence of float
         What each number of the action is without a key: in [-1, 1], or for a choice its index.
+    sticks : sequence of float, optional
+        How far a gamepad's sticks are pushed, in [-1, 1], in the order of the pairs of keys.
     """
     numbers = list(rest)
     sizes = [int(space.n)] if isinstance(space, gym.spaces.Discrete) else getattr(space, "nvec", None)
     for i, (down, up) in enumerate(keys_of(space)):
         low, high = (-1.0, 1.0) if sizes is None else (0.0, float(sizes[i]) - 1.0)
+        push = float(sticks[i]) if i < len(sticks) else 0.0
         if pressed(down) != pressed(up):
-            numbers[i] = low if pressed(down) else high
+            push = -1.0 if pressed(down) else 1.0
+        if abs(push) > DEAD:
+            # From where it rests all the way to either end.
+            end = low if push < 0.0 else high
+            numbers[i] = numbers[i] + abs(push) * (end - numbers[i])
+            numbers[i] = numbers[i] if sizes is None else float(round(numbers[i]))
     if isinstance(space, gym.spaces.Discrete):
         return int(numbers[0])
     return np.array(numbers, space.dtype).reshape(space.shape or (0,))
 
 
+class Gamepad:
+    """The first gamepad there is, if any; it may come and go."""
+
+    def __init__(self) -> None:
+        import pygame
+
+        self._pygame = pygame
+        self._pad: Any = None
+        pygame.joystick.init()
+
+    def sticks(self) -> list[float]:
+        """Return how far the sticks are pushed, right and up being positive; nothing without a gamepad."""
+        pygame = self._pygame
+        # Events that tell of gamepads are those of the joystick part; keys are left to the program.
+        kinds = (pygame.JOYDEVICEADDED, pygame.JOYDEVICEREMOVED)
+        changed = pygame.display.get_init() and bool(pygame.event.get(kinds))
+        if changed or (self._pad is None and pygame.joystick.get_count()):
+            self._find()
+        if self._pad is None:
+            return []
+        try:
+            axes = [self._pad.get_axis(i) for i in range(min(4, self._pad.get_numaxes()))]
+        except pygame.error:
+            # It was unplugged before its event came.
+            self._find()
+            return []
+        return [axis if i % 2 == 0 else -axis for i, axis in enumerate(axes)]
+
+    def _find(self) -> None:
+        """Take the first gamepad there is, and say where that is another than before."""
+        joystick, before = self._pygame.joystick, self._pad
+        try:
+            self._pad = joystick.Joystick(0) if joystick.get_count() else None
+        except self._pygame.error:
+            self._pad = None
+        if self._pad is not None and before is None:
+            print(f"gamepad: {self._pad.get_name()}", flush=True)
+        elif self._pad is None and before is not None:
+            print("the gamepad has left; the keys go on", flush=True)
+
+    def close(self) -> None:
+        """Leave the gamepad to others."""
+        self._pygame.joystick.quit()
+
+
 def resting(task: Any) -> list[float]:
     """Return the action that comes nearest to controls of 0."""
-    if not hasattr(task.formulas, "acting"):
-        return [float(task.rest_action)]
-    found = []
-    for acting in task.formulas.acting:
-        if acting.values:
-            found.append(float(np.argmin(np.abs(acting.values))))
-        else:
-            middle, half = 0.5 * (acting.low + acting.high), 0.5 * (acting.high - acting.low)
-            found.append(float(np.clip(-middle / half, -1.0, 1.0)))
-    return found
+    return [float(number) for number in np.atleast_1d(task.rest_action)]
 
 
 def help_of(task: Any, space: gym.Space) -> list[str]:
     """Return what to tell whoever drives."""
     names = [acting.control for acting in getattr(task.formulas, "acting", ())] or ["control"]
-    lines = [f"{name}: {down} and {up}" for name, (down, up) in zip(names, keys_of(space), strict=False)]
+    ways = zip(names, keys_of(space), STICKS, strict=False)
+    lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
     return [*(lines or ["nothing acts here: look on"]), "r: start anew", "q, or close the window: end"]
 
 
-def play(id: str, *, steps: int | None = None, seed: int | None = None) -> int:
-    """Drive an environment until its window is closed, or for some steps; return how many were taken.
+def play(id: str, *, steps: int | None = None, seed: int | None = None, **options: Any) -> list[float]:
+    """Drive an environment until its window is closed, or for some steps; return the episodes' returns.
 
     Parameters
     ----------
@@ -79,35 +134,48 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None) -> int:
         End after so many steps.
     seed : int, optional
         Seed of the starts.
+    **options
+        Keywords of the environment.
     """
     import pygame
 
-    env = gym.make(id, render_mode="human")
+    env = gym.make(id, render_mode="human", **options)
     own: Any = env.unwrapped
     rest = resting(own.task)
-    print("\n".join(help_of(own.task, env.action_space)))
+    print("\n".join(help_of(own.task, env.action_space)), flush=True)
     env.reset(seed=seed)
-    total, taken = 0.0, 0
+    pad = Gamepad()
+    returns, total, taken = [], 0.0, 0
 
     def pressed(name: str) -> bool:
         # Whoever closes the window ends pygame's display, and there are no keys any more.
         return pygame.display.get_init() and bool(pygame.key.get_pressed()[pygame.key.key_code(name)])
 
+    def tell(ending: str, whole: bool) -> None:
+        returns.append(total)
+        print(f"{ending}: {in_words(id, total, whole)}", flush=True)
+
+    begun = 0
     try:
         while pygame.display.get_init() and not pressed("q") and (steps is None or taken < steps):
+            action = action_of(env.action_space, pressed, rest, pad.sticks())
+            refused = False
             try:
-                _, reward, terminated, truncated, _ = env.step(action_of(env.action_space, pressed, rest))
+                _, reward, terminated, truncated, _ = env.step(action)
             except StepRefused as error:
                 print(error)
-                reward, terminated, truncated = 0.0, True, False
-            total, taken = total + float(reward), taken + 1
+                refused, reward, terminated, truncated = True, 0.0, True, False
+            total, taken, begun = total + float(reward), taken + 1, begun + 1
             if terminated or truncated or pressed("r"):
-                ending = "terminated" if terminated else "time is up" if truncated else "interrupted"
-                print(f"{ending}, sum of rewards {total:.4g}", flush=True)
-                total = 0.0
+                over = (terminated or truncated) and not refused
+                tell("terminated" if terminated else "time is up" if truncated else "interrupted", over)
+                total, begun = 0.0, 0
                 if terminated and steps is None:
                     time.sleep(0.5)
                 env.reset()
+        if begun:
+            tell("interrupted", whole=False)
     finally:
+        pad.close()
         env.close()
-    return taken
+    return returns

@@ -68,3 +68,27 @@ def score(env_id: str, mean_return: float) -> float | None:
     """
     known = known_returns(env_id)
     return None if known is None else (mean_return - known.random) / (known.best - known.random)
+
+
+def in_words(env_id: str, total: float, whole: bool = True) -> str:
+    """Return what an episode's return says, in words.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of an environment, with its default parameters.
+    total : float
+        The sum of the rewards.
+    whole : bool, default True
+        Whether the episode came to its end; else there is no score.
+
+    Examples
+    --------
+    >>> in_words("PivotedBar-v0", 209.6)
+    'return 209.6, score 0.501 (0 is random, 1 the best known)'
+    >>> in_words("PivotedBar-v0", 209.6, whole=False)
+    'return 209.6'
+    """
+    value = score(env_id, total) if whole else None
+    about = "" if value is None else f", score {value:.3f} (0 is random, 1 the best known)"
+    return f"return {total:.4g}{about}"

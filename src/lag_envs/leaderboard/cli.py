@@ -15,13 +15,39 @@ from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, b
 from lag_envs.leaderboard.log import COMMIT
 from lag_envs.tables import columns
 
+#: How each action is called; the first line of each is its plainest use.
+EXAMPLES = {
+    "add": """lag-envs leaderboard add my-submission               it waits for the next nonce
+lag-envs leaderboard add mine/* --nonce test-1       on a board of your own, verified at once""",
+    "nonce": """lag-envs leaderboard nonce                           the hash of the last commit
+lag-envs leaderboard nonce 5f3c... --source https://beacon.example/pulse/1""",
+    "list": """lag-envs leaderboard list
+lag-envs leaderboard list PivotedBar-v0""",
+    "show": """lag-envs leaderboard show PivotedBar-v0-ppo-c1dc3900
+lag-envs leaderboard show PivotedBar-v0-ppo-c1dc3900 --json""",
+    "withdraw": 'lag-envs leaderboard withdraw PivotedBar-v0-ppo-c1dc3900 --reason "asked for"',
+    "audit": """lag-envs leaderboard audit
+lag-envs leaderboard audit --all                     every result anew""",
+    "pin": "lag-envs leaderboard pin",
+    "open": "lag-envs leaderboard open",
+    "build": "lag-envs leaderboard build site",
+    "serve": "lag-envs leaderboard serve --port 0",
+}
+
 
 def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``leaderboard``."""
     actions = parser.add_subparsers(dest="action", required=True, title="actions", metavar="ACTION")
 
     def action(name: str, help: str, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
-        one = actions.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
+        examples = "".join(f"\n  {line}" for line in EXAMPLES.get(name, "").splitlines())
+        one = actions.add_parser(
+            name,
+            help=help,
+            description=help[0].upper() + help[1:] + ".",
+            epilog=examples and "examples:" + examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         one.add_argument(
             "--board",
             metavar="FOLDER",

@@ -1,0 +1,172 @@
+"""The policies that come with the package: for each environment the best on the board, as data.
+
+``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
+Together they have at most `MOST` bytes; where the best of all would be larger, those give way by which least
+is lost. Controllers are in the package anyway.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lag_envs.errors import UserError
+from lag_envs.store import write
+
+FOLDER = Path(__file__).parent / "best"
+INDEX = "policies.json"
+#: Bytes of all arrays together; the index has a few kB more.
+MOST = 1_000_000
+
+
+class Shipped(NamedTuple):
+    """A policy that comes with the package.
+
+    Attributes
+    ----------
+    name : str
+        Its name on the board.
+    score : float
+        What it was verified to score there.
+    submission : str
+        The submission's id.
+    seed : int
+        Which of its policies.
+    policy : mapping
+        The table ``[policy]`` of its ``submission.toml``.
+    """
+
+    name: str
+    score: float
+    submission: str
+    seed: int
+    policy: Mapping[str, Any]
+
+
+def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
+    """Return what comes with the package, by environment."""
+    found = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+    return {env_id: Shipped(**entry) for env_id, entry in found.items()}
+
+
+def load(env_id: str, folder: Path = FOLDER) -> Any:
+    """Return an environment's policy, with the `predict` of Stable-Baselines3."""
+    from lag_envs.leaderboard.policies import Policy, architecture
+    from lag_envs.leaderboard.submission import _arrays
+
+    made = architecture(env_id, shipped(folder)[env_id].policy)
+    file = folder / f"{env_id}.safetensors"
+    return Policy(made, _arrays(file.name, file.read_bytes(), made)).agent()
+
+
+# --- choosing them ------------------------------------------------------------------------------------------
+
+
+class Candidate(NamedTuple):
+    """A policy of the board."""
+
+    env: str
+    score: float
+    size: int
+    submission: str
+    seed: int
+    name: str
+
+
+def candidates(board: Any) -> list[Candidate]:
+    """Return the verified policies of a board that have arrays."""
+    from lag_envs.leaderboard.protocol import reference
+    from lag_envs.leaderboard.ranking import corrected, normalised
+    from lag_envs.scores import known_returns
+    from lag_envs.tasks import TASKS
+
+    found = []
+    for entry in board.read().entries.values():
+        scale = known_returns(entry.env) if entry.env in TASKS else None
+        if entry.state != "verified" or entry.kind == "controller" or scale is None:
+            continue
+        policies = board.result(entry)["policies"]
+        scores = normalised(scale, corrected(reference(entry.env), policies)).mean(axis=1)
+        for policy, score in zip(policies, scores.tolist(), strict=True):
+            file = board.submission(entry.id) / f"policy_{policy['seed']}.safetensors"
+            found.append(
+                Candidate(entry.env, score, file.stat().st_size, entry.id, policy["seed"], entry.name)
+            )
+    return found
+
+
+def chosen(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
+    """Return the best for each environment, or what loses least where these are too large together.
+
+    Examples
+    --------
+    >>> large, small = Candidate("A", 1.0, 90, "a", 0, "table"), Candidate("A", 0.9, 10, "b", 0, "network")
+    >>> other = Candidate("B", 1.0, 50, "c", 0, "table")
+    >>> [c.name for c in chosen([large, small, other], 140).values()]
+    ['table', 'table']
+    >>> [c.name for c in chosen([large, small, other], 139).values()]
+    ['network', 'table']
+    """
+    ranked = sorted(of, key=lambda c: (-c.score, c.size, c.submission, c.seed))
+    best: dict[str, Candidate] = {}
+    for candidate in ranked:
+        best.setdefault(candidate.env, candidate)
+    while sum(c.size for c in best.values()) > most:
+        smaller = [c for c in ranked if c.size < best[c.env].size]
+        if not smaller:
+            raise UserError(f"there is no choice of policies with at most {most:,} bytes together")
+        least = min(smaller, key=lambda c: (best[c.env].score - c.score) / (best[c.env].size - c.size))
+        best[least.env] = least
+    return best
+
+
+def ship(board: Any, folder: Path = FOLDER) -> dict[str, Shipped]:
+    """Write the policies of a board that are to come with the package, and return what they are."""
+    import tomllib
+
+    from lag_envs.tasks import TASKS
+
+    best, index = chosen(candidates(board)), {}
+    if not best:
+        raise UserError(f"{board.folder} has no verified policies; name the board's folder with --board")
+    for left in folder.glob("*.safetensors"):
+        left.unlink()
+    for env_id in filter(best.__contains__, TASKS):
+        found = best[env_id]
+        place = board.submission(found.submission)
+        table = tomllib.loads((place / "submission.toml").read_text(encoding="utf-8"))["policy"]
+        write(folder / f"{env_id}.safetensors", (place / f"policy_{found.seed}.safetensors").read_bytes())
+        index[env_id] = Shipped(found.name, round(found.score, 4), found.submission, found.seed, table)
+    text = json.dumps({env_id: entry._asdict() for env_id, entry in index.items()}, indent=1)
+    write(folder / INDEX, text + "\n")
+    return index
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Choose and write the policies."""
+    from lag_envs.leaderboard.board import Board, BoardError
+
+    parser = argparse.ArgumentParser(
+        prog="python -m lag_envs.leaderboard.shipped",
+        description="Write the policies that come with the package: the best on the board, as data.",
+    )
+    parser.add_argument(
+        "--board", metavar="FOLDER", type=Path, default=Path("leaderboard"), help="default: leaderboard"
+    )
+    try:
+        found = ship(Board(parser.parse_args(arguments).board))
+    except (BoardError, UserError, OSError) as error:
+        print(f"{parser.prog}: error: {error}", file=sys.stderr)
+        return 2
+    for env_id, entry in found.items():
+        size = (FOLDER / f"{env_id}.safetensors").stat().st_size
+        print(f"{env_id}: {entry.name}, seed {entry.seed}, score {entry.score:.4f}, {size:,} bytes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

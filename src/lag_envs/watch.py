@@ -1,0 +1,325 @@
+"""Watch an agent; the command ``lag-envs watch``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.errors import UserError, hint
+from lag_envs.leaderboard.shipped import shipped
+from lag_envs.scores import in_words
+
+#: Endings of the video files that can be written.
+VIDEOS = (".mp4", ".gif")
+#: Pictures per second of a GIF at most: browsers show no more.
+GIF_RATE = 25.0
+#: Names of the agents that every task has, see `lag_envs.controllers.KNOW_NOTHING`.
+ALL_HAVE = ("zero", "random")
+
+
+class Known(NamedTuple):
+    """An agent that goes by name.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    about : str
+        What it is.
+    """
+
+    name: str
+    about: str
+
+
+def known(task: Any, env_id: str) -> list[Known]:
+    """Return the agents of an environment that go by name, the one that is taken by default first."""
+    found = []
+    if (own := shipped().get(env_id)) is not None:
+        found.append(Known(own.name, f"comes with the package, score {own.score:.3f}"))
+    taken = {agent.name for agent in found}
+    controllers = [*task.controllers, *ALL_HAVE]
+    if task.reference in controllers:  # by default a quick one
+        controllers.sort(key=lambda name: name != task.reference)
+    for name in controllers:
+        if name not in taken:
+            entry = task.controllers.get(name)
+            plans = ", plans for seconds before each episode" if entry is not None and entry.plans else ""
+            found.append(Known(name, f"controller{plans}"))
+    return found
+
+
+def load(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
+    """Return an agent's name and what acts, with the `predict` of Stable-Baselines3.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of the environment.
+    task : Task
+        Its task.
+    name : str, optional
+        One of `known`, a verified submission of the board by name or id, or the path of a submission's
+        folder, of a model of Stable-Baselines3 or of the folder of its training. By default the first of
+        `known`.
+    board : Path, optional
+        A board's folder.
+
+    Raises
+    ------
+    UserError
+        Where there is no such agent, or it is none for this environment.
+    """
+    names = {agent.name.lower(): agent.name for agent in known(task, env_id)}
+    name = next(iter(names.values())) if name is None else names.get(name.lower(), name)
+    own = shipped().get(env_id)
+    if own is not None and name == own.name:
+        from lag_envs.leaderboard.shipped import load as load_shipped
+
+        return name, load_shipped(env_id)
+    if name in names.values():
+        from lag_envs.controllers import build
+
+        return name, build(task, name)
+    on_board = _on_board(env_id, board)
+    if name in on_board:
+        return name, _submission(env_id, on_board[name])
+    path = Path(name)
+    if not path.exists():
+        more = "" if on_board else "; those of a board go by name where its folder is, or with --board FOLDER"
+        raise UserError(
+            f"{env_id} has no agent {name!r}, and there is no such file; "
+            f"{hint(name, [*names.values(), *on_board])}{more}"
+        )
+    if (path / "submission.toml").is_file():
+        return path.name, _submission(env_id, path)
+    return path.name, _model(env_id, path)
+
+
+def _on_board(env_id: str, board: Path | None) -> dict[str, Path]:
+    """Return the folders of an environment's verified submissions, by id and by name."""
+    if board is None:
+        return {}
+    from lag_envs.leaderboard.board import Board, BoardError
+
+    try:
+        entries = Board(board).read().entries.values()
+    except (BoardError, OSError) as error:
+        raise UserError(f"{board} cannot be read: {error}") from error
+    there = [entry for entry in entries if entry.state == "verified" and entry.env == env_id]
+    places = {entry.id: Board(board).submission(entry.id) for entry in there}
+    return {entry.name: places[entry.id] for entry in there} | places
+
+
+def _submission(env_id: str, folder: Path) -> Any:
+    """Return the first policy of a submission."""
+    from lag_envs.leaderboard.submission import Refused
+    from lag_envs.leaderboard.submission import load as load_submission
+
+    try:
+        found = load_submission(folder)
+    except Refused as error:
+        raise UserError(f"{folder}: {error}") from error
+    if found.env != env_id:
+        raise UserError(f"{folder} is an agent of {found.env}, not of {env_id}")
+    return found.policies[0][1].agent()
+
+
+def _model(env_id: str, path: Path) -> Any:
+    """Return a model of Stable-Baselines3; loading it runs code."""
+    from lag_envs.leaderboard import export
+
+    try:
+        import stable_baselines3  # noqa: F401
+    except ImportError as error:
+        raise UserError(f'{path}: stable-baselines3 is missing: pip install "lag-envs[agents]"') from error
+    try:
+        source = export.find([path])[0]
+        model, normalise = export._load(source, export._algorithm(source.model))
+    except export.ExportError as error:
+        raise UserError(str(error)) from error
+    env = gym.make(env_id)
+    spaces = env.observation_space, env.action_space
+    env.close()
+    if model.observation_space.shape != spaces[0].shape:
+        raise UserError(
+            f"{path} observes {model.observation_space.shape} numbers, {env_id} has {spaces[0].shape}"
+        )
+    return Model(model, normalise, spaces[1])
+
+
+class Model:
+    """A model of Stable-Baselines3 that is given the environment's own observations, and gives its actions.
+
+    Parameters
+    ----------
+    model : BaseAlgorithm
+        The model.
+    normalise : VecNormalize or None
+        Its normalisation of observations.
+    space : gym.Space
+        The environment's actions; a model that chooses among bins of them is translated.
+    """
+
+    def __init__(self, model: Any, normalise: Any, space: gym.Space) -> None:
+        self.model, self.normalise = model, normalise
+        self.centres: NDArray[np.float64] | None = None
+        if isinstance(space, gym.spaces.Box) and isinstance(model.action_space, gym.spaces.Discrete):
+            from lag_envs.leaderboard.policies import bin_centres
+
+            self.centres = bin_centres(int(model.action_space.n))
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """Return the action, and what a recurrent model has to remember."""
+        seen = observation if self.normalise is None else self.normalise.normalize_obs(observation)
+        action, state = self.model.predict(seen, state, episode_start, deterministic=deterministic)
+        if self.centres is not None:
+            return np.array([self.centres[int(action)]], np.float32), state
+        return action, state
+
+
+# --- watching -----------------------------------------------------------------------------------------------
+
+
+def watch(
+    env_id: str,
+    agent: Any,
+    *,
+    seed: int,
+    episodes: int | None = None,
+    steps: int | None = None,
+    video: Path | None = None,
+    **options: Any,
+) -> list[float]:
+    """Show episodes of an agent in a window, or write them into a video; return their returns.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of the environment.
+    agent : object
+        Anything with the `predict` of Stable-Baselines3.
+    seed : int
+        Seed of the first episode; the others' follow it.
+    episodes : int, optional
+        How many; by default one in a video, and in a window until it is closed.
+    steps : int, optional
+        End after so many steps.
+    video : Path, optional
+        The file to write, ``.mp4`` or ``.gif``.
+    **options
+        Keywords of the environment.
+    """
+    env = gym.make(env_id, render_mode="human" if video is None else "rgb_array", **options)
+    most = 1 if video is not None and episodes is None else episodes
+    returns: list[float] = []
+    try:
+        with recorder(video, 1.0 / env.unwrapped.task.dt) as record:  # type: ignore[attr-defined]
+            left = steps
+            while (most is None or len(returns) < most) and left != 0:
+                total, over, left = _episode(env, agent, seed + len(returns), left, record)
+                if over is None:
+                    break
+                returns.append(total)
+                print(f"seed {seed + len(returns) - 1}: {in_words(env_id, total, over)}", flush=True)
+    finally:
+        env.close()
+    return returns
+
+
+def _episode(
+    env: gym.Env, agent: Any, seed: int, left: int | None, record: Any
+) -> tuple[float, bool | None, int | None]:
+    """Play one episode; return its return, whether it came to its end (None: the window was closed)."""
+    observation, _ = env.reset(seed=seed)
+    state, start, total, over = None, np.ones(1, np.bool_), 0.0, False
+    record(env)
+    while not over and left != 0:
+        action, state = agent.predict(observation, state, start, deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, start = total + float(reward), np.zeros(1, np.bool_)
+        over, left = terminated or truncated, None if left is None else left - 1
+        if record(env):
+            return total, None, left
+    return total, over, left
+
+
+@contextmanager
+def recorder(video: Path | None, rate: float) -> Iterator[Any]:
+    """Give what is called after each step; for a window it tells whether that was closed."""
+    if video is None:
+        import pygame
+
+        yield lambda env: not pygame.display.get_init()
+        return
+    with Video(video, rate) as file:
+        yield lambda env: file.add(env.render())
+
+
+class Video:
+    """A video file that is written picture by picture.
+
+    Parameters
+    ----------
+    path : Path
+        Where to, ``.mp4`` or ``.gif``.
+    rate : float
+        Pictures per second.
+    """
+
+    def __init__(self, path: Path, rate: float) -> None:
+        if path.suffix.lower() not in VIDEOS:
+            raise UserError(f"a video's name must end with {' or '.join(VIDEOS)}, got {path}")
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            raise UserError(f"there is no folder for {path}" if not path.is_dir() else f"{path} is a folder")
+        self.path, self.rate = path, rate
+        self._gif = path.suffix.lower() == ".gif"
+        #: Of pictures that come faster than they can be shown, each `every`-th is kept.
+        self._every = max(1, round(rate / (GIF_RATE if self._gif else 60.0)))
+        self._count = 0
+        self._writer: Any = None
+        self._pictures: list[Any] = []
+
+    def add(self, picture: NDArray[np.uint8]) -> None:
+        """Take a picture."""
+        self._count += 1
+        if (self._count - 1) % self._every:
+            return
+        if self._gif:
+            from PIL import Image
+
+            self._pictures.append(Image.fromarray(picture).quantize(64))
+            return
+        if self._writer is None:
+            from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
+
+            height, width = picture.shape[:2]
+            self._writer = FFMPEG_VideoWriter(str(self.path), (width, height), self.rate / self._every)
+        self._writer.write_frame(picture)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.close()
+        if self._pictures:
+            first, *others = self._pictures
+            hundredths = max(2, round(100.0 * self._every / self.rate))
+            first.save(
+                self.path,
+                save_all=True,
+                append_images=others,
+                duration=10 * hundredths,
+                loop=0,
+                optimize=True,
+            )

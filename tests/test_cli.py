@@ -1,0 +1,373 @@
+"""The commands that show things: list, info, play, watch, new, completion; and every help."""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from lag_envs import TASKS, cli, own_files, play, watch
+from lag_envs.errors import UserError
+from lag_envs.leaderboard import shipped
+from lag_envs.leaderboard.board import Board
+from lag_envs.scores import score
+from lag_envs.starter import filled
+
+ROOT = Path(__file__).parents[1]
+BALL = str(ROOT / "examples" / "ball_on_beam.py")
+ID = "PivotedBar-v0"
+
+
+@pytest.fixture
+def window(monkeypatch):
+    """A display without a screen."""
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    yield pygame
+    pygame.display.quit()
+
+
+@pytest.fixture(autouse=True)
+def own_ids_only():
+    gym.registry.pop("BallOnBeam-v0", None)
+    sys.modules.pop("ball_on_beam", None)
+
+
+def told(capsys, *arguments):
+    """Run the command, which fails; return what it says."""
+    assert cli.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error and error.startswith("lag-envs: error: ")
+    return error
+
+
+# --- help ---
+
+
+def parsers(parser, words):
+    yield words, parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, one in action.choices.items():
+                yield from parsers(one, f"{words} {name}")
+
+
+def test_every_help_has_examples_of_its_own_command():
+    walked = dict(parsers(cli.parser(), "lag-envs"))
+    assert {"lag-envs watch", "lag-envs leaderboard add"} <= set(walked) and len(walked) > 20
+    for words, parser in walked.items():
+        examples = parser.format_help().partition("\nexamples:\n")[2]
+        assert re.search(rf"^\s+.*{words}\b", examples, re.M), words
+
+
+def test_examples_parse():
+    """Each line of an example is one that the command takes."""
+    whole, count = cli.parser(), 0
+    for parser in dict(parsers(whole, "lag-envs")).values():
+        for line in (parser.epilog or "").replace("\\\n", "").splitlines():
+            if line.startswith("  lag-envs "):
+                call = re.split(r"\s{3,}(?![-\s])|\s>\s|\s\|\s", line.strip())[0]
+                words = re.findall(r'"[^"]*"|\S+', call)[1:]
+                if "--help" not in words:
+                    whole.parse_args([word.strip('"') for word in words])
+                    count += 1
+    assert count > 40
+
+
+# --- list, info ---
+
+
+def test_list_says_what_is_to_be_done(capsys):
+    assert cli.main(["list"]) == 0
+    out = capsys.readouterr().out
+    assert "Swing a bar up by moving its support" in out and "lag-envs watch ID" in out
+
+
+def test_info_names_the_agents(capsys):
+    assert cli.main(["info", ID]) == 0
+    out = capsys.readouterr().out
+    for part in ("PPO  ", "comes with the package, score 0.9", "iLQR ", "--agent NAME", "the best known 419"):
+        assert part in out, part
+    assert cli.main(["info", BALL]) == 0
+    assert "random  controller" in capsys.readouterr().out
+
+
+# --- what ships ---
+
+
+def test_what_ships_is_what_the_command_makes_of_the_board(tmp_path):
+    """After a change of the board: python -m lag_envs.leaderboard.shipped."""
+    made = shipped.ship(Board(ROOT / "leaderboard"), tmp_path)
+    assert made == shipped.shipped() and set(made) == set(TASKS)
+    files = sorted(path.name for path in shipped.FOLDER.iterdir())
+    assert files == sorted(path.name for path in tmp_path.iterdir())
+    for name in files:
+        assert (tmp_path / name).read_bytes() == (shipped.FOLDER / name).read_bytes(), name
+    assert sum((tmp_path / name).stat().st_size for name in files) <= 2**20
+
+
+def test_too_small_a_room_is_said():
+    with pytest.raises(UserError, match="at most 10 bytes"):
+        shipped.chosen([shipped.Candidate("A", 1.0, 90, "a", 0, "table")], 10)
+
+
+def test_a_folder_without_a_board_is_refused(capsys, tmp_path):
+    before = {path: path.read_bytes() for path in shipped.FOLDER.iterdir()}
+    assert shipped.main(["--board", str(tmp_path)]) == 2
+    assert "has no verified policies" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in shipped.FOLDER.iterdir()}
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_what_ships_does_better_than_nothing(env_id):
+    env, task = gym.make(env_id), TASKS[env_id]()
+    agents = shipped.load(env_id), watch.load(env_id, task, "zero")[1]
+    played = [watch._episode(env, agent, 1, None, lambda env: False) for agent in agents]
+    assert all(whole for _, whole, _ in played)
+    assert score(env_id, played[0][0]) > score(env_id, played[1][0])
+
+
+# --- watch ---
+
+
+def test_watch_takes_agents_by_name_and_by_file(tmp_path):
+    task = TASKS["PivotedBarBalance-v0"]()
+    board = ROOT / "leaderboard"
+    observation = np.zeros((1, 4), np.float32)
+    entries = [e for e in Board(board).read().entries.values() if e.env == task.id and e.name == "PPO"]
+    folder = Board(board).submission(entries[-1].id)
+    for name in (None, "ppo", "LQR", "zero", "random", str(folder)):
+        _, agent = watch.load(task.id, task, name)
+        assert agent.predict(observation)[0].shape == (1, 1), name
+    assert watch.load(task.id, task, entries[-1].id, board)[0] == entries[-1].id
+    for name, message in (
+        ("pppo", "has no agent 'pppo', and there is no such file; did you mean PPO?"),
+        (str(tmp_path), "is no model, nor a folder with model.zip"),
+        (str(board / "submissions" / "PivotedBar-v0-ppo-c1dc3900"), "an agent of PivotedBar-v0, not of Piv"),
+    ):
+        with pytest.raises(UserError, match=re.escape(message)):
+            watch.load(task.id, task, name)
+    (tmp_path / "broken.zip").write_bytes(b"PK")
+    with pytest.raises(UserError, match="is no model of Stable-Baselines3"):
+        watch.load(task.id, task, str(tmp_path / "broken.zip"))
+
+
+def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    envs = VecNormalize(DummyVecEnv([lambda: gym.make(ID)]))
+    model = sb3.PPO("MlpPolicy", envs, n_steps=8, batch_size=8, device="cpu")
+    envs.obs_rms.mean[:] = 0.25
+    model.save(tmp_path / "model.zip")
+    envs.save(str(tmp_path / "vecnormalize.pkl"))
+    observation, task = np.ones(5, np.float32), TASKS[ID]()
+    _, alone = watch.load(ID, task, str(tmp_path / "model.zip"))
+    _, whole = watch.load(ID, task, str(tmp_path))
+    assert alone.predict(observation)[0] == model.predict(observation, deterministic=True)[0]
+    seen = envs.normalize_obs(observation)
+    assert whole.predict(observation)[0] == model.predict(seen, deterministic=True)[0]
+    with pytest.raises(UserError, match=r"observes \(5,\) numbers, PivotedBarFree-v0 has \(3,\)"):
+        watch.load("PivotedBarFree-v0", TASKS["PivotedBarFree-v0"](), str(tmp_path / "model.zip"))
+    bins = SimpleNamespace(action_space=gym.spaces.Discrete(5), predict=lambda *_, **__: (np.array(4), None))
+    assert watch.Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
+
+
+def test_watch_opens_a_window_until_it_is_closed(window, capsys, monkeypatch):
+    assert cli.main(["watch", ID, "--seed", "1", "--steps", "3"]) == 0
+    assert "PivotedBar-v0: PPO" in capsys.readouterr().out
+    assert cli.main(["watch", BALL, "--steps", "3"]) == 0
+    agent = watch.load(ID, TASKS[ID](), "zero")[1]
+    predict, seen = agent.predict, []
+
+    def closing(*given, **named):
+        seen.append(window.event.post(window.event.Event(window.QUIT)))
+        return predict(*given, **named)
+
+    monkeypatch.setattr(agent, "predict", closing)
+    assert watch.watch(ID, agent, seed=1) == [] and len(seen) == 1
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_watch_writes_a_video(name, tmp_path, capsys):
+    pytest.importorskip("moviepy")
+    path = tmp_path / name
+    assert cli.main(["watch", ID, "--seed", "1", "--steps", "30", "--video", str(path)]) == 0
+    assert path.stat().st_size > 2000
+    assert re.search(r"seed 1: return \S+\n", capsys.readouterr().out)
+    if name.endswith("gif"):
+        from PIL import Image
+
+        with Image.open(path) as picture:
+            assert picture.n_frames == 16 and picture.info["duration"] == 40
+
+
+def test_watch_says_what_is_wrong(capsys, tmp_path, monkeypatch):
+    assert "end with .mp4 or .gif, got a.avi" in told(capsys, "watch", ID, "--video", "a.avi")
+    assert "there is no folder for" in told(capsys, "watch", ID, "--video", str(tmp_path / "no" / "a.gif"))
+    assert "--seed must be at least 0, got -1" in told(capsys, "watch", ID, "--seed", "-1")
+    assert "did you mean" in told(capsys, "watch", "PivotedBra-v0")
+    assert "did you mean iLQR?" in told(capsys, "watch", ID, "--agent", "ilqrr")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+    assert "--video FILE" in told(capsys, "watch", ID)
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    assert 'pip install "lag-envs[render]"' in told(capsys, "watch", ID)
+
+
+# --- play ---
+
+
+def test_play_tells_return_and_score(window, capsys, monkeypatch):
+    monkeypatch.setitem(gym.registry[ID].kwargs, "duration", 0.2)
+    assert cli.main(["play", ID, "--seed", "1", "--steps", "15"]) == 0
+    first, second = capsys.readouterr().out.splitlines()[-2:]
+    assert re.fullmatch(
+        r"time is up: return -?[\d.e-]+, score -?[\d.]+ \(0 is random, 1 the best known\)", first
+    )
+    assert re.fullmatch(r"interrupted: return \S+", second)
+
+
+def test_sticks_become_actions():
+    own_files.registered(str(ROOT / "tests" / "own_tasks.py"))
+    crane, switched = (gym.make(f"Own{name}-v0") for name in ("Crane", "Switched"))
+
+    def action(env, *sticks, keys=()):
+        rest = play.resting(env.unwrapped.task)
+        return play.action_of(env.action_space, keys.__contains__, rest, sticks)
+
+    # The second of the crane's controls goes from 0 to 20 N and rests at its lower end.
+    assert action(crane, 0.5, 0.5).tolist() == [0.5, 0.0]
+    assert action(crane, -0.05, -1.0).tolist() == [0.0, -1.0]
+    assert action(crane, 0.5, 0.0, keys=("left",)).tolist() == [-1.0, -1.0]
+    assert [action(switched, push) for push in (-1.0, -0.2, 0.0, 0.4, 0.9)] == [0, 1, 1, 1, 2]
+
+
+def test_a_gamepad_may_come_and_go(window, monkeypatch, capsys):
+    pads = []
+
+    class Pad:
+        def __init__(self, number):
+            self.there = pads[number]
+
+        def get_name(self):
+            return "Pad"
+
+        def get_numaxes(self):
+            return 6
+
+        def get_axis(self, i):
+            if self.there not in pads:
+                raise window.error("no such device")
+            return [0.5, -0.25, 0.0, 1.0, 0.1, 0.1][i]
+
+    monkeypatch.setattr(window.joystick, "get_count", lambda: len(pads))
+    monkeypatch.setattr(window.joystick, "Joystick", Pad)
+    gamepad = play.Gamepad()
+    assert gamepad.sticks() == []
+    pads.append("one")
+    assert gamepad.sticks() == [0.5, 0.25, 0.0, -1.0]
+    pads.clear()
+    assert gamepad.sticks() == [] and gamepad.sticks() == []
+    assert capsys.readouterr().out.splitlines() == ["gamepad: Pad", "the gamepad has left; the keys go on"]
+    gamepad.close()
+
+
+# --- new ---
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A folder to write modules into, which are forgotten then."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules), set(gym.registry)
+    yield tmp_path
+    for name in set(sys.modules) - before[0]:
+        if str(tmp_path) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+    for id in set(gym.registry) - before[1]:
+        del gym.registry[id]
+    own_files.load.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["my_scene", "scene", "swing_up", "task", "_", "parameter"])
+def test_new_writes_what_runs(name, elsewhere, capsys):
+    assert cli.main(["new", f"{name}.py"]) == 0
+    assert f"lag-envs info {name}.py" in capsys.readouterr().out
+    assert cli.main(["info", f"{name}.py"]) == 0
+    assert "torque  -5 to 5 N m" in capsys.readouterr().out
+    (id,) = own_files.registered(f"{name}.py")
+    env = gym.make(id, length=2.0)
+    check_env(env.unwrapped, skip_render_check=True)
+    picture = gym.make(id, render_mode="rgb_array")
+    picture.reset(seed=1)
+    assert picture.render().std() > 1.0
+    text = (elsewhere / f"{name}.py").read_text(encoding="utf-8")
+    assert text == filled(name) and max(map(len, text.splitlines())) <= 110
+    assert name in told(capsys, "new", f"{name}.py") and text == filled(name)
+
+
+def test_new_says_what_is_wrong(elsewhere, capsys):
+    (elsewhere / "there.py").write_text("mine")
+    assert "there.py is there already" in told(capsys, "new", "there.py")
+    assert (elsewhere / "there.py").read_text() == "mine"
+    assert "must end with .py, as in swing.py" in told(capsys, "new", "swing")
+    assert "one that Python can import" in told(capsys, "new", "my-scene.py")
+    assert "one that Python can import" in told(capsys, "new", "class.py")
+    assert "there is no folder" in told(capsys, "new", "no/my_scene.py")
+    (elsewhere / "folder.py").mkdir()
+    assert "is there already" in told(capsys, "new", "folder.py")
+
+
+# --- completion ---
+
+
+def completed(script, *words):
+    """Return what bash offers for the last of the words."""
+    line = " ".join(words)
+    ask = (
+        f"{script}\nCOMP_WORDS=({' '.join(repr(word) for word in words)}); COMP_CWORD={len(words) - 1}; "
+        f"COMP_LINE={line!r}; COMP_POINT={len(line)}; _shtab_lag_envs 2>/dev/null; "
+        'printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True, check=True, cwd=ROOT / "tests")
+    return done.stdout.split()
+
+
+def test_bash_completes_commands_options_ids_and_files(capsys):
+    assert cli.main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    assert {"watch", "play", "new"} <= set(completed(script, "lag-envs", ""))
+    assert completed(script, "lag-envs", "wat") == ["watch"]
+    assert "PivotedBarFree-v0" in completed(script, "lag-envs", "watch", "PivotedBar")
+    assert "own_tasks.py" in completed(script, "lag-envs", "info", "own_t")
+    assert completed(script, "lag-envs", "watch", ID, "--ag") == ["--agent"]
+    assert "withdraw" in completed(script, "lag-envs", "leaderboard", "w")
+
+
+def test_other_shells_and_what_is_missing(capsys, monkeypatch):
+    for shell in ("zsh", "tcsh"):
+        assert cli.main(["completion", shell]) == 0
+        assert ID in (out := capsys.readouterr().out) or shell == "tcsh"
+        assert "watch" in out
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    assert 'pip install "lag-envs[completion]"' in told(capsys, "completion", "bash")
+
+
+def test_the_core_alone_lists(tmp_path):
+    """What shows text asks for no extra."""
+    script = (
+        "import sys\nfrom lag_envs import cli\n"
+        "assert cli.main(['list']) == cli.main(['info', 'InclineTilt-v0']) == 0\n"
+        "assert not {'pydantic', 'scipy.optimize', 'sympy', 'pygame', 'torch'} & set(sys.modules)\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, cwd=tmp_path, env=os.environ
+    )
