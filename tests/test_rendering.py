@@ -1,10 +1,13 @@
 """Pictures: to scale, complete, the same for everyone, and without a display."""
 
+import gc
 import math
+import re
 import subprocess
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
 from typing import get_args
 
 import gymnasium as gym
@@ -13,7 +16,7 @@ import pytest
 from rollouts import SINGLE
 
 import lag_envs
-from lag_envs.envs import rendering
+from lag_envs.envs import raster, rendering
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.scenes.picture import Picture, turning
 from lag_envs.scenes.shapes import (
@@ -41,7 +44,7 @@ IDS = list(lag_envs.TASKS)
 TASKS = {env_id: kind() for env_id, kind in lag_envs.TASKS.items()}
 TASKS |= {"quasi-static": incline.Tilt(control="tilt")}
 UNLIMITED = (pivoted_bar.SwingUpFree.id, incline.Brake.id, cylinder_in_cylinder.Damping.id)
-BLUE = [(0x56, 0xB4, 0xE9), (0x00, 0x72, 0xB2)]
+BLUE = [(0x56, 0xB4, 0xE9), (0x0B, 0x5F, 0x9C)]
 
 
 def picture(env_id, state=None, action=0.5, **options):
@@ -76,7 +79,7 @@ def test_frames_are_pictures_that_follow_the_state(env_id):
     env = gym.make(env_id, render_mode="rgb_array")
     env.reset(seed=1)
     first = env.render()
-    assert first.shape == (432, 640, 3) and first.dtype == np.uint8
+    assert first.shape == (400, 600, 3) and first.dtype == np.uint8
     kept = first.copy()
     assert np.array_equal(env.render(), first)
     env.step(env.action_space.sample())
@@ -92,11 +95,11 @@ def test_frames_are_pictures_that_follow_the_state(env_id):
 
 
 def test_cylinders_are_drawn_to_scale():
-    # The window on the shell is 2.56 R = 1.28 m high, in 384 pixels; that on the plank 1.25 m wide, in 640.
+    # The window on the shell is 2.56 R = 1.28 m high, in 384 pixels; that on the plank 1.25 m wide, in 584.
     for frame, radius, scale in [
         (picture(cylinder_in_cylinder.Tilt.id), 0.1, 384 / 1.28),
         (picture(cylinder_in_cylinder.Damping.id, action=-1.0, radius=0.2), 0.2, 384 / 1.28),
-        (picture(incline.Tilt.id), 0.05, 640 / 1.25),
+        (picture(incline.Tilt.id), 0.05, 584 / 1.25),
     ]:
         assert blue(frame) == pytest.approx((2 * radius * scale,) * 2, abs=4)
 
@@ -247,7 +250,7 @@ def test_shell_turns_by_the_integral_of_its_rate():
 def test_unusual_parameters_are_drawn_too(env_id, options):
     task = lag_envs.TASKS[env_id](**options)
     start = time.process_time()
-    frame = pygame.surfarray.array3d(rendering.paint(task, moment(task)))
+    frame = rendering.paint(task, moment(task))
     assert time.process_time() - start < 0.5
     assert frame.std() > 0.0
 
@@ -255,7 +258,7 @@ def test_unusual_parameters_are_drawn_too(env_id, options):
 @pytest.mark.parametrize("tilt", [0.5, 0.8, math.pi / 2])
 def test_a_steep_plane_has_its_ground_too(tilt):
     frame = picture(incline.Brake.id, tilt=tilt)
-    assert np.all(frame == (0xE3, 0xE3, 0xE3), axis=-1).mean() > 0.15
+    assert np.all(frame == (0xE9, 0xE7, 0xE1), axis=-1).mean() > 0.15
 
 
 def test_far_away_start_stays_in_the_picture():
@@ -317,7 +320,7 @@ def test_window_opens_closes_and_opens_again(window, env_id):
         env.reset(seed=1)
         env.step(env.action_space.sample())
         assert env.render() is None
-        assert pygame.display.get_surface().get_size() == (640, 432)
+        assert pygame.display.get_surface().get_size() == (600, 400)
         env.close()
         assert not pygame.display.get_init()
 
@@ -347,10 +350,10 @@ def test_environments_share_the_window(window):
         env.reset(seed=1)
     for env in envs:
         env.step(env.action_space.sample())
-    assert pygame.display.get_surface().get_size() == (2 * 640, 2 * 432)
+    assert pygame.display.get_surface().get_size() == (2 * 600, 2 * 400)
     envs[1].close()
     envs[0].render()
-    assert pygame.display.get_surface().get_size() == (2 * 640, 432)
+    assert pygame.display.get_surface().get_size() == (2 * 600, 400)
     envs[0].close()
     envs[2].close()
     assert not pygame.display.get_init()
@@ -404,19 +407,26 @@ def test_missing_display_is_named(monkeypatch):
 
 def test_missing_pygame_is_named_with_its_remedy(monkeypatch):
     env = gym.make("PivotedBar-v0", render_mode="rgb_array")
-    env.reset(seed=1)
+    written = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)
     rendering._pygame.cache_clear()
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "lag-envs\[render\]"'):
-        env.render()
+    for without in (env, written):
+        without.reset(seed=1)
+    assert env.render().std() > 1.0
+    remedy = r'pip install "lag-envs\[render\]"'
+    with pytest.raises(gym.error.DependencyNotInstalled, match=remedy):
+        written.render()
+    with pytest.raises(gym.error.DependencyNotInstalled, match=remedy):
+        gym.make("PivotedBar-v0", render_mode="human").reset(seed=1)
 
 
-def test_pygame_is_imported_only_when_something_is_drawn():
+def test_pygame_is_imported_only_for_windows_and_text():
     code = """
 import sys, gymnasium as gym, lag_envs.envs.rendering
-env = gym.make("PivotedBar-v0")
+env = gym.make("PivotedBar-v0", render_mode="rgb_array")
 env.reset(seed=1)
 env.step(env.action_space.sample())
+env.render()
 env.close()
 assert "pygame" not in sys.modules
 """
@@ -435,14 +445,14 @@ def test_round_lengths_and_ticks():
 
 
 def test_dashes_cover_the_line():
-    dashes = list(rendering._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0))
+    dashes = list(rendering._dashes([(0.0, 0.0), (7.0, 0.0), (7.0, 13.0)], 3.0, 2.0))
     assert sum(length(dash) for dash in dashes) == pytest.approx(3.0 * 4)
     assert dashes[0] == [(0.0, 0.0), (3.0, 0.0)]
     assert dashes[1] == [(5.0, 0.0), (7.0, 0.0), (7.0, 1.0)]
 
 
 def test_numbers_keep_their_width():
-    assert rendering._number(-1.5) == "−1.500"
+    assert [rendering._number(x) for x in (-1.5, 12.345, -419.0)] == ["−1.500", "12.35", "−419.0"]
     assert rendering._number(123456.0) == "1.23e+05"
 
 
@@ -471,3 +481,310 @@ def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
     env.reset(seed=1)
     env.step(np.array([rest], dtype=np.float32))
     assert env.unwrapped.control == 0.0
+
+
+# --- what is shown on request ---
+
+
+def shown(env_id, steps=5, **look):
+    env = gym.make(env_id, render_mode="rgb_array", **look)
+    env.reset(seed=1)
+    for _ in range(steps):
+        env.step(np.full(1, 0.5, np.float32))
+        frame = env.render()
+    env.close()
+    return frame
+
+
+def colours(frame, *wanted):
+    return [int(np.all(frame == rendering._rgb(colour), axis=-1).sum()) for colour in wanted]
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_nothing_more_is_shown_unless_it_is_asked_for(env_id):
+    plain = shown(env_id)
+    assert max(colours(plain, rendering.FORCE.edge, rendering.STRIP_PAPER)) < 20
+    assert np.array_equal(plain, shown(env_id, show_arrows=False, show_trail=0.0, show_readout=False))
+    arrows, readout = shown(env_id, show_arrows=True), shown(env_id, show_readout=True)
+    assert colours(arrows, rendering.FORCE.edge)[0] > 20
+    assert colours(readout, rendering.STRIP_PAPER)[0] > 0.6 * 600 * 48
+    assert not np.array_equal(plain[:352], readout[:352])  # there is less room
+    assert not np.array_equal(plain, shown(env_id, show_trail=1.0))
+
+
+def test_forces_are_to_scale_and_point_where_they_push():
+    from lag_envs.envs.forces import LONG, Forces
+
+    task = TASKS["PivotedBarFree-v0"]
+    picture = Picture(task)
+    now = Frame([0.0, 0.0], [0.0], [0.0])
+    (up,) = (arrow for arrow, control in Forces(task, picture).arrows(now, picture.poses(now)) if not control)
+    (x0, y0), (x1, y1) = up.points
+    window = picture.view.top - picture.view.bottom
+    weight, usual = 0.2 * 9.81, Forces(task, picture)._usual["support_vertical"]
+    assert (x0, y0, x1) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert y1 == pytest.approx(LONG * window * weight / usual, rel=1e-6) and usual >= weight
+
+
+def test_controls_without_an_arrow_of_their_own_get_one():
+    from lag_envs.envs.forces import Forces
+    from lag_envs.scenes import Scene
+    from lag_envs.tasks import Task
+
+    class Cart(Scene):
+        coordinates = {"x": "m", "angle": "rad"}
+        controls = {"push": "N", "twist": "N m", "brake": "N s/m"}
+
+        def kinetic(self, q, v, xp):
+            return 0.5 * v.x**2 + 0.5 * v.angle**2
+
+        def potential(self, q, xp):
+            return 0.0
+
+        def dissipation(self, q, v, u, xp):
+            return 0.5 * u.brake * v.x**2
+
+        def applied(self, q, v, u, xp):
+            return {"x": u.push, "angle": u.twist}
+
+        def poses(self, q, xp):
+            return {"cart": (q.x, 0.0, 0.0), "wheel": (0.0, 1.0, q.angle)}
+
+        def bodies(self):
+            return {"cart": [Circle((0.0, 0.0), 0.1)], "wheel": [Circle((0.0, 0.0), 0.1)]}
+
+    class Drive(Task):
+        scene = Cart
+        action = {"push": 2.0, "twist": 1.0, "brake": (0.0, 4.0)}
+
+        def observe(self, after, target, xp):
+            return {"x": after.x}
+
+        def reward(self, before, after, control, target, dt, xp):
+            return 0.0
+
+    task = Drive()
+    picture = Picture(task)
+
+    def arrows(control, state):
+        now = Frame(state, control, task.share(control))
+        return [arrow.points for arrow, _ in Forces(task, picture).arrows(now, picture.poses(now))]
+
+    (pushed,) = arrows([1.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0])
+    assert pushed[0] == pytest.approx((0.5, 0.0)) and pushed[1][0] > 0.6
+    (twisted,) = arrows([0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 0.0])
+    assert len(twisted) > 10 and math.dist(twisted[0], (0.0, 1.0)) == pytest.approx(
+        math.dist(twisted[5], (0.0, 1.0))
+    )
+    (held,) = arrows([0.0, 0.0, 4.0], [0.0, 1.0, 0.0, 0.0])
+    assert held[1][0] < -0.1  # a brake pushes back
+    assert arrows([0.0, 0.0, 4.0], [0.0, 0.0, 0.0, 0.0]) == []
+
+
+def test_a_trail_is_of_the_seconds_that_are_asked_for_and_of_one_episode():
+    env = gym.make("PivotedBar-v0", render_mode="rgb_array", show_trail=0.1).unwrapped
+    env.reset(seed=1)
+    for _ in range(20):
+        env.step(np.ones(1, np.float32))
+        env.render()
+        env.render()
+    assert len(env._viewer._trail) == 6  # 0.1 s are five steps
+    env.reset(seed=1)
+    env.render()
+    assert len(env._viewer._trail) == 1
+    # A bar's tip, a cylinder's axis.
+    assert rendering.tips(env._viewer._picture)[env._viewer._picture.frames.index("bar")] == pytest.approx(
+        (0.0, -0.621), abs=0.03
+    )
+    rolling = Picture(TASKS[incline.Tilt.id])
+    assert rendering.tips(rolling)[rolling.frames.index("cylinder")] == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"show_arrows": 1}, "show_arrows must be True or False, got 1"),
+        ({"show_readout": "no"}, "show_readout must be True or False, got 'no'"),
+        ({"show_trail": True}, "show_trail must be a real number, got True"),
+        ({"show_trail": -1.0}, "show_trail must lie between 0 and 60 s, got -1.0"),
+        ({"show_trail": math.inf}, "show_trail must be finite"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(option, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("PivotedBar-v0", **option)
+    with pytest.raises(ValueError, match=message):
+        gym.make_vec("PivotedBar-v0", 2, **option)
+    for tiles in (0, 2.0, True):
+        with pytest.raises(ValueError, match="show_tiles must be a whole number of at least 1"):
+            gym.make_vec("PivotedBar-v0", 2, show_tiles=tiles)
+
+
+def test_readout_counts_the_episode(monkeypatch):
+    seen = []
+    monkeypatch.setattr(rendering, "write_readout", lambda image, rows, scale: seen.append(rows))
+    env = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True)
+    env.reset(seed=1)
+    total = 0.0
+    for _ in range(3):
+        total += env.step(np.ones(1, np.float32))[1]
+        env.render()
+    (first, second) = seen[-1]
+    assert [(r.name, r.unit) for r in first] == [
+        ("time", "s"),
+        ("return", ""),
+        ("score", ""),
+        ("s_ddot", "m/s²"),
+    ]
+    assert [r.name for r in second] == ["s", "s_dot", "theta", "theta_dot"]
+    from lag_envs.scores import score
+
+    assert [r.value for r in first[:3]] == pytest.approx([0.06, total, score("PivotedBar-v0", total)])
+    other = gym.make("PivotedBar-v0", render_mode="rgb_array", show_readout=True, mass=0.3)
+    other.reset(seed=1)
+    other.render()
+    assert [r.name for r in seen[-1][0]] == ["time", "return", "s_ddot"]  # no score for another task
+    envs = gym.make_vec("PivotedBar-v0", 2, render_mode="rgb_array", show_readout=True, duration=0.06)
+    envs.reset(seed=1)
+    steps = []
+    for _ in range(5):
+        envs.step(np.ones((2, 1), np.float32))
+        envs.render()
+        steps.append([round(r.value / 0.02) for rows in seen[-2:] for r in rows[0][:1]])
+    assert steps == [[1, 1], [2, 2], [3, 3], [0, 0], [1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("tiles", "shape"), [(1, (400, 600)), (4, (800, 1200)), (5, (532, 1200)), (99, (798, 1200))]
+)
+def test_vector_environment_renders_a_grid(tiles, shape):
+    envs = gym.make_vec("PivotedBar-v0", 9, render_mode="rgb_array", show_tiles=tiles)
+    envs.reset(seed=1)
+    frame = envs.render()
+    assert frame.shape == (*shape, 3) and frame.dtype == np.uint8
+    kept = frame.copy()
+    envs.step(envs.action_space.sample())
+    assert not np.array_equal(envs.render(), kept) and np.array_equal(frame, kept)
+    envs.close()
+
+
+# --- polygons ---
+
+
+def test_a_polygon_covers_its_area():
+    """The sum over the pixels is the area, exactly but for the rounding to bytes."""
+    rng, room = np.random.default_rng(1), np.zeros((60, 92))
+    for _ in range(200):
+        angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, 9))
+        points = np.stack([45 + 40 * np.cos(angles), 30 + 25 * np.sin(angles)], axis=1)
+        image = np.zeros((60, 90, 3), np.uint8)
+        colour, at = np.array([[255.0, 255.0, 255.0, 1.0]]), np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+        raster.fill(image, points, np.array([9]), np.array([0]), at, colour, room)
+        (x, y), edge = points.T, (image > 0) & (image < 255)
+        area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+        assert image[:, :, 0].sum() / 255.0 == pytest.approx(area, abs=0.3)
+        assert edge[:, :, 0].sum() < 500 and not room.any()
+
+
+def test_polygons_are_cut_off_at_the_edges_and_blended():
+    room, image = np.zeros((4, 6)), np.full((4, 4, 3), 200, np.uint8)
+    points = np.array([(-1e9, -1e9), (1e9, -1e9), (1e9, 1.5), (-1e9, 1.5)])
+    at, colour = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]]), np.array([[0.0, 100.0, 200.0, 0.5]])
+    raster.fill(image, points, np.array([4]), np.array([0]), at, colour, room)
+    assert image[:, 2].tolist() == [[100, 150, 200], [150, 175, 200], [200, 200, 200], [200, 200, 200]]
+    assert not room.any()
+    # Beside the image, and without an extent.
+    raster.fill(image, points - (0.0, 1e3), np.array([4]), np.array([0]), at, colour, room)
+    raster.fill(image, 0.0 * points + 2.0, np.array([4]), np.array([0]), at, colour, room)
+    assert image[2:].min() == 200
+
+
+def test_png_can_be_read(tmp_path):
+    frame = shown("PivotedBar-v0")
+    (tmp_path / "a.png").write_bytes(raster.png(frame))
+    read = pygame.surfarray.array3d(pygame.image.load(tmp_path / "a.png")).swapaxes(0, 1)
+    assert np.array_equal(read, frame)
+
+
+# --- beside the page ---
+
+
+def test_colours_and_widths_are_those_of_the_page():
+    """`site.js` paints the same shapes in a browser; its style sheet has the colours of light and dark."""
+    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
+    css = (site / "site.css").read_text(encoding="utf-8").partition("@media")[0]
+    colour = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", css))
+    roles = re.search(r"ink\.roles = \{(.*?)\n    \};", (site / "site.js").read_text(encoding="utf-8"), re.S)
+    found = {}
+    for role, given in re.findall(r"(\w+): \[(.*)\],", roles[1]):
+        fill, edge, width, *dash = re.findall(r'get\("([\w-]+)"\)|null|([\d.]+)', given)
+        numbers = [float(x[1]) for x in (width, *dash)]
+        fills = colour[fill[0]] if fill[0] else None
+        found[role] = rendering.Style(fills, colour[edge[0]], numbers[0], tuple(numbers[1:]) or None)
+    assert found == rendering.STYLES
+
+
+# --- speed and real time ---
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_pictures_are_quick(env_id):
+    """At least 300 steps with a picture per second of processor time, in the best of a few samples."""
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=1)
+    env.render()
+
+    def seconds():
+        start = time.process_time()
+        for _ in range(20):
+            if any(env.step(env.action_space.sample())[2:4]):
+                env.reset()
+            env.render()
+        return time.process_time() - start
+
+    assert min(seconds() for _ in range(5)) < 20 / 300
+
+
+def test_windows_keep_real_time(window, monkeypatch):
+    """Also where an interval is no whole number of milliseconds, or shorter than a screen's."""
+
+    class Clock:
+        """One that other programs do not disturb: a look at it takes 0.2 ms."""
+
+        now, pictures = 0.0, 0
+
+        def perf_counter(self):
+            self.now += 2e-4
+            return self.now
+
+        def sleep(self, seconds):
+            assert seconds >= 0.0
+            self.now, self.pictures = self.now + seconds, self.pictures + 1
+
+    for dt, steps, pictures in ((0.0333, 30, 30), (0.001, 1000, 59)):
+        monkeypatch.setattr(rendering, "time", clock := Clock())
+        env = gym.make("PivotedBar-v0", render_mode="human", dt=dt)
+        env.reset(seed=1)
+        start, shown = clock.now, clock.pictures
+        for _ in range(steps):
+            env.step(np.zeros(1, np.float32))
+        assert clock.now - start == pytest.approx(steps * dt, abs=0.017)
+        assert clock.pictures - shown == pytest.approx(pictures, abs=1)
+        clock.now += 5.0  # whoever steps was busy: what is lost is not caught up with
+        start = clock.now
+        for _ in range(steps):
+            env.step(np.zeros(1, np.float32))
+        assert clock.now - start == pytest.approx(steps * dt, abs=dt + 0.017)
+        env.close()
+
+
+def test_a_window_that_was_left_open_is_closed(window):
+    env = gym.make("PivotedBar-v0", render_mode="human")
+    env.reset(seed=1)
+    assert pygame.display.get_init()
+    del env
+    gc.collect()
+    assert not pygame.display.get_init()
+    code = "import gymnasium as gym, lag_envs; gym.make('PivotedBar-v0', render_mode='human').reset(seed=1)"
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -373,8 +373,8 @@ def run_play(args: argparse.Namespace) -> int:
 
     id, _ = _shown(args)
     try:
-        play(id, steps=args.steps, seed=args.seed)
-    except Error as error:
+        play(id, steps=args.steps, seed=args.seed, **_look(args))
+    except (Error, ValueError) as error:
         raise UserError(str(error)) from error
     return 0
 
@@ -421,7 +421,10 @@ def run_watch(args: argparse.Namespace) -> int:
         name, agent = watch.load(id, task, args.agent, board)
         seed = secrets.randbelow(2**31) if args.seed is None else args.seed
         print(f"{id}: {name}", flush=True)
-        watch.watch(id, agent, seed=seed, episodes=args.episodes, steps=args.steps, video=args.video)
+        limits = {"episodes": args.episodes, "steps": args.steps, "video": args.video}
+        watch.watch(id, agent, seed=seed, **limits, **_look(args))
+    except ValueError as error:
+        raise UserError(str(error)) from error
     except Error as error:
         raise UserError(f"{error}, and --video FILE neither") from error
     return 0
@@ -432,6 +435,16 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
     parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
     parser.add_argument("--steps", metavar="N", type=_count, help="end after so many steps")
+    parser.add_argument("--arrows", action="store_true", help="show forces too")
+    parser.add_argument(
+        "--trail", metavar="S", type=_seconds, default=0.0, help="show the way of so many seconds"
+    )
+    parser.add_argument("--readout", action="store_true", help="show time, score, controls and state below")
+
+
+def _look(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the keywords of an environment that say what is to be seen."""
+    return {"show_arrows": args.arrows, "show_trail": args.trail, "show_readout": args.readout}
 
 
 def _shown(args: argparse.Namespace) -> tuple[str, Task]:
@@ -688,6 +701,7 @@ tells the return, and the score on the leaderboard's scale.
 examples:
   lag-envs play PivotedBar-v0
   lag-envs play PivotedBar-v0 --seed 1       the same start each time
+  lag-envs play PivotedBar-v0 --readout --trail 1
   lag-envs play ball_on_beam.py              a task of your own; this runs the file""",
         declare_play,
         run_play,

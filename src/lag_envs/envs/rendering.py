@@ -1,4 +1,7 @@
-"""Pictures: what a scene and its task say is to be seen, painted with pygame.
+"""Pictures: what a scene and its task say is to be seen, painted as the leaderboard's page paints it.
+
+Shapes become outlines once, in the frames in which they lie; a moment's picture is then a place for each
+frame and one compiled call. pygame opens windows and writes the read-out, and nothing else.
 
 ``python -m lag_envs.envs.rendering DIRECTORY`` writes a picture of every environment as PNG.
 """
@@ -8,11 +11,13 @@ from __future__ import annotations
 import math
 import os
 import sys
+import time
 import unicodedata
 import weakref
+from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,44 +25,56 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled, Error
 from numpy.typing import NDArray
 
+from lag_envs.envs import raster
+from lag_envs.envs.forces import Forces
 from lag_envs.scenes import shapes as s
 from lag_envs.scenes.picture import Picture, turning
-from lag_envs.scenes.shapes import Frame, Point, Reading, Role, Shape, Window
+from lag_envs.scenes.shapes import Frame, Point, Pose, Reading, Role, Shape, Window
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.measured import measured
 
 if TYPE_CHECKING:
     import pygame
 
-#: Width and height of a picture, and height of the strip below it that holds the read-out [pixels].
-WIDTH, HEIGHT, STRIP = 640, 432, 48
-#: Pictures are painted this much larger, then scaled down, for smooth edges.
-FINE = 2
-FAR = 8_000.0
+#: Width and height of a picture, margin around what is to be seen, and height of the read-out [pixels].
+WIDTH, HEIGHT, MARGIN, STRIP = 600, 400, 8, 48
+#: Least width of a column of the read-out [pixels].
+COLUMN = 90
+#: Side of a magnifier, as a share of the picture's shorter side, and its distance from the corner [pixels].
+GLASS, GLASS_ROOM = 0.36, 12
+#: A window shows at most so many pictures per second.
+RATE = 60.0
+#: A line of more dashes than this is drawn without gaps.
+DASHES = 2_000
 
 PAPER, STRIP_PAPER, INK = "#ffffff", "#f2f2f2", "#303030"
 
 
 class Style(NamedTuple):
-    """How a role looks: colours, width of lines and length of dashes [pixels]."""
+    """How a role looks: colours, width of lines, length of dashes and of the gaps between them [pixels]."""
 
     fill: str | None
     edge: str
     width: float
-    dash: float = 0.0
+    dash: tuple[float, float] | None = None
 
 
-#: The colours that carry meaning are Okabe and Ito's, which colour-blind people can tell apart.
+#: As the page's style sheet and painter have them, in light. The colours that carry meaning are Okabe and
+#: Ito's, which colour-blind people can tell apart.
 STYLES: dict[Role, Style] = {
-    "body": Style("#56b4e9", "#0072b2", 2.0),
-    "mark": Style("#0072b2", "#0072b2", 0.0),
-    "hole": Style(PAPER, "#606060", 1.5),
-    "ground": Style("#e3e3e3", "#8a8a8a", 1.5),
-    "frame": Style("#b4b4b4", "#606060", 2.0),
-    "guide": Style(None, "#9a9a9a", 1.2, 5.0),
-    "target": Style(None, "#009e73", 2.2, 7.0),
-    "limit": Style("#cc79a7", "#b0558a", 3.0),
-    "action": Style("#d55e00", "#d55e00", 5.0),
+    "body": Style("#56b4e9", "#0b5f9c", 1.5),
+    "mark": Style("#0b5f9c", "#0b5f9c", 0.0),
+    "hole": Style(PAPER, "#605e58", 1.2),
+    "ground": Style("#e9e7e1", "#98958c", 1.2),
+    "frame": Style("#bdbbb4", "#605e58", 1.5),
+    "guide": Style(None, "#a5a299", 1.0, (4.0, 4.0)),
+    "target": Style(None, "#00805c", 1.8, (6.0, 4.0)),
+    "limit": Style("#b0558a", "#b0558a", 2.5),
+    "action": Style("#ad4200", "#ad4200", 4.0),
 }
+#: The arrow of a force, a trail, and the rim of a magnifier.
+FORCE, TRAIL = Style("#5b3a8c", "#5b3a8c", 3.0), Style(None, "#0b5f9c", 1.6)
+RIM = STYLES["guide"]._replace(width=1.2, dash=None)
 
 
 @cache
@@ -66,8 +83,34 @@ def _pygame() -> Any:
     try:
         import pygame
     except ImportError as error:
-        raise DependencyNotInstalled('rendering needs pygame: pip install "lag-envs[render]"') from error
+        raise DependencyNotInstalled(
+            'windows and the read-out need pygame: pip install "lag-envs[render]"'
+        ) from error
     return pygame
+
+
+@cache
+def _rgb(colour: str) -> tuple[float, float, float]:
+    """Return red, green and blue, 0 to 255."""
+    return float(int(colour[1:3], 16)), float(int(colour[3:5], 16)), float(int(colour[5:7], 16))
+
+
+class Look(NamedTuple):
+    """What is to be seen besides shapes.
+
+    Attributes
+    ----------
+    arrows : bool
+        Arrows for controls that the scene shows none of, and for the forces that the scene names.
+    trail : float [s]
+        For how long the way of the bodies is to be seen.
+    readout : bool
+        Whether time, return, score, controls and state stand below.
+    """
+
+    arrows: bool = False
+    trail: float = 0.0
+    readout: bool = False
 
 
 class Viewer:
@@ -78,7 +121,11 @@ class Viewer:
     task : Task
         Says, with its scene, what is to be seen.
     mode : {"human", "rgb_array"}
-        Whether `draw` shows the picture in a window, at the pace of the control interval, or returns it.
+        Whether `draw` shows the picture in a window, in real time, or returns it.
+    look : Look, optional
+        What else is to be seen.
+    size : (int, int)
+        Width and height of the picture [pixels].
 
     Notes
     -----
@@ -88,25 +135,43 @@ class Viewer:
     Raises
     ------
     DependencyNotInstalled
-        Where pygame is missing.
+        Where pygame is missing, for a window or the read-out.
     Error
         From `draw`, where there is no display for the window.
     """
 
-    def __init__(self, task: Task, mode: str) -> None:
-        pygame = _pygame()
-        self._task = task
+    def __init__(
+        self,
+        task: Task,
+        mode: str,
+        look: tuple[bool, float, bool] = Look(),
+        size: tuple[int, int] = (WIDTH, HEIGHT),
+    ) -> None:
+        self._task, self._look, self._size = task, Look(*look), size
         self._picture = Picture(task)
+        self._pen = Pen(self._picture, size, STRIP if self._look.readout else 0)
+        self._forces = Forces(task, self._picture) if self._look.arrows else None
+        self._scale = _scale(task) if self._look.readout else None
+        #: Points of each body whose way is shown, and where they were.
+        self._tips = tips(self._picture) if self._look.trail else {}
+        self._trail: deque[list[Point]] = deque(maxlen=max(2, round(self._look.trail / task.dt) + 1))
         self._turned: Any = 0.0
         self._before: tuple[list[float], NDArray[np.float64]] | None = None
-        self._clock = pygame.time.Clock()
-        self._rate = max(1, round(1.0 / task.dt))
+        self._steps = 0
         self._human = mode == "human"
+        self._due = self._shown = -math.inf
+        if self._human or self._look.readout:
+            _pygame()
         if self._human:
             _desk.add(self)
 
     def draw(
-        self, state: NDArray[np.float64], control: float, target: float | None
+        self,
+        state: NDArray[np.float64],
+        control: Any,
+        target: Any,
+        steps: int = 0,
+        total: float = 0.0,
     ) -> NDArray[np.uint8] | None:
         """Paint a state.
 
@@ -114,10 +179,14 @@ class Viewer:
         ----------
         state : ndarray, shape (n_state,)
             State in SI units, in the scene's order.
-        control : float
-            Control applied last, in SI units.
-        target : float or None
-            The episode's target.
+        control : float or sequence of float
+            Controls applied last, in SI units.
+        target : float, sequence of float or None
+            The episode's targets.
+        steps : int
+            Steps of the episode so far; where they are fewer than before another one has begun.
+        total : float
+            Sum of its rewards so far.
 
         Returns
         -------
@@ -126,20 +195,68 @@ class Viewer:
         """
         if self._human and self not in _desk:
             return None
+        if steps < self._steps:
+            self._turned, self._before = 0.0, None
+            self._trail.clear()
+        again, self._steps = steps == self._steps and self._before is not None, steps
         values = state.tolist()
         self._turn(values)
         now = Frame(values, control, self._task.share(control), target, self._turned)
-        picture = paint(self._task, now, self._picture)
-        if self._human:
-            _desk.show(self, picture)
-            self._clock.tick(self._rate)
+        poses = self._picture.poses(now)
+        if self._tips and not (again and self._trail):
+            self._trail.append([_seen(poses[frame], tip) for frame, tip in self._tips.items()])
+        if self._human and not again and not self._is_due():
             return None
-        pixels = np.frombuffer(_pygame().image.tobytes(picture, "RGB"), dtype=np.uint8)
-        return pixels.reshape(HEIGHT, WIDTH, 3).copy()
+        picture = self._paint(now, poses, steps * self._task.dt, total)
+        if not self._human:
+            return picture
+        _desk.show(self, picture)
+        if not again:
+            self._wait()
+        return None
 
     def close(self) -> None:
         """Take the picture off the window; the last one closes it."""
         _desk.remove(self)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture [pixels]."""
+        return self._size
+
+    def _paint(self, now: Frame, poses: list[Pose], seconds: float, total: float) -> NDArray[np.uint8]:
+        width, height = self._size
+        image = np.full((height, width, 3), 255, np.uint8)
+        more = list(self._more(now, poses))
+        self._pen.paint(image, poses, self._picture.window(poses), more)
+        if self._look.readout:
+            write_readout(image, self._readings(now, seconds, total), self._pen.scale)
+        return image
+
+    def _more(self, now: Frame, poses: list[Pose]) -> Iterator[Extra]:
+        """Yield trail and arrows."""
+        pieces = min(12, len(self._trail) - 1)
+        for tip in range(len(self._tips)):
+            way = [points[tip] for points in self._trail]
+            for i in range(pieces):
+                part = way[i * (len(way) - 1) // pieces : (i + 1) * (len(way) - 1) // pieces + 1]
+                yield Extra(s.Line(part), TRAIL, (i + 1.0) / pieces)
+        if self._forces is not None:
+            for arrow, is_control in self._forces.arrows(now, poses):
+                yield Extra(arrow, STYLES["action"] if is_control else FORCE, 1.0)
+
+    def _readings(self, now: Frame, seconds: float, total: float) -> list[list[Reading]]:
+        """Return the rows of the read-out."""
+        task = self._task
+        first = [Reading("time", seconds, "s"), Reading("return", total, "")]
+        if self._scale is not None:
+            random, best = self._scale
+            first.append(Reading("score", (total - random) / (best - random), ""))
+        names = zip(task.scene.state_names, now.state, task.scene.state_units, strict=True)
+        return [
+            [*first, *task.control_readings(now), *task.readings(now)],
+            [Reading(*entry) for entry in names],
+        ]
 
     def _turn(self, state: list[float]) -> None:
         """Integrate what turns but is not in the state; exact if its rate is linear and each step drawn."""
@@ -148,222 +265,329 @@ class Viewer:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
         self._before = (state, rate)
 
+    # --- real time ------------------------------------------------------------------------------------------
 
-def paint(task: Task, now: Frame, shown: Picture | None = None) -> pygame.Surface:
-    """Return a picture with its read-out; `shown` is the task's `Picture`, where it was made before."""
-    pygame, shown = _pygame(), shown or Picture(task)
+    def _is_due(self) -> bool:
+        """Tell whether to show this step: of those that follow each other faster than a window can, some."""
+        now = time.perf_counter()
+        self._due += self._task.dt
+        if not now - 0.25 < self._due:
+            self._due = now  # the first, or whoever steps was busy: what is lost is not caught up with
+        return self._due - self._shown > 1.0 / RATE - 1e-4
+
+    def _wait(self) -> None:
+        """Wait until a control interval has gone by since the step before."""
+        self._shown = self._due
+        time.sleep(max(0.0, self._due - time.perf_counter()))
+
+
+def _scale(task: Task) -> tuple[float, float] | None:
+    """Return the returns that are scores 0 and 1; None where the task is another than theirs."""
+    known, usual = measured(task.id).get("scale"), type(task)()
+    same = (task.scene, task.dt, task.duration) == (usual.scene, usual.dt, usual.duration)
+    return (known["random"], known["best"]) if known and same else None
+
+
+def tips(picture: Picture) -> dict[int, Point]:
+    """Return for each frame with a body the middle of what of it is farthest away from the frame's origin."""
+    found = {}
+    for frame in dict.fromkeys(frame for frame, _ in picture.shapes):
+        points: list[Point] = []
+        for of, shape in picture.shapes:
+            if of == frame and getattr(shape, "role", "") == "body":
+                points += [shape.centre] if isinstance(shape, s.Circle) else list(shape.points)
+        far = max((math.hypot(*point) for point in points), default=0.0)
+        ends = [point for point in points if math.hypot(*point) >= 0.98 * far]
+        if points:
+            found[frame] = (sum(x for x, _ in ends) / len(ends), sum(y for _, y in ends) / len(ends))
+    return found
+
+
+def _seen(pose: Pose, point: Point) -> Point:
+    """Return where a point of a frame is."""
+    c, n, way = math.cos(pose.angle), math.sin(pose.angle), -1.0 if pose.part < 0.0 else 1.0
+    return pose.x + c * point[0] - way * n * point[1], pose.y + n * point[0] + way * c * point[1]
+
+
+def paint(task: Task, now: Frame, shown: Picture | None = None) -> NDArray[np.uint8]:
+    """Return a picture of a moment; `shown` is the task's `Picture`, where it was made before."""
+    shown = shown or Picture(task)
     poses = shown.poses(now)
-    view = shown.window(poses)
-    scene = pygame.Surface((FINE * WIDTH, FINE * (HEIGHT - STRIP)), depth=32)
-    scene.fill(PAPER)
-    pen = Pen(scene, view)
-    pen.paint([part for frame, shape in shown.shapes for part in s.placed(shape, poses[frame], view)])
-    picture = pygame.Surface((WIDTH, HEIGHT), depth=32)
-    size = (WIDTH, HEIGHT - STRIP)
-    pygame.transform.smoothscale(scene, size, picture.subsurface((0, 0), size))
-    picture.fill(STRIP_PAPER, (0, HEIGHT - STRIP, WIDTH, STRIP))
-    names = zip(task.scene.state_names, now.state, task.scene.state_units, strict=True)
-    _write_row(picture, 0, [Reading(*entry) for entry in names])
-    _write_row(picture, 1, [*task.control_readings(now), *task.readings(now)])
-    _draw_scale(picture, pen.scale / FINE)
-    return picture
+    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    Pen(shown, (WIDTH, HEIGHT)).paint(image, poses, shown.window(poses))
+    return image
+
+
+def columns_of(tiles: int) -> int:
+    """Return how many pictures stand side by side, of so many in a grid."""
+    return math.ceil(math.sqrt(tiles))
+
+
+def tile_size(tiles: int) -> tuple[int, int]:
+    """Return the size of each picture of a grid: all of it is as wide as two pictures at most."""
+    # Even, as video files ask for.
+    width, height = (max(30, size // columns_of(tiles)) * 2 for size in (WIDTH, HEIGHT))
+    return min(WIDTH, width), min(HEIGHT, height)
+
+
+def tiled(pictures: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
+    """Return pictures of one size as one, row by row, with a line between them."""
+    height, width = pictures[0].shape[:2]
+    rows = math.ceil(len(pictures) / columns)
+    image = np.full((rows * height, columns * width, 3), 255, np.uint8)
+    for i, picture in enumerate(pictures):
+        y, x = divmod(i, columns)
+        place = image[y * height : (y + 1) * height, x * width : (x + 1) * width]
+        place[:] = picture
+        place[-1:], place[:, -1:] = 0xC8, 0xC8
+    return image
+
+
+# --- painting ---------------------------------------------------------------------------------------------
+
+
+class Extra(NamedTuple):
+    """A line or an arrow in the plane with a style of its own, and how opaque it is."""
+
+    shape: s.Line | s.Arrow
+    style: Style
+    opacity: float = 1.0
+
+
+class Outline(NamedTuple):
+    """Polygons of one shape, see `raster.fill`."""
+
+    points: NDArray[np.float64]
+    ends: NDArray[np.int64]
+    colours: NDArray[np.float64]
 
 
 class Pen:
-    """Paints shapes on a surface, of which a window in metres fills as much as it can."""
+    """Paints the shapes of a picture, of whose window an image shows as much as it can.
 
-    def __init__(self, surface: pygame.Surface, window: Window) -> None:
-        self._surface = surface
-        self._size = width, height = surface.get_size()
-        self.scale = 1.0 / max((window.right - window.left) / width, (window.top - window.bottom) / height)
-        self._left = 0.5 * (width - self.scale * (window.left + window.right))
-        self._top = 0.5 * (height + self.scale * (window.bottom + window.top))
+    Parameters
+    ----------
+    picture : Picture
+        The shapes; what it looks at moves, but keeps its size.
+    size : (int, int)
+        Width and height of the image [pixels].
+    strip : int
+        Height of what is left free below [pixels].
+    glass : float, optional
+        In place of the picture's window a square with sides of so many metres, without a margin.
+    """
 
-    def paint(self, shapes: Sequence[Shape]) -> None:
-        """Paint shapes, later ones over earlier ones."""
-        for shape in shapes:
-            match shape:
-                case s.Line(points, role):
-                    self._line(self._place(points), STYLES[role])
-                case s.Polygon(points, role):
-                    self._area(self._place(points), STYLES[role])
-                case s.Circle(centre, radius, role):
-                    self._disc(centre, radius, STYLES[role])
-                case s.Arrow(points, role):
-                    self._arrow(self._place(points), STYLES[role])
-                case s.Magnifier():
-                    self._magnify(shape, [x for x in shapes if not isinstance(x, s.Magnifier)])
+    def __init__(
+        self, picture: Picture, size: tuple[int, int], strip: int = 0, glass: float | None = None
+    ) -> None:
+        self._picture, (width, height) = picture, size
+        view, margin = picture.view, MARGIN if glass is None else 0
+        wide, high = (view.right - view.left, view.top - view.bottom) if glass is None else (glass, glass)
+        self._box = width - 2 * margin, height - strip - 2 * margin
+        self.scale = 1.0 / max(wide / self._box[0], high / self._box[1])
+        self._middle = 0.5 * width, 0.5 * (height - strip)
+        self._shapes = [x for x in picture.shapes if not isinstance(x[1], s.Magnifier)]
+        self._lenses = [x for x in picture.shapes if isinstance(x[1], s.Magnifier)] if glass is None else []
+        #: Those of rulers, whose ticks are where one looks, are made anew for each picture.
+        self._outlines = [self._outline(shape) for _, shape in self._shapes]
+        self._room = np.zeros((height, width + 2))
+        self._plane = len(picture.frames)
+        self._glass: Glass | None = None
 
-    def _place(self, points: Sequence[Point]) -> list[Point]:
-        return _near([(self._left + self.scale * x, self._top - self.scale * y) for x, y in points])
+    def paint(
+        self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[Extra] = ()
+    ) -> None:
+        """Paint the shapes, and then what lies in the plane, over an image."""
+        places = self._places(poses, view)
+        found, frames = [], []
+        for (frame, shape), outline in zip(self._shapes, self._outlines, strict=True):
+            pose = poses[frame]
+            if isinstance(shape, s.Ruler):
+                outline = self._ticks(shape, s.ruled(shape, pose, view))
+            elif abs(pose.part) < 1.0 and isinstance(shape, s.Line | s.Arrow):
+                outline = self._outline(shape._replace(points=s.beginning(shape.points, abs(pose.part))))
+            found.append(outline)
+            frames.append(frame)
+        for shape, style, opacity in more:
+            outline = self._outline(shape, style)
+            outline.colours[:, 3] = opacity
+            found.append(outline)
+            frames.append(self._plane)
+        self._fill(image, found, frames, places)
+        for frame, lens in self._lenses:
+            self._magnify(image, lens, _seen(poses[frame], lens.centre), poses, places)
 
-    def _area(self, points: list[Point], style: Style) -> None:
-        half = 0.5 * FINE * style.width
-        if style.fill is None:
-            self._line([*points, points[0]], style)
-        elif half == 0.0:
-            self._fill(points, style.fill)
-        else:
-            turn = sum(a[0] * b[1] - a[1] * b[0] for a, b in pairwise([*points, points[0]]))
-            outward, ways = math.copysign(half, turn), _aside(points, closed=True)
-            self._fill(_moved(points, ways, outward), style.edge)
-            self._fill(_moved(points, ways, -outward), style.fill)
+    def _places(self, poses: Sequence[Pose], view: Window) -> NDArray[np.float64]:
+        """Return how each frame, and last the plane, comes to lie on the image."""
+        places = np.empty((len(poses) + 1, 6))
+        scale, (across, down) = self.scale, self._middle
+        x0, y0 = 0.5 * (view.left + view.right), 0.5 * (view.bottom + view.top)
+        for i, (x, y, angle, part) in enumerate((*poses, Pose(0.0, 0.0))):
+            c, n = scale * math.cos(angle), scale * math.sin(angle)
+            way = -1.0 if part < 0.0 else 1.0
+            places[i] = c, -n * way, -n, -c * way, across + scale * (x - x0), down - scale * (y - y0)
+        return places
 
-    def _disc(self, centre: Point, radius: float, style: Style) -> None:
-        (middle,), size, half = self._place([centre]), self.scale * radius, 0.5 * FINE * style.width
-        if style.fill is None:
-            self._line(_rim(middle, size), style)
-        else:
-            self._fill(_rim(middle, size + half), style.edge)
-            self._fill(_rim(middle, size - half), style.fill)
+    def _fill(
+        self,
+        image: NDArray[np.uint8],
+        outlines: Sequence[Outline],
+        frames: Sequence[int],
+        places: NDArray[np.float64],
+    ) -> None:
+        counts = [len(outline.ends) for outline in outlines]
+        sizes = [0, *accumulate(len(outline.points) for outline in outlines)]
+        ends = np.concatenate([outline.ends for outline in outlines]) + np.repeat(sizes[:-1], counts)
+        points = np.concatenate([outline.points for outline in outlines])
+        colours = np.concatenate([outline.colours for outline in outlines])
+        raster.fill(image, points, ends, np.repeat(frames, counts), places, colours, self._room)
 
-    def _line(self, points: list[Point], style: Style) -> None:
-        for part in _dashes(points, FINE * style.dash) if style.dash else [points]:
-            self._stroke(part, style.edge, FINE * style.width)
+    def _outline(self, shape: Shape, style: Style | None = None) -> Outline:
+        """Return the polygons of a shape, in metres of its frame."""
+        polygons: list[tuple[Sequence[Point], str]] = []
+        look, unit = style or STYLES[shape.role], 1.0 / self.scale  # type: ignore[union-attr]
+        match shape:
+            case s.Line(points):
+                polygons += _line(list(points), look, unit)
+            case s.Polygon(points):
+                polygons += _area(list(points), look, unit)
+            case s.Circle(centre, radius):
+                polygons += _disc(centre, radius, look, unit)
+            case s.Arrow(points):
+                polygons += _arrow(list(points), look, unit)
+        return _joined(polygons)
 
-    def _arrow(self, points: list[Point], style: Style) -> None:
-        """Paint an arrow as long as its points say; a short one is thinner."""
-        length, width = sum(math.dist(a, b) for a, b in pairwise(points)), FINE * style.width
-        if length < 1.0:
+    def _ticks(self, ruler: s.Ruler, at: Sequence[float]) -> Outline:
+        """Return a ruler's ticks."""
+        style = STYLES[ruler.role]
+        half = 0.5 * style.width / self.scale
+        tick = np.array([(-half, 0.0), (half, 0.0), (half, -ruler.size), (-half, -ruler.size)])
+        points = (np.array(at).reshape(-1, 1, 1) * (1.0, 0.0) + tick).reshape(-1, 2)
+        colours = np.tile((*_rgb(style.edge), 1.0), (len(at), 1))
+        return Outline(points, 4 * np.arange(1, len(at) + 1), colours)
+
+    def _magnify(
+        self,
+        image: NDArray[np.uint8],
+        lens: s.Magnifier,
+        centre: Point,
+        poses: Sequence[Pose],
+        places: NDArray[np.float64],
+    ) -> None:
+        """Show a part of the picture once more, in the upper right corner."""
+        size = round(GLASS * min(self._box))
+        if size < 8:
             return
-        width *= min(1.0, length / (4.0 * width))
-        head, shaft = 3.0 * width, [points[0]]
-        room = length - head
-        for a, b in pairwise(points):
-            step = math.dist(a, b)
-            if step >= room:
-                shaft.append(_between(a, b, room / step))
-                break
-            shaft.append(b)
-            room -= step
-        tip, (x, y) = points[-1], shaft[-1]
-        aside = 0.5 * (tip[1] - y), 0.5 * (x - tip[0])
-        self._stroke(shaft, style.edge, width)
-        self._fill([tip, (x + aside[0], y + aside[1]), (x - aside[0], y - aside[1])], style.edge)
+        if self._glass is None or self._glass.lens != lens:
+            self._glass = self._ground(lens, size)
+        x, y = centre
+        view = Window(x - lens.radius, y - lens.radius, x + lens.radius, y + lens.radius)
+        glass = np.full((size, size, 3), 255, np.uint8)
+        self._glass.pen.paint(glass, poses, view)
+        left, top = MARGIN + self._box[0] - size - GLASS_ROOM, MARGIN + GLASS_ROOM
+        place = image[top : top + size, left : left + size]
+        place[:] = place + self._glass.cover * (glass - place.astype(np.float32)) + 0.5
+        a, *_, e, f = places[-1].tolist()
+        middles = [(left + 0.5 * size, top + 0.5 * size), (e + a * x, f - a * y)]
+        at = np.array([(1.0, 0.0, 0.0, 1.0, *middle) for middle in middles])
+        self._fill(image, self._glass.rims, [0, 1], at)
 
-    def _stroke(self, points: list[Point], colour: str, width: float) -> None:
-        # Most dashes of a guide are beside a lens.
-        if self._beside(points, 4.0 * width):
-            return
-        ways = _aside(points)
-        there, back = _moved(points, ways, 0.5 * width), _moved(points, ways, -0.5 * width)
-        self._fill([*there, *reversed(back)], colour)
-
-    def _beside(self, points: list[Point], pad: float) -> bool:
-        """Tell whether nothing of an outline can be on the surface."""
-        width, height = self._size
-        x, y = [p[0] for p in points], [p[1] for p in points]
-        return max(x) < -pad or min(x) > width + pad or max(y) < -pad or min(y) > height + pad
-
-    def _fill(self, points: list[Point], colour: str) -> None:
-        if self._beside(points, 2.0):
-            return
-        draw, points = _pygame().draw, _near(points)
-        draw.polygon(self._surface, colour, points)
-        draw.aalines(self._surface, colour, True, points)
-
-    def _magnify(self, lens: s.Magnifier, shapes: Sequence[Shape]) -> None:
-        """Show a part of the picture in its upper right corner."""
-        pygame = _pygame()
-        size = FINE * 150
-        x, y = lens.centre
-        glass = pygame.Surface((size, size), pygame.SRCALPHA)
-        glass.fill(PAPER)
-        pen = Pen(glass, Window(x - lens.radius, y - lens.radius, x + lens.radius, y + lens.radius))
-        pen.paint(shapes)
-        mask = pygame.Surface((size, size), pygame.SRCALPHA)
-        pygame.draw.circle(mask, "white", (size / 2, size / 2), size / 2 - FINE)
-        glass.blit(mask, (0, 0), special_flags=pygame.BLEND_RGBA_MIN)
-        corner = (self._surface.get_width() - size - FINE * 12, FINE * 12)
-        middle = (corner[0] + size / 2, corner[1] + size / 2)
-        (small,) = self._place([lens.centre])
-        style = STYLES["guide"]._replace(dash=0.0)
-        radius = lens.radius * self.scale
-        # The common outer tangents of the two circles.
-        gap, turn = math.dist(small, middle), math.atan2(middle[1] - small[1], middle[0] - small[0])
-        if gap > size / 2 + radius:
-            spread = math.acos((radius - size / 2) / gap)
-            for angle in (turn + spread, turn - spread):
-                self._line([s.polar(small, radius, angle), s.polar(middle, size / 2 - FINE, angle)], style)
-        self._line(_rim(small, radius), style)
-        self._surface.blit(glass, corner)
-        self._line(_rim(middle, size / 2 - FINE), style)
+    def _ground(self, lens: s.Magnifier, size: int) -> Glass:
+        """Return what a magnifier needs each time."""
+        mask, rim = np.zeros((size, size, 3), np.uint8), np.array(_rim((0.5, 0.5), 0.5, 1.0 / size))
+        at, white = np.array([[size, 0.0, 0.0, size, 0.0, 0.0]]), np.array([[255.0, 255.0, 255.0, 1.0]])
+        none, room = np.zeros(1, np.int64), np.zeros((size, size + 2))
+        raster.fill(mask, rim, np.array([len(rim)]), none, at, white, room)
+        pen = Pen(self._picture, (size, size), glass=2.0 * lens.radius)
+        circles = [
+            _line(_rim((0.0, 0.0), radius, 1.0), RIM, 1.0)
+            for radius in (0.5 * size, lens.radius * self.scale)
+        ]
+        return Glass(lens, pen, mask[:, :, :1].astype(np.float32) / 255.0, [_joined(c) for c in circles])
 
 
-class _Desk:
-    """The window of the process, which the viewers share."""
+class Glass(NamedTuple):
+    """A magnifier: its pen, how much of each pixel it covers, and the rims of it and of what it shows."""
 
-    def __init__(self) -> None:
-        # Weak, so that an environment that was dropped without being closed leaves no place behind.
-        self._viewers: weakref.WeakKeyDictionary[Viewer, None] = weakref.WeakKeyDictionary()
-        self._screen: pygame.Surface | None = None
-        self._places = 0
-
-    def __contains__(self, viewer: Viewer) -> bool:
-        return viewer in self._viewers
-
-    def add(self, viewer: Viewer) -> None:
-        """Make room for a viewer."""
-        self._viewers[viewer] = None
-
-    def remove(self, viewer: Viewer) -> None:
-        """Take a viewer's picture away; the last one closes the window."""
-        if viewer in self._viewers:
-            del self._viewers[viewer]
-            if not self._viewers:
-                self._close()
-
-    def show(self, viewer: Viewer, picture: pygame.Surface) -> None:
-        """Show a viewer's picture, and close the window if its user asks for it."""
-        pygame, places = _pygame(), list(self._viewers)
-        columns = math.ceil(math.sqrt(len(places)))
-        # There is no surface either where another part of the program has closed all windows.
-        if self._screen is None or self._places != len(places) or pygame.display.get_surface() is None:
-            rows = math.ceil(len(places) / columns)
-            self._screen, self._places = _open_window(columns * WIDTH, rows * HEIGHT), len(places)
-        row, column = divmod(places.index(viewer), columns)
-        self._screen.blit(picture, (column * WIDTH, row * HEIGHT))
-        pygame.display.flip()
-        pygame.event.pump()
-        # Only this event is taken, so that a program can read keys.
-        if pygame.event.get(pygame.QUIT):
-            self._viewers.clear()
-            self._close()
-
-    def _close(self) -> None:
-        self._screen = None
-        _pygame().display.quit()
+    lens: s.Magnifier
+    pen: Pen
+    cover: NDArray[np.float32]
+    rims: list[Outline]
 
 
-def _open_window(width: int, height: int) -> pygame.Surface:
-    pygame = _pygame()
-    try:
-        pygame.display.init()
-        screen = pygame.display.set_mode((width, height))
-    except pygame.error as error:
-        raise Error(f'no window can be opened ({error}); render_mode="rgb_array" needs none') from error
-    pygame.display.set_caption("lag_envs")
-    return screen
-
-
-_desk = _Desk()
-
-
-# --- geometry, in pixels ----------------------------------------------------------------------------------
-
-
-def _near(points: list[Point]) -> list[Point]:
-    """Move points that are far outside nearer: pygame goes through all rows and columns of what it draws."""
-    if all(-FAR < x < FAR and -FAR < y < FAR for x, y in points):
-        return points
-    return [(min(max(x, -FAR), FAR), min(max(y, -FAR), FAR)) for x, y in points]
-
-
-def _rim(centre: Point, radius: float) -> list[Point]:
-    """Return points of a circle, as many as its size asks for; the last is the first."""
-    return s.arc(
-        centre, radius, 0.0, 2.0 * math.pi, min(max(12, math.ceil(4.0 * math.sqrt(max(radius, 0.0)))), 200)
+def _joined(polygons: Polygons) -> Outline:
+    """Return polygons as `raster.fill` takes them."""
+    ends = np.array([*accumulate(len(points) for points, _ in polygons)], np.int64)
+    flat = [point for points, _ in polygons for point in points]
+    colours = [(*_rgb(colour), 1.0) for _, colour in polygons]
+    return Outline(
+        np.array(flat, np.float64).reshape(-1, 2), ends, np.array(colours, np.float64).reshape(-1, 4)
     )
+
+
+# --- outlines, in metres ----------------------------------------------------------------------------------
+# `unit` is the length of a pixel.
+
+Polygons = list[tuple[Sequence[Point], str]]
+
+
+def _line(points: list[Point], style: Style, unit: float) -> Polygons:
+    if style.dash is None or not _dashable(points, style.dash, unit):
+        return _stroke(points, style.edge, unit * style.width)
+    found: Polygons = []
+    for dash in _dashes(points, unit * style.dash[0], unit * style.dash[1]):
+        found += _stroke(dash, style.edge, unit * style.width)
+    return found
+
+
+def _dashable(points: list[Point], dash: tuple[float, float], unit: float) -> bool:
+    return sum(math.dist(a, b) for a, b in pairwise(points)) < DASHES * unit * sum(dash)
+
+
+def _area(points: list[Point], style: Style, unit: float) -> Polygons:
+    half = 0.5 * unit * style.width
+    if style.fill is None:
+        return _line([*points, points[0]], style, unit)
+    if half == 0.0:
+        return [(points, style.fill)]
+    turn = sum(a[0] * b[1] - a[1] * b[0] for a, b in pairwise([*points, points[0]]))
+    outward, ways = math.copysign(half, turn), _aside(points, closed=True)
+    return [(_moved(points, ways, outward), style.edge), (_moved(points, ways, -outward), style.fill)]
+
+
+def _disc(centre: Point, radius: float, style: Style, unit: float) -> Polygons:
+    half = 0.5 * unit * style.width
+    if style.fill is None:
+        return _line(_rim(centre, radius, unit), style, unit)
+    found: Polygons = [(_rim(centre, radius + half, unit), style.edge)]
+    return [*found, (_rim(centre, radius - half, unit), style.fill)] if radius > half else found
+
+
+def _rim(centre: Point, radius: float, unit: float) -> list[Point]:
+    """Return points of a circle, as many as its size asks for; the last is the first."""
+    n = min(max(12, math.ceil(7.0 * math.sqrt(max(radius, 0.0) / unit))), 300)
+    return s.arc(centre, radius, 0.0, 2.0 * math.pi, n)
+
+
+def _arrow(points: list[Point], style: Style, unit: float) -> Polygons:
+    """Return an arrow as long as its points say; a short one is thinner."""
+    length, width = sum(math.dist(a, b) for a, b in pairwise(points)), unit * style.width
+    if length < 1.5 * unit:
+        return []
+    width *= min(1.0, length / (4.0 * width))
+    shaft = list(s.beginning(points, 1.0 - 3.0 * width / length))
+    tip, (x, y) = points[-1], shaft[-1]
+    aside = 0.5 * (tip[1] - y), 0.5 * (x - tip[0])
+    head = [tip, (x + aside[0], y + aside[1]), (x - aside[0], y - aside[1])]
+    return [*_stroke(shaft, style.edge, width), (head, style.edge)]
+
+
+def _stroke(points: list[Point], colour: str, width: float) -> Polygons:
+    if len(points) < 2:
+        return []
+    ways = _aside(points)
+    there, back = _moved(points, ways, 0.5 * width), _moved(points, ways, -0.5 * width)
+    return [([*there, *reversed(back)], colour)]
 
 
 def _between(a: Point, b: Point, share: float) -> Point:
@@ -390,8 +614,8 @@ def _normal(a: Point, b: Point) -> Point:
     return ((b[1] - a[1]) / length, (a[0] - b[0]) / length) if length else (0.0, 0.0)
 
 
-def _dashes(points: list[Point], length: float) -> Iterator[list[Point]]:
-    """Cut a line into dashes with gaps of two thirds of their length."""
+def _dashes(points: list[Point], length: float, gap: float) -> Iterator[list[Point]]:
+    """Cut a line into dashes with gaps between them."""
     dash, room, on = [points[0]], length, True
     for a, b in pairwise(points):
         step, done = math.dist(a, b), 0.0
@@ -401,11 +625,79 @@ def _dashes(points: list[Point], length: float) -> Iterator[list[Point]]:
             if on:
                 yield [*dash, cut]
             dash, on = [cut], not on
-            room = length if on else length * 2.0 / 3.0
+            room = length if on else gap
         room -= step - done
         dash.append(b)
     if on:
         yield dash
+
+
+# --- the window -------------------------------------------------------------------------------------------
+
+
+class _Desk:
+    """The window of the process, which the viewers share."""
+
+    def __init__(self) -> None:
+        # Weak, so that an environment that was dropped without being closed leaves no place behind.
+        self._viewers: weakref.WeakKeyDictionary[Viewer, None] = weakref.WeakKeyDictionary()
+        self._screen: pygame.Surface | None = None
+        self._places = 0
+
+    def __contains__(self, viewer: Viewer) -> bool:
+        return viewer in self._viewers
+
+    def add(self, viewer: Viewer) -> None:
+        """Make room for a viewer."""
+        # What is registered first is called last: when the viewer is no longer among these.
+        weakref.finalize(viewer, self._tidy)
+        self._viewers[viewer] = None
+
+    def remove(self, viewer: Viewer) -> None:
+        """Take a viewer's picture away; the last one closes the window."""
+        self._viewers.pop(viewer, None)
+        self._tidy()
+
+    def _tidy(self) -> None:
+        """Close the window where nobody shows anything any more, as at the end of the program."""
+        if self._screen is not None and not self._viewers:
+            self._close()
+
+    def show(self, viewer: Viewer, picture: NDArray[np.uint8]) -> None:
+        """Show a viewer's picture, and close the window if its user asks for it."""
+        pygame, places = _pygame(), list(self._viewers)
+        columns, (width, height) = math.ceil(math.sqrt(len(places))), viewer.size
+        # There is no surface either where another part of the program has closed all windows.
+        if self._screen is None or self._places != len(places) or pygame.display.get_surface() is None:
+            rows = math.ceil(len(places) / columns)
+            self._screen, self._places = _open_window(columns * width, rows * height), len(places)
+        row, column = divmod(places.index(viewer), columns)
+        surface = pygame.image.frombuffer(picture, (width, height), "RGB")
+        self._screen.blit(surface, (column * width, row * height))
+        pygame.display.flip()
+        pygame.event.pump()
+        # Only this event is taken, so that a program can read keys.
+        if pygame.event.get(pygame.QUIT):
+            self._viewers.clear()
+            self._close()
+
+    def _close(self) -> None:
+        self._screen = None
+        _pygame().display.quit()
+
+
+def _open_window(width: int, height: int) -> pygame.Surface:
+    pygame = _pygame()
+    try:
+        pygame.display.init()
+        screen = pygame.display.set_mode((width, height))
+    except pygame.error as error:
+        raise Error(f'no window can be opened ({error}); render_mode="rgb_array" needs none') from error
+    pygame.display.set_caption("lag_envs")
+    return screen
+
+
+_desk = _Desk()
 
 
 # --- the read-out -----------------------------------------------------------------------------------------
@@ -427,49 +719,81 @@ def _text(text: str, size: int, colour: str) -> pygame.Surface:
         return _font(size).render(text, True, colour)
 
 
-def _write_row(picture: pygame.Surface, row: int, readings: Sequence[Reading]) -> None:
-    """Write readings in columns that do not move with the length of the numbers."""
-    y = HEIGHT - STRIP + 6 + 20 * row
-    for column, reading in enumerate(readings):
-        x = 14 + 128 * column
-        colour = STYLES[reading.role].edge if reading.role != "frame" else INK
-        _write_name(picture, reading.name, x, y, colour)
-        number = _text(_number(reading.value), 20, colour)
-        picture.blit(number, (x + 70 - number.get_width(), y))
-        picture.blit(_text(reading.unit, 20, colour), (x + 74, y))
+def write_readout(image: NDArray[np.uint8], rows: Sequence[Sequence[Reading]], scale: float) -> None:
+    """Write rows of readings below a picture, in columns that do not move with the length of the numbers.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width, 3)
+        The picture.
+    rows : sequence of sequence of Reading
+        Two rows.
+    scale : float
+        Pixels of a metre, of which a part is drawn.
+    """
+    pygame, (height, width) = _pygame(), image.shape[:2]
+    surface = pygame.image.frombuffer(image, (width, height), "RGB")
+    surface.fill(STRIP_PAPER, (0, height - STRIP, width, STRIP))
+    bar = min(100, width // 3)
+    for number, row in enumerate(rows):
+        x, y, end = 10, height - STRIP + 7 + 20 * number, width - number * (bar + 24)
+        for reading in row:
+            colour = STYLES[reading.role].edge if reading.role != "frame" else INK
+            value, unit = _text(_number(reading.value), 17, colour), _text(reading.unit, 17, colour)
+            # The column's width follows from what does not change.
+            right = x + max(_name_width(reading.name) + 54, 62)
+            if right + 4 + unit.get_width() > end:
+                break
+            _write_name(surface, reading.name, x, y, colour)
+            surface.blit(value, (right - value.get_width(), y))
+            surface.blit(unit, (right + 4, y))
+            x = max(right + 4 + unit.get_width() + 14, x + COLUMN)
+    _draw_scale(surface, scale, bar)
 
 
-def _write_name(picture: pygame.Surface, name: str, x: int, y: int, colour: str) -> None:
-    base = name.removesuffix("*").rstrip("'").replace("_dot", "").replace("_ddot", "")
+def _name_parts(name: str) -> tuple[str, int, bool]:
+    """Return a name's letter or word, how many dots are above it, and whether a star follows."""
+    base = name.removesuffix("*").rstrip("'").replace("_ddot", "").replace("_dot", "")
     dots = name.count("'") + name.count("_dot") + 2 * name.count("_ddot")
     try:
         base = unicodedata.lookup(f"GREEK SMALL LETTER {base}")
     except KeyError:
         pass
-    letter = _text(base, 20, colour)
-    picture.blit(letter, (x, y))
+    return base, dots, name.endswith("*")
+
+
+def _name_width(name: str) -> int:
+    base, _, star = _name_parts(name)
+    return _font(17).size(base + "*" * star)[0]
+
+
+def _write_name(surface: pygame.Surface, name: str, x: int, y: int, colour: str) -> None:
+    base, dots, star = _name_parts(name)
+    letter = _text(base, 17, colour)
+    surface.blit(letter, (x, y))
     for i in range(dots):
         place = x + 0.5 * letter.get_width() + 4 * (i - 0.5 * (dots - 1))
-        _pygame().draw.rect(picture, colour, (round(place) - 1, y - 2, 2, 2))
-    if name.endswith("*"):
-        picture.blit(_text("*", 20, colour), (x + letter.get_width(), y))
+        _pygame().draw.rect(surface, colour, (round(place) - 1, y - 2, 2, 2))
+    if star:
+        surface.blit(_text("*", 17, colour), (x + letter.get_width(), y))
 
 
 def _number(value: float) -> str:
-    return (f"{value:.3f}" if abs(value) < 1e4 else f"{value:.2e}").replace("-", "−")
+    digits = 3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1
+    return (f"{value:.{digits}f}" if abs(value) < 1e4 else f"{value:.2e}").replace("-", "−")
 
 
-def _draw_scale(picture: pygame.Surface, scale: float) -> None:
+def _draw_scale(surface: pygame.Surface, scale: float, longest: int) -> None:
     """Draw a length and say how long it is."""
-    length = s.round_length(100.0 / scale)
-    label = _text(f"{length:g} m", 18, INK)
-    right, y = WIDTH - 14, HEIGHT - 9
+    length = s.round_length(longest / scale)
+    label = _text(f"{length:g} m", 16, INK)
+    right, y = surface.get_width() - 12, surface.get_height() - 8
     left = right - round(length * scale)
     draw = _pygame().draw
-    draw.line(picture, INK, (left, y), (right, y))
+    draw.line(surface, INK, (left, y), (right, y))
     for x in (left, right):
-        draw.line(picture, INK, (x, y - 3), (x, y + 3))
-    picture.blit(label, ((left + right - label.get_width()) // 2, y - 15))
+        draw.line(surface, INK, (x, y - 3), (x, y + 3))
+    surface.blit(label, ((left + right - label.get_width()) // 2, y - 14))
 
 
 # --- pictures of all environments -------------------------------------------------------------------------
@@ -496,7 +820,7 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -
 
     from lag_envs.tasks import TASKS
 
-    pygame, files = _pygame(), []
+    files = []
     Path(directory).mkdir(parents=True, exist_ok=True)
     for env_id in TASKS:
         env = gym.make(env_id, render_mode="rgb_array")
@@ -511,7 +835,7 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -
                 break
         picture: Any = env.render()
         files.append(Path(directory) / f"{env_id}.png")
-        pygame.image.save(pygame.image.frombytes(picture.tobytes(), (WIDTH, HEIGHT), "RGB"), files[-1])
+        files[-1].write_bytes(raster.png(picture))
     return files
 
 

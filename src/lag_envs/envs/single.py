@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.program import SLOW, constants_of, program_for
-from lag_envs.scenes.checks import shown
+from lag_envs.scenes.checks import check_number, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 
@@ -37,6 +37,13 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         How `render` shows the scene.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
+    show_arrows : bool, default False
+        Whether pictures have arrows for controls that the scene shows none of, and for the forces that it
+        names.
+    show_trail : float, default 0.0 [s]
+        For how long pictures show the way of the bodies.
+    show_readout : bool, default False
+        Whether time, return, score, controls and state stand below a picture.
     **options
         Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...
 
@@ -57,10 +64,20 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
     def __init__(
-        self, task: str, render_mode: str | None = None, diagnostics: bool = False, **options: Any
+        self,
+        task: str,
+        render_mode: str | None = None,
+        diagnostics: bool = False,
+        show_arrows: bool = False,
+        show_trail: float = 0.0,
+        show_readout: bool = False,
+        **options: Any,
     ) -> None:
         check_render_mode(render_mode)
         check_flag("diagnostics", diagnostics)
+        self._look = check_look(show_arrows, show_trail, show_readout)
+        #: Whether anything is to be done after each step.
+        self._seen = render_mode == "human" or bool(show_readout)
         self.task: Task = load_task(task)(**options)
         self.scene = self.task.scene
         self.__doc__ = self.task.__doc__
@@ -81,8 +98,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._ids = np.zeros(3, dtype=np.uint64)
         self._row = {name: j for j, name in enumerate(rows)}
         self._size = len(program.o)
-        self._ready = False
-        self._started = False
+        self._ready = self._started = False
         self._bind()
 
     def _bind(self) -> None:
@@ -134,7 +150,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._program.start_one(
             self._rows, observation, self._ids, given_state is not None, given_target is not None
         )
-        self._ready = True
+        self._ready, self._total = True, 0.0
         if self.render_mode == "human":
             self.render()
         return observation, self._info()
@@ -180,8 +196,10 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             if over == SLOW:
                 reward, over = self._slow_step(observation)
             self._ready = over % 2 == 0
-        if self.render_mode == "human":
-            self.render()
+        if self._seen:
+            self._total += float(reward)
+            if self.render_mode == "human":
+                self.render()
         return observation, reward, over % 2 == 1, over >= 2, self._info() if self.diagnostics else {}
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -196,8 +214,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._viewer is None:
             from lag_envs.envs.rendering import Viewer
 
-            self._viewer = Viewer(self.task, self.render_mode)
-        return self._viewer.draw(self.state, self.control, self.target)
+            self._viewer = Viewer(self.task, self.render_mode, self._look)
+        steps = int(self._rows[self._row["n"]])
+        return self._viewer.draw(self.state, self.control, self.target, steps, self._total)
 
     def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
         """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""
@@ -241,6 +260,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._spec = None if value is None else true_spec(value, self.task.limit)
 
     _spec: EnvSpec | None = None
+    #: Sum of the episode's rewards, where that is to be seen.
+    _total = 0.0
 
     # --- the rest ------------------------------------------------------------------------------------------
 
@@ -320,6 +341,16 @@ def check_render_mode(mode: str | None) -> None:
     """Raise ValueError for an unknown render mode."""
     if mode is not None and not (isinstance(mode, str) and mode in RENDER_MODES):
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)} or None, got {shown(mode)}")
+
+
+def check_look(arrows: Any, trail: Any, readout: Any) -> tuple[bool, float, bool]:
+    """Return what pictures show besides shapes, see `rendering.Look`, or raise a ValueError."""
+    check_flag("show_arrows", arrows)
+    check_flag("show_readout", readout)
+    seconds = check_number("show_trail", trail, "s")
+    if not 0.0 <= seconds <= 60.0:
+        raise ValueError(f"show_trail must lie between 0 and 60 s, got {shown(trail)}")
+    return bool(arrows), seconds, bool(readout)
 
 
 def check_flag(name: str, value: Any) -> None:

@@ -19,6 +19,7 @@ from lag_envs.envs.single import (
     FLOAT32,
     absent,
     check_flag,
+    check_look,
     check_render_mode,
     check_seed,
     diagnostics,
@@ -55,9 +56,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     autoreset_mode : {"NextStep", "SameStep", "Disabled"} or AutoresetMode
         What happens when an episode is over; see `gymnasium.vector.AutoresetMode`.
     render_mode : {"rgb_array"}, optional
-        `render` then returns one picture for each environment.
+        `render` then returns a picture of each environment, which Gymnasium's wrappers ask for; or with
+        `show_tiles` one of them all.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
+    show_arrows, show_trail, show_readout
+        What pictures show besides, see `LagrangianEnv`.
+    show_tiles : int, optional
+        Show the first so many environments at most, side by side in one picture.
     **options
         Parameters of the scene and of the task. `num_envs` values give each environment its own.
 
@@ -85,13 +91,21 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         diagnostics: bool = False,
+        show_arrows: bool = False,
+        show_trail: float = 0.0,
+        show_readout: bool = False,
+        show_tiles: int | None = None,
         **options: Any,
     ) -> None:
         if render_mode == "human":
             raise ValueError("render_mode must be 'rgb_array' or None for a vector environment, got 'human'")
         check_render_mode(render_mode)
         check_flag("diagnostics", diagnostics)
+        self._look = check_look(show_arrows, show_trail, show_readout)
         self.num_envs = check_count("num_envs", num_envs)
+        self._tiles = (
+            None if show_tiles is None else min(check_count("show_tiles", show_tiles), self.num_envs)
+        )
         self.render_mode = render_mode
         self.diagnostics = diagnostics
         #: TorchRL asks for it under this name, as Gymnasium's own vector environments have it.
@@ -132,6 +146,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             self._write(f"k_{name}", self._lanes, np.array(values))
         self._started = False
         self._over = 0
+        #: Steps and sums of rewards of the episodes, where they are to be seen.
+        self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
+        self._seen = render_mode is not None and bool(
+            show_readout or show_trail or self.scene._layout.left_out
+        )
 
     def _compile(self) -> None:
         first = self._constants[0]
@@ -201,6 +220,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._start(observations, mask, True, state is not None, target is not None)
         self._started = True
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
+        self._steps[mask] = self._totals[mask] = 0
         return observations, self._infos(mask)
 
     def step(
@@ -264,27 +284,30 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         infos = self._infos(None) if self.diagnostics else {}
         if self._over and self.autoreset_mode == AutoresetMode.SAME_STEP:
             observations, infos = self._restart(observations, terminations | truncations, infos)
+        if self._seen:
+            self._count(rewards)
         results = observations, rewards, terminations, truncations, infos
         if status > 0:
             raise self._refusal(status - 1, results)
         return results
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """Return a picture of each environment."""
+    def render(self) -> Any:
+        """Return a picture (height, width, 3) of each environment, or with `show_tiles` one of them all."""
         if self.render_mode is None:
             gym.logger.warn('no render mode is set; make the environment with render_mode="rgb_array"')
             return None
         if not self._started:
             raise ResetNeeded("call reset() before render(): no episode has begun")
         if not self._viewers:
-            from lag_envs.envs.rendering import Viewer
-
-            self._viewers = tuple(Viewer(task, "rgb_array") for task in self._tasks)
+            self._viewers = self._make_viewers()
         targets = self.target if self.target is not None else [None] * self.num_envs
-        return tuple(
-            v.draw(s, u, g)
-            for v, s, u, g in zip(self._viewers, self.state, self.control, targets, strict=True)
-        )
+        shown = zip(self._viewers, self.state, self.control, targets, self._steps, self._totals, strict=False)
+        pictures = tuple(v.draw(s, u, g, int(n), float(r)) for v, s, u, g, n, r in shown)
+        if self._tiles is None:
+            return pictures
+        from lag_envs.envs.rendering import columns_of, tiled
+
+        return tiled(pictures, columns_of(self._tiles))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let go of the pictures."""
@@ -339,6 +362,21 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     _spec: EnvSpec | None = None
 
     # --- the rest ------------------------------------------------------------------------------------------
+
+    def _make_viewers(self) -> tuple[Any, ...]:
+        from lag_envs.envs.rendering import HEIGHT, WIDTH, Viewer, tile_size
+
+        size = (WIDTH, HEIGHT) if self._tiles is None else tile_size(self._tiles)
+        return tuple(
+            Viewer(task, "rgb_array", self._look, size)
+            for task in self._tasks[: self._tiles or self.num_envs]
+        )
+
+    def _count(self, rewards: NDArray[np.float64]) -> None:
+        """Note how far the episodes have come."""
+        begun = self._read("n") == 0.0
+        self._steps = np.where(begun, 0, self._steps + 1)
+        self._totals = np.where(begun, 0.0, self._totals + rewards)
 
     def _read(self, row: str) -> NDArray[np.float64]:
         return self._blocks[:, self._row[row]].reshape(-1)[: self.num_envs].copy()

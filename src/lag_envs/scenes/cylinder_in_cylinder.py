@@ -133,10 +133,10 @@ class CylinderInCylinder(Scene):
 
     def poses(self, q: Any, xp: Any) -> Any:
         """Return places and angles of shell and cylinder."""
-        spin = (self.shell_radius * q.psi - self.arm * q.theta) / self.radius
+        spin = (self.shell_radius * q.psi - self.arm * q.theta + q.slip) / self.radius
         return {
             "shell": (0.0, 0.0, q.psi),
-            "cylinder": (*self.place(q.theta, xp=xp), spin),
+            "cylinder": (*self.place(q.theta, self.arm - q.gap, xp), spin),
         }
 
     def bodies(self) -> Bodies:

@@ -125,7 +125,8 @@ class Incline(Scene):
 
     def poses(self, q: Any, xp: Any) -> Any:
         """Return place and angle of the cylinder; rolling ties its own angle to its place."""
-        return {"cylinder": (*self.place(q.x, self.radius, q.phi, xp), -q.x / self.radius - q.phi)}
+        turned = -(q.x + q.slip) / self.radius - q.phi
+        return {"cylinder": (*self.place(q.x, self.radius + q.lift, q.phi, xp), turned)}
 
     def bodies(self, low: float | None = None, high: float | None = None) -> Bodies:
         """Return ground from low to high [m], cylinder and tilt, and an arrow for the drag."""

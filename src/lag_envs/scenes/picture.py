@@ -136,7 +136,7 @@ class Picture:
 
     def _poses(self, now: Frame) -> dict[str, tuple]:
         scene = self._scene
-        q = _places(scene, now)
+        q = places(scene, now)
         found = {GROUND: (0.0, 0.0)} | dict(scene.poses(Values("coordinate", q), Numeric))
         seen = Now(
             Values("coordinate", q),
@@ -185,7 +185,7 @@ def at_rest(scene: Scene) -> Now:
     """Return a moment at which all numbers are zero."""
     zero = Frame([0.0] * len(scene.state_names))
     return Now(
-        Values("coordinate", _places(scene, zero)),
+        Values("coordinate", places(scene, zero)),
         Values("entry of the state", dict.fromkeys(scene.state_names, 0.0)),
         Values("control", dict.fromkeys(scene.control_names, 0.0)),
         Values("target", {}),
@@ -205,7 +205,7 @@ def _filled(names: Sequence[str], given: Any) -> dict[str, Any]:
     return dict.fromkeys(names, 0.0) | dict(zip(names, values, strict=False))
 
 
-def _places(scene: Scene, now: Frame) -> dict[str, Any]:
+def places(scene: Scene, now: Frame) -> dict[str, Any]:
     """Return the places of all coordinates."""
     layout = scene._layout
     controls = _filled(layout.controls, now.control)

@@ -161,13 +161,19 @@ def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
             return [shape._replace(centre=move(shape.centre))]
         case Polygon():
             return [shape._replace(points=[move(point) for point in shape.points])]
-        case Ruler(step, size, role):
-            across, up = 0.5 * (view.left + view.right) - x, 0.5 * (view.bottom + view.top) - y
-            middle, far = c * across + s * up, 2.0 * max(view.right - view.left, view.top - view.bottom)
-            at = ticks(middle - far, middle + far, step)
-            return [Line([move((a, 0.0)), move((a, -size))], role) for a in at]
+        case Ruler(_, size, role):
+            return [Line([move((a, 0.0)), move((a, -size))], role) for a in ruled(shape, pose, view)]
         case _:
             return [shape._replace(points=[move(point) for point in beginning(shape.points, abs(part))])]
+
+
+def ruled(ruler: Ruler, pose: Pose, view: Window) -> list[float]:
+    """Return where along its axis a ruler has ticks [m], as far as somebody sees who looks at a window."""
+    across, up = 0.5 * (view.left + view.right) - pose.x, 0.5 * (view.bottom + view.top) - pose.y
+    middle = math.cos(pose.angle) * across + math.sin(pose.angle) * up
+    far = 2.0 * max(view.right - view.left, view.top - view.bottom)
+    # Finer than any eye could tell, there are none.
+    return ticks(middle - far, middle + far, ruler.step) if far < 5_000.0 * ruler.step else []
 
 
 def beginning(points: Sequence[Point], part: float) -> Sequence[Point]:

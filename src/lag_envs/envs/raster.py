@@ -1,0 +1,143 @@
+"""Anti-aliased polygons in an image of bytes: each pixel takes the share of it that is covered.
+
+An outline's edges leave, in the cells of a row that they cross, how much of each lies to their right; the
+running sum along the row is the coverage, exact up to rounding. (The method is that of FreeType's and
+font-rs's rasterisers.) No library is asked for: what paints is compiled by Numba, as what steps is.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.stepping.cache import jit
+
+#: Coverage below this is rounding, and above its rest to 1 is all.
+EDGE = 1.0 / 512.0
+
+
+def fill(
+    image: NDArray[np.uint8], points: Any, ends: Any, frames: Any, poses: Any, colours: Any, room: Any
+) -> None:
+    """Paint polygons over an image, the later ones over the earlier ones.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width, 3)
+        What is painted on.
+    points : ndarray, shape (n, 2)
+        Corners of all polygons, one after the other.
+    ends : ndarray of int, shape (polygons,)
+        Where each one's corners end.
+    frames : ndarray of int, shape (polygons,)
+        The frame in which each one's corners are given.
+    poses : ndarray, shape (frames, 6)
+        For each frame (a, b, c, d, e, f), with which x = a·x' + b·y' + e and y = c·x' + d·y' + f in pixels.
+    colours : ndarray, shape (polygons, 4)
+        Red, green, blue from 0 to 255, and opacity from 0 to 1.
+    room : ndarray, shape (height, width + 2)
+        Zeros, which it leaves as zeros.
+    """
+    _fill(image, points, ends, frames, poses, colours, room)
+
+
+@jit
+def _fill(image: Any, points: Any, ends: Any, frames: Any, poses: Any, colours: Any, room: Any) -> None:
+    height, width = image.shape[0], image.shape[1]
+    begin = 0
+    for polygon in range(len(ends)):
+        end = ends[polygon]
+        frame = frames[polygon]
+        a, b, c = poses[frame, 0], poses[frame, 1], poses[frame, 2]
+        d, e, f = poses[frame, 3], poses[frame, 4], poses[frame, 5]
+        # The rows and columns that are touched.
+        left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
+        for i in range(begin, end):
+            x = a * points[i, 0] + b * points[i, 1] + e
+            y = c * points[i, 0] + d * points[i, 1] + f
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        if not (left < width and right > 0.0 and top < height and bottom > 0.0):
+            begin = end
+            continue
+        first, last = int(max(0.0, math.floor(left))), int(min(float(width), math.ceil(right)))
+        upper, lower = int(max(0.0, math.floor(top))), int(min(float(height), math.ceil(bottom)))
+        low, high = float(first), float(last)
+        for i in range(begin, end):
+            j = i + 1 if i + 1 < end else begin
+            x0 = a * points[i, 0] + b * points[i, 1] + e
+            y0 = c * points[i, 0] + d * points[i, 1] + f
+            x1 = a * points[j, 0] + b * points[j, 1] + e
+            y1 = c * points[j, 0] + d * points[j, 1] + f
+            way = 1.0
+            if y0 > y1:
+                x0, y0, x1, y1, way = x1, y1, x0, y0, -1.0
+            if y1 <= upper or y0 >= lower or y0 == y1:
+                continue
+            slope = (x1 - x0) / (y1 - y0)
+            for row in range(max(upper, math.floor(max(y0, 0.0))), lower):
+                if row >= y1:
+                    break
+                from_y, to_y = max(y0, float(row)), min(y1, row + 1.0)
+                share = way * (to_y - from_y)
+                xa = min(max(x0 + slope * (from_y - y0), low), high)
+                xb = min(max(x0 + slope * (to_y - y0), low), high)
+                if xa > xb:
+                    xa, xb = xb, xa
+                start, stop = math.floor(xa), math.ceil(xb)
+                if stop <= start + 1:
+                    inside = 0.5 * (xa + xb) - start
+                    room[row, start] += share * (1.0 - inside)
+                    room[row, start + 1] += share * inside
+                    continue
+                per = 1.0 / (xb - xa)
+                over = 0.0
+                for column in range(start, stop):
+                    # What of this piece of the edge's strip lies left of the cell's right end, integrated.
+                    p, q = max(xa, float(column)), min(xb, column + 1.0)
+                    covered = per * ((q - p) * (column + 1.0 - 0.5 * (p + q)) + (p - xa))
+                    room[row, column] += share * (covered - over)
+                    over = covered
+                room[row, stop] += share * (1.0 - over)
+        opaque = colours[polygon, 3]
+        red, green, blue = colours[polygon, 0], colours[polygon, 1], colours[polygon, 2]
+        whole = np.uint8(red), np.uint8(green), np.uint8(blue)
+        for row in range(upper, lower):
+            total, cover = 0.0, 0.0
+            for column in range(first, last):
+                change = room[row, column]
+                if change != 0.0:
+                    room[row, column] = 0.0
+                    total += change
+                    cover = min(abs(total), 1.0)
+                    cover = 0.0 if cover < EDGE else opaque if cover > 1.0 - EDGE else opaque * cover
+                if cover == 1.0:
+                    image[row, column, 0], image[row, column, 1], image[row, column, 2] = whole
+                elif cover > 0.0:
+                    rest = 1.0 - cover
+                    image[row, column, 0] = np.uint8(rest * image[row, column, 0] + cover * red + 0.5)
+                    image[row, column, 1] = np.uint8(rest * image[row, column, 1] + cover * green + 0.5)
+                    image[row, column, 2] = np.uint8(rest * image[row, column, 2] + cover * blue + 0.5)
+            room[row, last] = 0.0
+            room[row, last + 1] = 0.0
+        begin = end
+
+
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image (height, width, 3) as the bytes of a PNG file."""
+    height, width = image.shape[:2]
+    # Each row as its difference to the one above, which is mostly nothing.
+    rows = np.empty((height, 1 + 3 * width), np.uint8)
+    flat = np.ascontiguousarray(image).reshape(height, -1)
+    rows[:, 0], rows[0, 1:], rows[1:, 1:] = 2, flat[0], flat[1:] - flat[:-1]
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), 9)), (b"IEND", b""))
+    chunks = [
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in parts
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
