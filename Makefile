@@ -14,7 +14,7 @@ NUMBA_TESTS ?= tests/test_golden.py tests/test_series.py tests/test_own_tasks.py
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo baselines test test-slow test-libraries test-oldest lint types check audit bench bench-docs report report-docs submissions site format clean
+.PHONY: help setup demo baselines test test-slow notebooks test-libraries test-oldest lint types check audit bench bench-docs report report-docs submissions site format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -40,6 +40,9 @@ test: setup  ## run the tests and doctests, all but the slow ones
 test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'
 	$(BIN)/python -m pytest -m slow --no-skips --durations 10 $(ARGS)
+
+notebooks: setup  ## run the notebooks in full, from the wheel (minutes); the tests run a shorter version
+	$(BIN)/python -m pytest -m slow --no-skips -s tests/test_notebooks.py $(ARGS)
 
 test-libraries: setup  ## run libraries by their own scripts, each in its environment; ARGS='--docs' writes the page
 	$(BIN)/python tools/libraries $(ARGS)

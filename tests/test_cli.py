@@ -183,7 +183,7 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
 def test_watch_opens_a_window_until_it_is_closed(window, capsys, monkeypatch):
     assert cli.main(["watch", ID, "--seed", "1", "--steps", "3"]) == 0
     assert "PivotedBar-v0: PPO" in capsys.readouterr().out
-    assert cli.main(["watch", BALL, "--steps", "3"]) == 0
+    assert cli.main(["watch", BALL, "--steps", "3", "--arrows", "--trail", "1", "--readout"]) == 0
     agent = watch.load(ID, TASKS[ID](), "zero")[1]
     predict, seen = agent.predict, []
 
@@ -214,6 +214,8 @@ def test_watch_says_what_is_wrong(capsys, tmp_path, monkeypatch):
     assert "there is no folder for" in told(capsys, "watch", ID, "--video", str(tmp_path / "no" / "a.gif"))
     assert "--seed must be at least 0, got -1" in told(capsys, "watch", ID, "--seed", "-1")
     assert "did you mean" in told(capsys, "watch", "PivotedBra-v0")
+    assert "show_trail must lie between 0 and 60 s" in told(capsys, "watch", ID, "--trail", "100")
+    assert "show_trail must lie between 0 and 60 s" in told(capsys, "play", ID, "--trail", "100")
     assert "did you mean iLQR?" in told(capsys, "watch", ID, "--agent", "ilqrr")
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     assert "--video FILE" in told(capsys, "watch", ID)

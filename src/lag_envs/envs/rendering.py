@@ -309,12 +309,12 @@ def _seen(pose: Pose, point: Point) -> Point:
     return pose.x + c * point[0] - way * n * point[1], pose.y + n * point[0] + way * c * point[1]
 
 
-def paint(task: Task, now: Frame, shown: Picture | None = None) -> NDArray[np.uint8]:
-    """Return a picture of a moment; `shown` is the task's `Picture`, where it was made before."""
-    shown = shown or Picture(task)
+def paint(task: Task, now: Frame, size: tuple[int, int] = (WIDTH, HEIGHT)) -> NDArray[np.uint8]:
+    """Return a picture of a moment, of some width and height."""
+    shown = Picture(task)
     poses = shown.poses(now)
-    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    Pen(shown, (WIDTH, HEIGHT)).paint(image, poses, shown.window(poses))
+    image = np.full((size[1], size[0], 3), 255, np.uint8)
+    Pen(shown, size).paint(image, poses, shown.window(poses))
     return image
 
 

@@ -263,6 +263,15 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     #: Sum of the episode's rewards, where that is to be seen.
     _total = 0.0
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the picture as it is now, spaces, controls, parameters."""
+        from lag_envs.envs.html import described, still
+
+        now = (self.state, self.control, self.target) if self._started else ()
+        title = self.spec.id if self.spec else type(self.task).__name__
+        spaces = {"observation": self.observation_space, "action": self.action_space}
+        return described(self.task, title, spaces, still(self.task, *now))
+
     # --- the rest ------------------------------------------------------------------------------------------
 
     def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:

@@ -361,6 +361,23 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     _spec: EnvSpec | None = None
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the pictures as they are now, spaces, controls, parameters."""
+        from lag_envs.envs.html import described, still
+        from lag_envs.envs.rendering import columns_of, tiled
+
+        shown, pictures = self._tasks[:9], []
+        columns = columns_of(len(shown))
+        targets = self.target if self._started and self.target is not None else [None] * self.num_envs
+        for i, task in enumerate(shown):
+            now = (self.state[i], self.control[i], targets[i]) if self._started else ()
+            if (picture := still(task, *now, columns=columns)) is not None:
+                pictures.append(picture)
+        title = f"{self.spec.id if self.spec else type(self.task).__name__} × {self.num_envs}"
+        spaces = {"observation of each": self.single_observation_space, "action": self.single_action_space}
+        grid = tiled(pictures, columns) if pictures else None
+        return described(self.task, title, spaces, grid)
+
     # --- the rest ------------------------------------------------------------------------------------------
 
     def _make_viewers(self) -> tuple[Any, ...]:

@@ -513,6 +513,12 @@ class Scene(metaclass=SceneType):
         """
         return steps.jacobian(self, state, control, dt)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: parameters, state, controls, equations."""
+        from lag_envs.scenes.html import described
+
+        return described(self)
+
     def lagrangian(self) -> sympy.Expr:
         """Return the Lagrangian T - V as a SymPy expression, with functions of time and parameters."""
         from lag_envs.scenes.symbolic import lagrangian

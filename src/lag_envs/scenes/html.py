@@ -1,0 +1,110 @@
+"""Scenes as a notebook shows them: parameters, state, controls and equations."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Sequence
+from html import escape
+from importlib.util import find_spec
+from typing import Any
+
+#: Operations of a Lagrangian up to which its equations of motion are written out.
+LONGEST = 150
+
+
+def table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """Return rows of text as a table; what is in a cell is escaped."""
+    lines = [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"] if head else []
+    lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>"
+
+
+def parameters(scene: Any) -> list[tuple[str, str]]:
+    """Return names and values of a scene's parameters and structural fields."""
+    rows = []
+    for field in dataclasses.fields(scene):
+        value, unit = getattr(scene, field.name), field.metadata.get("unit", "")
+        shown = f"{value:.6g} {unit}".rstrip() if isinstance(value, float) else repr(value)
+        rows.append((field.name, shown))
+    return rows
+
+
+def described(scene: Any) -> str:
+    """Return what a notebook shows of a scene."""
+    state = ", ".join(
+        f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True)
+    )
+    controls = ", ".join(
+        f"{name} [{unit}]" for name, unit in zip(scene.control_names, scene.control_units, strict=True)
+    )
+    about = (inspect.getdoc(type(scene)) or "").partition("\n")[0]
+    rows = [("State", state), ("Controls", controls or "none")]
+    return (
+        f"<div><b>{escape(type(scene).__name__)}</b> {escape(about)}{table(rows)}"
+        f"{table(parameters(scene), ('parameter', 'value'))}{_equations(scene)}</div>"
+    )
+
+
+def _equations(scene: Any) -> str:
+    """Return Lagrangian and equations of motion, or what is needed to have them."""
+    if find_spec("sympy") is None:
+        return '<p>Its equations need SymPy: <code>pip install "lag-envs[symbolic]"</code></p>'
+    import sympy
+
+    from lag_envs.scenes import symbolic
+
+    energy = symbolic.lagrangian(scene)
+    found = ["<p>L = T − V =</p>", mathml(energy)]
+    if sympy.count_ops(energy) > LONGEST:
+        code = "<code>lag_envs.scenes.symbolic.equations(scene)</code>"
+        return "".join([*found, f"<p>Its equations of motion are long: {code}</p>"])
+    found.append("<p>Equations of motion</p>")
+    q = symbolic.motion(scene)[0]
+    rates = [q[name].diff(symbolic.t, 2) for name in scene._layout.names]
+    for name in scene._layout.free:
+        equation = sympy.expand(symbolic.euler_lagrange(scene, name))
+        squares = {
+            power: 1 - sympy.cos(power.base.args[0]) ** 2
+            for power in equation.atoms(sympy.Pow)
+            if isinstance(power.base, sympy.sin) and power.exp == 2
+        }
+        shorter = sympy.expand(equation.xreplace(squares))
+        shortest = min(equation, shorter, key=sympy.count_ops)
+        found.append(mathml(sympy.collect(shortest, rates), " = 0"))
+    return "".join(found)
+
+
+def mathml(expression: Any, behind: str = "") -> str:
+    """Return an expression, and text behind it, as MathML, which browsers show; rates have dots."""
+    import sympy
+    from sympy.core.function import AppliedUndef
+    from sympy.printing.mathml import MathMLPresentationPrinter
+
+    class Printer(MathMLPresentationPrinter):
+        """Writes names that end with primes with dots above them."""
+
+        def _print_Symbol(self, symbol: Any, style: str = "plain") -> Any:
+            name = symbol.name.rstrip("'")
+            dots = len(symbol.name) - len(name)
+            written = super()._print_Symbol(sympy.Symbol(name), style)
+            if not dots:
+                return written
+            over, above = self.dom.createElement("mover"), self.dom.createElement("mo")
+            above.appendChild(self.dom.createTextNode("˙" if dots == 1 else "¨"))
+            over.appendChild(written)
+            over.appendChild(above)
+            return over
+
+    names: dict[Any, Any] = {}
+    for rate in expression.atoms(sympy.Derivative):
+        names[rate] = sympy.Symbol(rate.expr.func.__name__ + "'" * int(rate.derivative_count))
+    expression = expression.xreplace(names)
+    names = {place: sympy.Symbol(place.func.__name__) for place in expression.atoms(AppliedUndef)}
+    # Products of names need a sign between them.
+    written = Printer({"mul_symbol": "dot"}).doprint(expression.xreplace(names))
+    text = f"<mtext>{escape(behind)}</mtext>" if behind else ""
+    return (
+        '<div style="overflow-x: auto"><math xmlns="http://www.w3.org/1998/Math/MathML">'
+        f"<mrow>{written}{text}</mrow></math></div>"
+    )

@@ -1,0 +1,125 @@
+"""What a notebook shows of scenes and environments: whole, escaped, and from nowhere else."""
+
+import re
+from html import unescape
+from html.parser import HTMLParser
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lag_envs
+from lag_envs.scenes import SCENES, Scene, html, parameter
+
+
+class Checked(HTMLParser):
+    """Notes what a text is made of, and fails where elements do not close."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.tags, self.text = [], set(), ""
+        self.feed(text)
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.add(tag)
+        for name, value in attributes:
+            assert name not in ("href",) and (name != "src" or value.startswith("data:image/png;base64,"))
+        if tag not in ("br", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_scenes_show_parameters_and_equations(kind):
+    scene = kind()
+    shown = Checked(scene._repr_html_())
+    assert "math" in shown.tags and "script" not in shown.tags
+    for name in (*scene.state_names, *scene.control_names, *scene._numbers()):
+        assert name in shown.text, name
+    assert "mover" in shown.tags  # rates have dots
+
+
+def test_equations_are_those_of_the_scene():
+    class Swing(Scene):
+        """A bob <on> a rod."""
+
+        mass: float = parameter(1.0, "kg", above=0.0)
+        length: float = parameter(1.0, "m", above=0.0)
+        coordinates = {"theta": "rad"}
+        controls = {"torque": "N m"}
+
+        def kinetic(self, q, v, xp):
+            # Written so that a square of a sine has to go.
+            return (
+                0.5 * self.mass * self.length**2 * v.theta**2 * (xp.cos(q.theta) ** 2 + xp.sin(q.theta) ** 2)
+            )
+
+        def potential(self, q, xp):
+            return -9.81 * self.mass * self.length * xp.cos(q.theta)
+
+        def applied(self, q, v, u, xp):
+            return {"theta": u.torque}
+
+    text = Swing()._repr_html_()
+    assert "A bob &lt;on&gt; a rod." in text
+    equation = re.sub(r"<[^>]*>", " ", unescape(text.rpartition("<math")[2])).split()
+    assert equation.count("θ") == 2 and equation.count("¨") == 1 and equation.count("˙") == 0
+    assert {"torque", "mass", "length", "sin", "981"} <= set(equation) and equation[-2:] == ["=", "0"]
+
+
+def test_without_sympy_the_rest_is_shown(monkeypatch):
+    monkeypatch.setattr(html, "find_spec", lambda name: None)
+    shown = Checked(SCENES[0]()._repr_html_())
+    assert 'pip install "lag-envs[symbolic]"' in shown.text and "mass" in shown.text
+
+
+def test_long_equations_are_left_out():
+    from lag_envs.scenes import Chain
+
+    assert "equations of motion are long" in Chain(bars=4)._repr_html_()
+
+
+@pytest.mark.parametrize("env_id", lag_envs.TASKS)
+def test_environments_show_picture_and_spaces(env_id):
+    env = gym.make(env_id).unwrapped
+    before = env._repr_html_()
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    state = env.state
+    shown = Checked(env._repr_html_())
+    assert np.array_equal(env.state, state) and env._viewer is None and env._repr_html_() != before
+    assert "img" in shown.tags and env_id in shown.text and "Box(-1.0, 1.0, (1,), float32)" in shown.text
+    for name in (*env.task.observation, *env.scene.control_names, *env.scene._numbers()):
+        assert name in shown.text
+
+
+def test_batches_show_a_grid():
+    envs = gym.make_vec("InclineTilt-v0", 20)
+    assert "InclineTilt-v0 × 20" in Checked(envs._repr_html_()).text
+    envs.reset(seed=1)
+    assert 'width="600"' in envs._repr_html_() and len(envs._repr_html_()) < 100_000
+
+
+def test_what_draws_nothing_shows_the_rest():
+    import own_tasks
+
+    from lag_envs import register
+
+    class Bare(own_tasks.Drift):
+        id = "Bare-v0"
+
+        def bodies(self):
+            return {}
+
+    register(Bare)
+    shown = Checked(gym.make("Bare-v0").unwrapped._repr_html_())
+    assert "img" not in shown.tags and "Bare-v0" in shown.text
+    assert "img" not in Checked(gym.make_vec("Bare-v0", 2)._repr_html_()).tags
+    gym.registry.pop("Bare-v0")
