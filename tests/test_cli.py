@@ -19,10 +19,12 @@ from lag_envs.leaderboard import shipped
 from lag_envs.leaderboard.board import Board
 from lag_envs.scores import score
 from lag_envs.starter import filled
+from lag_envs.tasks import pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
 ID = "PivotedBar-v0"
+FREE = pivoted_bar.SwingUpFree.id
 
 
 @pytest.fixture
@@ -138,7 +140,7 @@ def test_what_ships_does_better_than_nothing(env_id):
 
 
 def test_watch_takes_agents_by_name_and_by_file(tmp_path):
-    task = TASKS["PivotedBarBalance-v0"]()
+    task = pivoted_bar.Balance()
     board = ROOT / "leaderboard"
     observation = np.zeros((1, 4), np.float32)
     entries = [e for e in Board(board).read().entries.values() if e.env == task.id and e.name == "PPO"]
@@ -174,8 +176,8 @@ def test_watch_takes_a_model_of_stable_baselines3(tmp_path):
     assert alone.predict(observation)[0] == model.predict(observation, deterministic=True)[0]
     seen = envs.normalize_obs(observation)
     assert whole.predict(observation)[0] == model.predict(seen, deterministic=True)[0]
-    with pytest.raises(UserError, match=r"observes \(5,\) numbers, PivotedBarFree-v0 has \(3,\)"):
-        watch.load("PivotedBarFree-v0", TASKS["PivotedBarFree-v0"](), str(tmp_path / "model.zip"))
+    with pytest.raises(UserError, match=rf"observes \(5,\) numbers, {FREE} has \(3,\)"):
+        watch.load(FREE, TASKS[FREE](), str(tmp_path / "model.zip"))
     bins = SimpleNamespace(action_space=gym.spaces.Discrete(5), predict=lambda *_, **__: (np.array(4), None))
     assert watch.Model(bins, None, gym.make(ID).action_space).predict(observation)[0] == np.float32(0.8)
 
@@ -237,8 +239,7 @@ def test_play_tells_return_and_score(window, capsys, monkeypatch):
 
 
 def test_sticks_become_actions():
-    own_files.registered(str(ROOT / "tests" / "own_tasks.py"))
-    crane, switched = (gym.make(f"Own{name}-v0") for name in ("Crane", "Switched"))
+    crane, switched, _ = map(gym.make, own_files.registered(str(ROOT / "tests" / "own_tasks.py")))
 
     def action(env, *sticks, keys=()):
         rest = play.resting(env.unwrapped.task)
@@ -348,7 +349,7 @@ def test_bash_completes_commands_options_ids_and_files(capsys):
     script = capsys.readouterr().out
     assert {"watch", "play", "new"} <= set(completed(script, "lag-envs", ""))
     assert completed(script, "lag-envs", "wat") == ["watch"]
-    assert "PivotedBarFree-v0" in completed(script, "lag-envs", "watch", "PivotedBar")
+    assert FREE in completed(script, "lag-envs", "watch", "PivotedBar")
     assert "own_tasks.py" in completed(script, "lag-envs", "info", "own_t")
     assert completed(script, "lag-envs", "watch", ID, "--ag") == ["--agent"]
     assert "withdraw" in completed(script, "lag-envs", "leaderboard", "w")
@@ -367,7 +368,7 @@ def test_the_core_alone_lists(tmp_path):
     """What shows text asks for no extra."""
     script = (
         "import sys\nfrom lag_envs import cli\n"
-        "assert cli.main(['list']) == cli.main(['info', 'InclineTilt-v0']) == 0\n"
+        "assert cli.main(['list']) == cli.main(['info', 'PivotedBar-v0']) == 0\n"
         "assert not {'pydantic', 'scipy.optimize', 'sympy', 'pygame', 'torch'} & set(sys.modules)\n"
     )
     subprocess.run(

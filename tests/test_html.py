@@ -10,6 +10,7 @@ import pytest
 
 import lag_envs
 from lag_envs.scenes import SCENES, Scene, html, parameter
+from lag_envs.tasks import incline
 
 
 class Checked(HTMLParser):
@@ -101,8 +102,8 @@ def test_environments_show_picture_and_spaces(env_id):
 
 
 def test_batches_show_a_grid():
-    envs = gym.make_vec("InclineTilt-v0", 20)
-    assert "InclineTilt-v0 × 20" in Checked(envs._repr_html_()).text
+    envs = gym.make_vec(incline.Tilt.id, 20)
+    assert f"{incline.Tilt.id} × 20" in Checked(envs._repr_html_()).text
     envs.reset(seed=1)
     assert 'width="600"' in envs._repr_html_() and len(envs._repr_html_()) < 100_000
 

@@ -1,11 +1,16 @@
 """Pictures: to scale, complete, the same for everyone, and without a display."""
 
+import base64
 import gc
+import io
 import math
+import os
 import re
+import shutil
 import subprocess
 import sys
 import time
+import warnings
 from itertools import pairwise
 from pathlib import Path
 from typing import get_args
@@ -515,7 +520,7 @@ def test_nothing_more_is_shown_unless_it_is_asked_for(env_id):
 def test_forces_are_to_scale_and_point_where_they_push():
     from lag_envs.envs.forces import LONG, Forces
 
-    task = TASKS["PivotedBarFree-v0"]
+    task = TASKS[pivoted_bar.SwingUpFree.id]
     picture = Picture(task)
     now = Frame([0.0, 0.0], [0.0], [0.0])
     (up,) = (arrow for arrow, control in Forces(task, picture).arrows(now, picture.poses(now)) if not control)
@@ -788,3 +793,59 @@ def test_a_window_that_was_left_open_is_closed(window):
     code = "import gymnasium as gym, lag_envs; gym.make('PivotedBar-v0', render_mode='human').reset(seed=1)"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.fixture(scope="module")
+def page():
+    """The page's painter in a browser, on an empty page."""
+    site = Path(rendering.__file__).parents[1] / "leaderboard" / "site" / "static"
+    chromium = shutil.which(os.environ.get("CHROMIUM", "chromium"))
+    if chromium is None:
+        missing = "THERE IS NO CHROMIUM, SO PICTURES WERE NOT HELD AGAINST THE PAGE'S: install chromium"
+        warnings.warn(missing, stacklevel=1)
+        pytest.skip(missing)
+    playwright = pytest.importorskip("playwright.sync_api")
+    script, count = re.subn(
+        r"\n  // --- replays -",
+        "\n  window.painter = { paint, placed, windowOf, readColours };\n  // --- replays -",
+        (site / "site.js").read_text(encoding="utf-8"),
+    )
+    assert count == 1
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=chromium)
+        page = browser.new_page(viewport={"width": 700, "height": 500})
+        page.set_content(
+            f"<style>{(site / 'site.css').read_text(encoding='utf-8')}</style>"
+            "<canvas width=600 height=400></canvas>"
+        )
+        page.evaluate("text => { try { (0, eval)(text); } catch { /* there is no board */ } }", script)
+        yield page
+        browser.close()
+
+
+PAINT = """([picture, poses, margin]) => {
+  const { paint, placed, windowOf, readColours } = window.painter;
+  readColours();
+  const pen = document.querySelector("canvas").getContext("2d");
+  pen.fillStyle = "#ffffff";
+  pen.fillRect(0, 0, 600, 400);
+  const box = { x: margin, y: margin, width: 600 - 2 * margin, height: 400 - 2 * margin };
+  const view = windowOf(picture, poses);
+  paint(pen, box, view, placed(picture, poses, view));
+  return document.querySelector("canvas").toDataURL();
+}"""
+
+
+@pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
+@pytest.mark.parametrize("env_id", IDS)
+def test_pictures_are_those_of_the_page(env_id, page):
+    """Both painters, given the same shapes and poses; what differs are roundings where edges are."""
+    from lag_envs.leaderboard.site import scenery
+
+    task = TASKS[env_id]
+    now, picture = moment(task), Picture(task)
+    theirs = page.evaluate(PAINT, [scenery.picture(picture), picture.poses(now), rendering.MARGIN])
+    png = io.BytesIO(base64.b64decode(theirs.partition(",")[2]))
+    theirs = pygame.surfarray.array3d(pygame.image.load(png, "a.png")).swapaxes(0, 1).astype(np.float64)
+    apart = np.abs(theirs - rendering.paint(task, now)).max(axis=2)
+    assert apart.mean() < 0.4 and np.mean(apart > 64) < 0.001, (apart.mean(), np.mean(apart > 64))

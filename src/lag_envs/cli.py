@@ -716,7 +716,7 @@ examples:
   lag-envs watch PivotedBar-v0
   lag-envs watch PivotedBar-v0 --agent "energy shaping + LQR"
   lag-envs watch PivotedBar-v0 --seed 1 --video episode.mp4
-  lag-envs watch InclineTilt-v0 --agent leaderboard/submissions/InclineTilt-v0-ppo-b9d778e2
+  lag-envs watch PivotedBar-v0 --agent leaderboard/submissions/PivotedBar-v0-ppo-c1dc3900
   lag-envs watch ball_on_beam.py --agent model.zip     a task and a model of your own; this runs both""",
         declare_watch,
         run_watch,

@@ -564,9 +564,9 @@ def _disc(centre: Point, radius: float, style: Style, unit: float) -> Polygons:
 
 
 def _rim(centre: Point, radius: float, unit: float) -> list[Point]:
-    """Return points of a circle, as many as its size asks for; the last is the first."""
+    """Return points of a circle, clockwise, as many as its size asks for; the last is the first."""
     n = min(max(12, math.ceil(7.0 * math.sqrt(max(radius, 0.0) / unit))), 300)
-    return s.arc(centre, radius, 0.0, 2.0 * math.pi, n)
+    return s.arc(centre, radius, 0.0, -2.0 * math.pi, n)
 
 
 def _arrow(points: list[Point], style: Style, unit: float) -> Polygons:
