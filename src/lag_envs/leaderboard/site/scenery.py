@@ -7,7 +7,6 @@ written, for these are small; one that never changes is a single number.
 from __future__ import annotations
 
 import inspect
-import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -139,19 +138,14 @@ class Scenery:
         return {"count": len(states), "target": target, "poses": self._poses(states, None, target, 0.0)}
 
     def preview(self, states: Sequence[Sequence[float]], target: Any) -> bytes | None:
-        """Return the last of some states as a PNG; None without pygame, or with nothing to be seen."""
+        """Return the last of some states as a PNG; None where nothing is to be seen."""
         task, shown = self._task, self._shown
         if task is None or shown is None or not shown.shapes or not states:
             return None
-        try:
-            import pygame
-        except ImportError:
-            return None
+        from lag_envs.envs.raster import png
         from lag_envs.envs.rendering import paint
 
-        png = io.BytesIO()
-        pygame.image.save(paint(task, Frame(list(states[-1]), target=target), shown), png, "preview.png")
-        return png.getvalue()
+        return png(paint(task, Frame(list(states[-1]), target=target)))
 
     @property
     def start(self) -> list[list[float]]:
