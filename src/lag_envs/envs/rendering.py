@@ -435,6 +435,8 @@ class Pen:
         frames: Sequence[int],
         places: NDArray[np.float64],
     ) -> None:
+        if not outlines:
+            return
         counts = [len(outline.ends) for outline in outlines]
         sizes = [0, *accumulate(len(outline.points) for outline in outlines)]
         ends = np.concatenate([outline.ends for outline in outlines]) + np.repeat(sizes[:-1], counts)
