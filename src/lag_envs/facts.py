@@ -98,7 +98,13 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
         rows.append((field.name, shown, ", ".join(rules)))
     rows.append(("dt", f"{task.dt:g} s", "1e-6 to 1"))
     rows.append(("duration", f"{task.duration:g} s", "at least dt; math.inf for no end"))
-    return rows + [("target", "None", "random if None")] * bool(task.formulas.target_boxes)
+    rows += [("target", "None", "random if None")] * bool(task.formulas.target_boxes)
+    return [
+        *rows,
+        ("show_arrows", "False", "forces in pictures"),
+        ("show_trail", "0 s", "the way of the last seconds in pictures"),
+        ("show_readout", "False", "time, return, score, controls and state below pictures"),
+    ]
 
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
