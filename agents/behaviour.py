@@ -18,12 +18,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.analysis import rounded
 from agents.results import ROOT, to_json
 from agents.run import FIRST_FRESH_SEED, UserError, check_env
 from agents.submit import AUTHORS
 from lag_envs import TASKS
 from lag_envs.controllers import build
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard.submission import load
 from lag_envs.store import write
 from lag_envs.tasks.base import Task

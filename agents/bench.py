@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.analysis import rounded
 from agents.results import to_json
 from lag_envs.benchmark import (
     Contestant,
@@ -27,6 +26,7 @@ from lag_envs.benchmark import (
     ratios,
     short,
 )
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import ONE_THREAD, machine
 from lag_envs.store import write
 from lag_envs.tables import columns

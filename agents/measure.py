@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.analysis import NOMINAL, OFTEN, Data, rounded
+from agents.analysis import NOMINAL, OFTEN, Data
 from agents.evaluate import Sensor, evaluate_batch
 from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
 from lag_envs import TASKS, __version__, controllers, store
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard import protocol
 
 AGENTS = Path(__file__).parent

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import math
 import signal
 import sys
 import time
@@ -35,6 +34,7 @@ from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
+from lag_envs.evaluation import statistics
 from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
@@ -361,12 +361,6 @@ def trajectory(env_id: str, agent: Any, seed: int = FIRST_FRESH_SEED) -> Array:
     return np.array(states)
 
 
-def mean_and_interval(returns: Array) -> dict[str, Any]:
-    """Return the mean with its 95 % confidence interval."""
-    mean, half = float(returns.mean()), 1.96 * float(returns.std(ddof=1)) / math.sqrt(len(returns))
-    return {"mean": round(mean, 4), "interval": [round(mean - half, 4), round(mean + half, 4)]}
-
-
 def proved_bound(env_id: str) -> tuple[float, str]:
     """Return what no policy exceeds in the mean over the starts, and why."""
     task: Task = TASKS[env_id]()
@@ -436,7 +430,9 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     lower, started = None, time.process_time()
     if not relaxed:
         agent = Optimal(env_id, solution=solution)
-        lower = mean_and_interval(evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES))
+        found = statistics.estimate([evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES)])
+        low, high = (round(found[end], 4) for end in ("low", "high"))
+        lower = {"mean": round(found["mean"], 4), "interval": [low, high]}
     limit, error, order = extrapolated([grid["value"] for grid in grids])
     bound, why = proved_bound(env_id)
     broken = lower is not None and lower["mean"] > limit + error

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
+from agents.analysis import NOMINAL, OFTEN, Data
 from lag_envs.benchmark import quartiles, short
+from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured
@@ -474,7 +475,7 @@ def _method(data: Data) -> str:
             "- *Noise*: Gaussian, drawn anew for each entry of the observation at each step, with a standard"
             " deviation of 1 % and 5 % of what the entry itself has over random actions (100 episodes).",
             "- *Late*: the agent sees the observation of the step before.",
-            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, SciPy's, strata being the"
+            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, strata being the"
             " environments and elements the seeds, as in rliable (Agarwal et al., NeurIPS 2021), with whose"
             " functions tests compare ours. The probability of improvement compares runs: an agent that was"
             " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"

@@ -17,11 +17,12 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
+from agents.analysis import NOMINAL, Data, compare, ranked, summarise_env, summarise_learners
 from agents.evaluate import observation_std
 from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import machine
 from lag_envs.scores import known_returns
 from lag_envs.store import write

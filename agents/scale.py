@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,6 +28,7 @@ from agents.results import to_json
 from agents.run import UserError, check_env
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
+from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
@@ -148,31 +148,6 @@ def optima(env_id: str, first: int) -> Array:
     best = resolve(bare.task.optimum.place)(bare.task, *bare.state.T)
     envs.close()
     return best
-
-
-def without_luck(returns: Array, reference: Array | None) -> tuple[float, float]:
-    """Return mean and standard error of returns in the first of the episodes that a reference played.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> luck = np.random.default_rng(0).normal(size=10_000)
-    >>> mean, error = without_luck(5.0 + 2.0 * luck[:100], luck)
-    >>> abs(mean - 5.0) < 0.05, error < 0.03
-    (True, True)
-    """
-    if reference is None:
-        return mean_and_error(returns)
-    same = reference[: len(returns)]
-    slope = float(np.cov(returns, same)[0, 1] / same.var(ddof=1))
-    rest, its = mean_and_error(returns - slope * same)
-    mean, error = mean_and_error(reference)
-    return rest + slope * mean, math.hypot(its, slope * error)
-
-
-def mean_and_error(returns: Array) -> tuple[float, float]:
-    """Return the mean and its standard error."""
-    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(len(returns))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""What was measured of agents: statistics against known answers, the command, figures and page."""
+"""What was measured of agents: the summary, the command, figures and page."""
 
 import errno
 import json
 import re
-import warnings
 from pathlib import Path
 
 import gymnasium as gym
@@ -11,19 +10,7 @@ import numpy as np
 import pytest
 
 from agents import behaviour, measure, report, results
-from agents.analysis import (
-    NOMINAL,
-    OFTEN,
-    estimate,
-    improvement,
-    interval,
-    iqm,
-    iqm_of_all,
-    learning_curve,
-    level,
-    summarise_env,
-    summarise_learners,
-)
+from agents.analysis import NOMINAL, OFTEN, learning_curve, level, summarise_env, summarise_learners
 from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_std
 from agents.measure import Condition, Entrant, Job, conditions
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
@@ -34,68 +21,7 @@ ROOT = Path(__file__).parents[1]
 ENV = incline.Brake.id
 
 
-def rliable_metrics():
-    """Return rliable's metrics; its other parts do not import beside every pandas."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return pytest.importorskip("rliable.metrics")
-
-
-# --- statistics ---
-
-
-def test_iqm_by_hand():
-    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 70.0]) == np.mean([2.0, 3.0, 4.0, 5.0])
-    assert iqm([1.0, 3.0]) == 2.0  # too few to leave any out
-    assert iqm_of_all([0.0, 5.0], [1.0, 3.0]) == 2.0
-    np.testing.assert_array_equal(iqm([[0.0, 1.0, 2.0, 90.0], [4.0, 4.0, 4.0, 4.0]], axis=1), [1.5, 4.0])
-
-
-def test_improvement_by_hand():
-    assert improvement([2.0, 2.0], [1.0]) == 1.0
-    assert improvement([1.0], [1.0, 2.0]) == 0.25
-    assert improvement([[1.0, 2.0], [0.0, 0.0]], [[0.0, 1.5], [1.0, 1.0]]).tolist() == [0.75, 0.0]
-
-
-def test_statistics_agree_with_rliable():
-    metrics = rliable_metrics()
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(size=(10, 3)), rng.normal(0.3, size=(10, 3))
-    assert iqm_of_all(*x.T) == pytest.approx(metrics.aggregate_iqm(x), rel=1e-12)
-    ours = np.mean([improvement(a, b) for a, b in zip(x.T, y.T, strict=True)])
-    assert ours == pytest.approx(metrics.probability_of_improvement(x, y), rel=1e-12)
-
-
-def test_interval_is_that_of_resampling_each_stratum():
-    # Two elements: their mean takes the lower, the upper or the middle with 1/4, 1/4, 1/2.
-    assert interval(iqm, [0.0, 1.0]) == [0.0, 1.0]
-    assert interval(iqm, [3.0, 3.0, 3.0]) == [3.0, 3.0]
-    assert interval(iqm, [3.0]) is None and interval(iqm_of_all, [1.0, 2.0], [3.0]) is None
-    # As rliable does it: rows of a matrix (runs, tasks) are drawn anew for each column by itself.
-    rng = np.random.default_rng(1)
-    scores = rng.normal([0.0, 1.0, 5.0], size=(8, 3))
-    drawn = [iqm_of_all(*(column[rng.integers(8, size=8)] for column in scores.T)) for _ in range(1500)]
-    expected = np.quantile(drawn, [0.025, 0.975])
-    np.testing.assert_allclose(interval(iqm_of_all, *scores.T), expected, atol=0.1)
-    assert interval(iqm_of_all, *scores.T) == interval(iqm_of_all, *scores.T)  # same numbers each time
-
-
-def test_interval_covers_as_often_as_it_says():
-    rng = np.random.default_rng(2)
-    ends = [interval(iqm, sample) for sample in rng.normal(size=(60, 20))]
-    assert 0.8 <= np.mean([low < 0.0 < high for low, high in ends]) <= 1.0
-
-
-def test_estimate_by_hand():
-    single = estimate([[1.0, 3.0, 1.0, 3.0]])
-    error = np.sqrt(4.0 / 3.0) / 2.0
-    assert single["value"] == single["mean"] == 2.0 and single["error"] == pytest.approx(error)
-    assert single["high"] - 2.0 == pytest.approx(1.96 * error) == 2.0 - single["low"]
-    several = estimate([[0.0, 2.0], [2.0, 4.0], [8.0, 8.0]])
-    assert several["each"] == [1.0, 3.0, 8.0] and several["mean"] == several["value"] == 4.0
-    assert several["error"] == pytest.approx(np.std([1.0, 3.0, 8.0], ddof=1) / np.sqrt(3.0))
-    assert several["low"] == 1.0 and several["high"] == 8.0
-    assert estimate([[5.0]])["error"] == 0.0
+# --- the summary ---
 
 
 def test_fewer_episodes_are_levelled():

@@ -594,6 +594,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
 def _environment(
     board: Board, state: State, results: Mapping[tuple[int, str], dict[str, Any]], env_id: str, number: int
 ) -> dict[str, Any]:
+    from lag_envs.evaluation.statistics import ends, iqm, normalised, rounded
     from lag_envs.leaderboard import ranking
     from lag_envs.leaderboard.site.scenery import describe
 
@@ -610,7 +611,7 @@ def _environment(
         # Who acts like an earlier one is shown, but neither ranked nor anybody's neighbour.
         places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
         ranks = {place.id: place for place in places}
-        for id in sorted(scores, key=lambda id: -float(ranking.iqm(scores[id].table.mean(axis=1)))):
+        for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):
             entry, result, place = entries[id], found[id], ranks.get(id)
             like = first[id]
             row: dict[str, Any] = {
@@ -630,21 +631,21 @@ def _environment(
             row["curves"] = [
                 {
                     "seed": c["seed"], "steps": c["steps"],
-                    "scores": ranking.normalised(scale, c["returns"]).tolist(),
+                    "scores": normalised(scale, c["returns"]).tolist(),
                 }
                 for c in result["claimed"]["curves"]
             ]  # fmt: skip
             row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
-            row["interval"] = list(ranking.ends(ranking.iqm(drawn[id])))
+            row["interval"] = list(ends(iqm(drawn[id])))
             middle, chosen = shown_episodes(result)
             verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
             row["replays"] = [
-                replay | {"t0": 0.0, "score": float(ranking.normalised(scale, replay["return"]))}
+                replay | {"t0": 0.0, "score": float(normalised(scale, replay["return"]))}
                 for replay in result["replays"]
                 # Under protocol 1 those of random actions were other ones.
                 if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
             ]
-            rows.append(_rounded(row))
+            rows.append(rounded(row))
     return {
         "id": env_id,
         "protocol": number,
@@ -693,12 +694,3 @@ def _value(path: Path) -> dict[str, Any] | None:
     except (OSError, ValueError) as error:
         told = error.strerror if isinstance(error, OSError) else error
         raise BoardError(f"{path} cannot be read: {told}; {REMEDY}, or remove it") from None
-
-
-def _rounded(value: Any) -> Any:
-    """Return JSON types with numbers of 6 digits; more would only make the page large."""
-    if isinstance(value, dict):
-        return {key: _rounded(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(v) for v in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
