@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.evaluation.conditions import NOMINAL
 from lag_envs.evaluation.statistics import estimate, improvement, interval, iqm, pooled_iqm
 
 Array = NDArray[np.float64]
 Data = dict[str, Any]
 
-NOMINAL, OFTEN = "nominal", "ten times as often"
 #: Points of a learning curve.
 POINTS = 33
 

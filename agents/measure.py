@@ -16,12 +16,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.analysis import NOMINAL, OFTEN, Data
-from agents.evaluate import Sensor, evaluate_batch
-from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
+from agents.analysis import Data
+from agents.run import (
+    FIRST_FRESH_SEED,
+    MODEL,
+    NORMALISATION,
+    RESULT,
+    SCHEMA,
+    UserError,
+    fresh_seeds,
+    read_result,
+)
 from lag_envs import TASKS, __version__, controllers, store
+from lag_envs.evaluation.conditions import Condition, Sensor
+from lag_envs.evaluation.rollout import Rollout, Step
 from lag_envs.evaluation.statistics import rounded
-from lag_envs.leaderboard import protocol
 
 AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
@@ -170,39 +179,6 @@ def digest(*files: Path | str) -> str:
     return total.hexdigest()[:16]
 
 
-# --- conditions ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What differs from the environment as it is.
-
-    Parameters
-    ----------
-    name : str
-        As tables call it.
-    options : dict
-        The environment's arguments.
-    noise : float
-        Standard deviation of the observation's noise, relative to its own under random actions.
-    late : bool
-        Whether the agent sees the observation before.
-    """
-
-    name: str
-    options: Data = field(default_factory=dict)
-    noise: float = 0.0
-    late: bool = False
-
-
-def conditions(env_id: str) -> list[Condition]:
-    """Return the conditions under which agents are measured on an environment."""
-    found = [Condition(NOMINAL), Condition(OFTEN, protocol.often(env_id))]
-    found += [Condition(name, options) for name, options in protocol.disturbances(env_id).items()]
-    found += [Condition(f"noise {level:.0%}".replace("%", " %"), noise=level) for level in (0.01, 0.05)]
-    return [*found, Condition("late", late=True)]
-
-
 # --- measuring ----------------------------------------------------------------------------------------------
 
 
@@ -251,25 +227,12 @@ class Job:
 
 
 def plans(entrant: Entrant) -> bool:
-    """Tell whether an agent plans before each episode: that takes long, and is for one control interval."""
+    """Tell whether an agent plans before each episode, which takes long."""
     found = controllers.controllers(TASKS[entrant.env]).get(entrant.name)
     return entrant.kind == "classical" and found is not None and found.plans
 
 
-def set_pace(agent: Any, job: Job) -> bool:
-    """Tell an agent that counts steps how much of one of its own steps passes; return whether it can take it.
-
-    Such an agent has an attribute `pace`: what its clock advances by at each `predict`.
-    """
-    interval = TASKS[job.entrant.env].interval
-    pace = job.condition.options.get("dt", interval) / interval
-    if hasattr(agent, "pace"):
-        agent.pace = pace
-        return True
-    return pace == 1.0 or not plans(job.entrant)
-
-
-def measure(job: Job, agent: Any, scale: NDArray, tick: Callable[[], Any]) -> NDArray[np.float64]:
+def measure(job: Job, agent: Any, scale: NDArray, tick: Callable[[Step], Any]) -> NDArray[np.float64]:
     """Return the returns of a policy under a condition, shape (episodes,).
 
     Parameters
@@ -281,17 +244,12 @@ def measure(job: Job, agent: Any, scale: NDArray, tick: Callable[[], Any]) -> ND
     scale : ndarray, shape (n_observation,)
         What noise is relative to.
     tick : callable
-        Called at each step.
+        Called with each step.
     """
-    sensor = Sensor(job.condition.noise * scale, job.condition.late)
-
-    def observe(observation: NDArray, start: NDArray[np.bool_]) -> NDArray:
-        tick()
-        return sensor(observation, start)
-
-    return evaluate_batch(
-        job.entrant.env, agent, FIRST_FRESH_SEED, job.episodes, observe=observe, **job.condition.options
-    )
+    found = job.condition
+    sensor = Sensor(found.noise * scale, found.late)
+    rollout = Rollout(job.entrant.env, agent, fresh_seeds(job.episodes), sensor, **found.options)
+    return rollout.run(tick)
 
 
 def follow(
@@ -319,7 +277,7 @@ def follow(
                     # What draws random numbers begins anew, so that the order of measurements is all one.
                     if agent is None or hasattr(agent, "rng"):
                         agent = job.entrant.make()
-                    if not set_pace(agent, job):
+                    if not job.condition.suits(agent, plans(job.entrant)):
                         continue
                     returns = measure(job, agent, scales[env_id], bar.update)
                 except Exception as error:  # whatever an agent does; the others are measured all the same

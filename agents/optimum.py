@@ -20,8 +20,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.evaluate import evaluate_batch
-from agents.run import FIRST_FRESH_SEED, UserError, check_env
+from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
 from agents.value_iteration import (
     CacheError,
     Grid,
@@ -35,6 +34,7 @@ from lag_envs import TASKS, __version__
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
 from lag_envs.evaluation import statistics
+from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
@@ -347,20 +347,6 @@ def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
     return found
 
 
-def trajectory(env_id: str, agent: Any, seed: int = FIRST_FRESH_SEED) -> Array:
-    """Return the states of an episode, shape (steps + 1, n_state)."""
-    env = gym.make(env_id)
-    observation, _ = env.reset(seed=seed)
-    states, state, over = [env.unwrapped.state.copy()], None, False
-    while not over:
-        action, state = agent.predict(observation, state)
-        observation, _, terminated, truncated, _ = env.step(action)
-        states.append(env.unwrapped.state.copy())
-        over = terminated or truncated
-    env.close()
-    return np.array(states)
-
-
 def proved_bound(env_id: str) -> tuple[float, str]:
     """Return what no policy exceeds in the mean over the starts, and why."""
     task: Task = TASKS[env_id]()
@@ -430,7 +416,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     lower, started = None, time.process_time()
     if not relaxed:
         agent = Optimal(env_id, solution=solution)
-        found = statistics.estimate([evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES)])
+        found = statistics.estimate([play(env_id, agent, fresh_seeds(EPISODES))])
         low, high = (round(found[end], 4) for end in ("low", "high"))
         lower = {"mean": round(found["mean"], 4), "interval": [low, high]}
     limit, error, order = extrapolated([grid["value"] for grid in grids])
@@ -535,7 +521,8 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
                 plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
         plots[0].set_ylabel(problem.axes[1].label)
         if not problem.options and len(axes) == 2:
-            states = trajectory(env_id, Optimal(env_id, solution=solution))[:, solution.keep]
+            played = record(Rollout(env_id, Optimal(env_id, solution=solution), fresh_seeds(1)))
+            states = played.states[:, 0, solution.keep]
             if problem.axes[0].periodic:
                 states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)
                 jumps = np.abs(np.diff(states[:, 0])) > 0.5 * problem.axes[0].high

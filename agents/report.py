@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.analysis import NOMINAL, OFTEN, Data
+from agents.analysis import Data
 from lag_envs.benchmark import quartiles, short
+from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS

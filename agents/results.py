@@ -17,11 +17,12 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from agents.analysis import NOMINAL, Data, compare, ranked, summarise_env, summarise_learners
-from agents.evaluate import observation_std
-from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
+from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
+from agents.measure import Entrant, Field, Job, Store, follow, gather, plans
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
+from lag_envs.evaluation.conditions import NOMINAL, conditions
+from lag_envs.evaluation.rollout import observation_std
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import machine
 from lag_envs.scores import known_returns
@@ -128,7 +129,7 @@ def measure_all(
     ]
     todo = [job for job in jobs if job.key not in stores[job.entrant.env].returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
-    scales = {env_id: observation_std(env_id, SCALE_SEED) for env_id in envs}
+    scales = {env_id: observation_std(env_id, range(SCALE_SEED, SCALE_SEED + 100)) for env_id in envs}
     follow(todo, stores, scales, fields)
 
     broken = [problem for found in fields.values() for problem in found.broken]

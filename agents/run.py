@@ -30,6 +30,11 @@ FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
 
 
+def fresh_seeds(episodes: int) -> range:
+    """Return the seeds of the first of the episodes on which agents are compared."""
+    return range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + episodes)
+
+
 @dataclass
 class Run:
     """A run's settings and how far it has come.

@@ -22,12 +22,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluate import evaluate_batch
 from agents.optimum import Optimal, played
 from agents.results import to_json
 from agents.run import UserError, check_env
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
+from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
 from lag_envs.store import write
@@ -115,7 +115,7 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
             agent = Optimal(env_id) if name == "optimal" else build(task, name)
-            returns = evaluate_batch(env_id, agent, FIRST_SEED, slow[name])
+            returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
             same = many(env_id, task.reference, batches) if task.reference else None
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
@@ -137,7 +137,7 @@ def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
     firsts = (first + k * BATCH for k in range(batches))
-    return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
+    return np.concatenate([play(env_id, agent, range(first, first + BATCH)) for first in firsts])
 
 
 def optima(env_id: str, first: int) -> Array:

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 
 from scipy.optimize import differential_evolution
 
-from agents.evaluate import evaluate_batch
 from agents.run import UserError, check_env
 from lag_envs.controllers import build
 from lag_envs.errors import hint
+from lag_envs.evaluation.rollout import play
 from lag_envs.tasks import TASKS
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
@@ -33,7 +33,7 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
 
     def loss(values: Sequence[float]) -> float:
         agent = build(task, name, **dict(zip(ranges, values, strict=True)))
-        return -float(evaluate_batch(env_id, agent, FIRST_TUNING_SEED, episodes).mean())
+        return -float(play(env_id, agent, range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)).mean())
 
     found = differential_evolution(
         loss, list(ranges.values()), maxiter=generations, popsize=12, seed=0, polish=False

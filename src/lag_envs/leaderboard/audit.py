@@ -505,6 +505,7 @@ def _load(board: Board, entry: Entry) -> Any:
 
 def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
     """Play some episodes of each policy again, which nobody can foresee, and those that were recorded."""
+    from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import replay
 
@@ -524,7 +525,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
                 chosen += [i for i in recorded.values() if i not in chosen]
             try:
                 again, episodes = replay(submission, dict(result), number, chosen)
-            except Refused as error:
+            except (PolicyError, Refused) as error:
                 odd.append(f"a policy that {error}")
                 continue
             played += len(chosen)
@@ -613,7 +614,7 @@ def _links(board: Board, found: Cheap) -> Iterator[str]:
 def _references(found: Cheap) -> Iterator[str]:
     """Yield what is stated of a reference's mean and is not what it gets."""
     from lag_envs.controllers import make_controller
-    from lag_envs.leaderboard.verify import play
+    from lag_envs.evaluation.rollout import play
 
     told = found.state.protocols.get(found.state.number)
     for env_id, reference in (told.references if told else {}).items():

@@ -22,6 +22,7 @@ from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.submission import Refused, Submission, write
+from lag_envs.tasks import TASKS
 
 #: Algorithms: where the class is, and the module that a model's file names for its policy.
 ALGORITHMS = {
@@ -234,7 +235,7 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     agent_centres = getattr(agent, "centres", None)
     envs = gym.make_vec(env_id, 64, autoreset_mode="SameStep")
     observation, _ = envs.reset(seed=0)
-    for _ in range(int(protocol.make_task(env_id).limit)):
+    for _ in range(int(TASKS[env_id]().limit)):
         seen.append(observation)
         action = act(observation)
         action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))

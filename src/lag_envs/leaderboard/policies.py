@@ -32,7 +32,7 @@ from pydantic import Field, create_model, model_validator
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, shown
 from lag_envs.leaderboard.protocol import Refused
-from lag_envs.tasks import resolve
+from lag_envs.tasks import TASKS, resolve
 
 Array = NDArray[np.float64]
 #: Lengths of an array's axes; a name stands for any length of at least 2, the same wherever it occurs.
@@ -199,10 +199,10 @@ class MLP(Architecture):
     table = MLPTable
 
     def __init__(self, env_id: str, table: MLPTable) -> None:
-        wide = len(protocol.make_task(env_id).observation)
+        wide = len(TASKS[env_id]().observation)
         self.activation, self.bins, self.squash = table.activation, table.bins, table.squash
         self.mean_limit, self.normalise = table.mean_limit, table.normalise
-        self.controls = protocol.make_task(env_id).formulas.actions
+        self.controls = TASKS[env_id]().formulas.actions
         widths = [wide, *table.hidden, self.controls * (self.bins or 1)]
         self.arrays = {}
         for k, (rows, columns) in enumerate(zip(widths[1:], widths[:-1], strict=True)):
@@ -264,7 +264,7 @@ class Linear(Architecture):
     """
 
     def __init__(self, env_id: str, table: PolicyTable) -> None:
-        task = protocol.make_task(env_id)
+        task = TASKS[env_id]()
         wide, count = len(task.observation), task.formulas.actions
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
@@ -327,7 +327,7 @@ class Table(Architecture):
     table = GridTable
 
     def __init__(self, env_id: str, table: GridTable) -> None:
-        self.task = protocol.make_task(env_id)
+        self.task = TASKS[env_id]()
         if self.task.formulas.actions != 1 or self.task.formulas.targets > 1:
             raise Refused(f"{POLICY}: tables are for tasks with one control and at most one target")
         names = list(self.task.scene.state_names)
@@ -465,7 +465,7 @@ class Controller(Architecture):
     def __init__(self, env_id: str, table: ControllerTable) -> None:
         from lag_envs.controllers import build, controllers
 
-        self.task = protocol.make_task(env_id)
+        self.task = TASKS[env_id]()
         known = controllers(self.task)
         if table.name not in known:
             raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")

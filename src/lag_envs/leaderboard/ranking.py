@@ -48,7 +48,6 @@ from lag_envs.evaluation.statistics import (
     redraw,
     wilson,
 )
-from lag_envs.leaderboard.protocol import make_task
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
@@ -258,7 +257,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
     robustness = {name: _score(scale, each, moved) for name, each in (result.get("robustness") or {}).items()}
     # Where there are kicks, they are others when acting often.
-    often = 0.0 * moved if env_id in TASKS and make_task(env_id).draws else moved
+    often = 0.0 * moved if env_id in TASKS and TASKS[env_id]().draws else moved
     return {
         "score": float(iqm(means)),
         "return": scale.random + float(means.mean()) * (scale.best - scale.random),
