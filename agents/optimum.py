@@ -31,7 +31,7 @@ from agents.value_iteration import (
 )
 from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
-from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.envs.model import Model
 from lag_envs.evaluation import statistics
 from lag_envs.evaluation.rollout import Rollout, play, record
@@ -256,11 +256,8 @@ class Solution:
         return sum(w * self.value(times, p, targets) for w, p in zip(weights, outcomes, strict=True))
 
 
-class Optimal:
-    """The greedy policy of a computed value function, with Stable-Baselines3's `predict`.
-
-    It looks one step ahead with the exact model: over a set of actions, then over finer ones around the best.
-    Its state is the number of steps taken in each episode.
+class Optimal(LookAhead):
+    """The greedy policy of a computed value function.
 
     Parameters
     ----------
@@ -296,43 +293,15 @@ class Optimal:
             raise ValueError(
                 f"value iteration gives no policy for {env_id!r}, only for {', '.join(played())}"
             )
-        self.solution = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
-        self.read = ObservationDecoder(self.solution.task)
-        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
-        self.pace = 1.0
+        found = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
+        self.solution = found
+        super().__init__(found.task, self._value, found.programs[0].actions)
 
-    def predict(
-        self,
-        observation: ArrayLike,
-        state: Array | None = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Array]:
-        """Return actions and the numbers of steps taken then, for one observation or a batch."""
-        observation = np.asarray(observation, np.float64)
-        single, batch = observation.ndim == 1, np.atleast_2d(observation)
-        n = len(batch)
-        taken = np.zeros(n) if state is None else np.broadcast_to(np.asarray(state, np.float64), n)
-        if episode_start is not None:
-            taken = np.where(np.broadcast_to(episode_start, n), 0.0, taken)
-        points, goals = self.read(batch)
-        targets = goals if self.solution.problem.targets else None
+    def _value(self, ends: Array, targets: Array, taken: Array) -> Array:
+        solution = self.solution
         # The margin is for a clock that has gone tenths of a step.
-        after = np.minimum((taken + 1e-6).astype(np.int64) + 1, self.solution.steps)
-        coarse = self.solution.programs[0].actions
-        action = self._best(points, np.tile(coarse, (n, 1)), targets, after)
-        around = action[:, None] + (coarse[1] - coarse[0]) * np.linspace(-1.0, 1.0, 17)
-        action = self._best(points, np.clip(around, -1.0, 1.0), targets, after).astype(np.float32)
-        return (action if single else action[:, None]), taken + self.pace
-
-    def _best(self, points: Array, actions: Array, targets: Array | None, after: Any) -> Array:
-        """Return the best of each row's actions."""
-        n, m = actions.shape
-        goals = None if targets is None else np.repeat(targets, m)
-        ends, rewards, ended = self.solution.step(np.repeat(points, m, axis=0), actions.ravel(), goals)
-        later = self.solution.expected(np.repeat(after, m), ends, goals)
-        gains = (rewards + np.where(ended, 0.0, later)).reshape(n, m)
-        return np.take_along_axis(actions, gains.argmax(axis=1)[:, None], axis=1)[:, 0]
+        after = np.minimum((taken + 1e-6).astype(np.int64) + 1, solution.steps)
+        return solution.expected(after, ends[:, solution.keep], targets if solution.problem.targets else None)
 
 
 # --- numbers ------------------------------------------------------------------------------------------------
