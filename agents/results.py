@@ -11,18 +11,14 @@ import errno
 import json
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from numpy.typing import NDArray
-
 from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
-from agents.measure import Entrant, Field, Job, Store, follow, gather, plans
+from agents.measure import Field, Job, measure
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
 from lag_envs import TASKS, __version__
-from lag_envs.evaluation.conditions import NOMINAL, conditions
-from lag_envs.evaluation.rollout import observation_std
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import machine
 from lag_envs.scores import known_returns
@@ -30,10 +26,8 @@ from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
-#: Episodes under each condition; those of agents that take long, where something is changed; with --quick.
-EPISODES, PLANNED, QUICK = 1000, 200, 20
-#: Seed of the random actions from which the noise's size is taken.
-SCALE_SEED = 3_000_000_000
+#: Episodes under each condition, and with --quick.
+EPISODES, QUICK = 1000, 20
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
 
 EPILOG = f"""what it reads and writes:
@@ -84,11 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not args.new:
             load_summary(output)  # better now than when all is measured
         with terminable():
-            broken, parts = measure_all(envs, args.agents, args.runs, episodes)
+            found = measure_all(envs, args.agents, args.runs, episodes)
             # Only now: another command may have written it meanwhile.
-            data = summarise(*parts, usual, {} if args.new else load_summary(output))
+            data = summarise(found, usual, {} if args.new else load_summary(output))
             write(output / SUMMARY, to_json(data))
             show(data, output)
+        broken = [problem for field, _ in found for problem in field.broken]
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
@@ -109,103 +104,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int
-) -> tuple[list[str], tuple]:
-    """Measure what has not been measured; return what is wrong, and what `summarise` begins with."""
+) -> list[tuple[Field, list[Job]]]:
+    """Measure what has not been measured; return the environments with all that there is to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
-    fields = {env_id: gather(env_id, runs) for env_id in envs}
+    fields = [Field(env_id, runs) for env_id in envs]
     if names is not None:
-        there = {entrant.name for found in fields.values() for entrant in found.entrants}
+        there = {entrant.name for field in fields for entrant in field.entrants}
         if unknown := sorted(set(names) - there):
             raise UserError(f"there is no agent {unknown[0]!r} here; there are {', '.join(sorted(there))}")
-    stores = {env_id: Store(runs / "measurements" / f"{env_id}.jsonl") for env_id in envs}
-    jobs = [
-        Job(entrant, condition, episodes if condition.name == NOMINAL else min(episodes, few))
-        for env_id, found in fields.items()
-        for entrant in found.entrants
-        if names is None or entrant.name in names
-        for few in [PLANNED if plans(entrant) else episodes]
-        for condition in conditions(env_id)
-    ]
-    todo = [job for job in jobs if job.key not in stores[job.entrant.env].returns]
+    found = [(field, field.jobs(names, episodes)) for field in fields]
+    jobs = [(field, job) for field, own in found for job in own]
+    todo = [(field, job) for field, job in jobs if job.key not in field.returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
-    scales = {env_id: observation_std(env_id, range(SCALE_SEED, SCALE_SEED + 100)) for env_id in envs}
-    follow(todo, stores, scales, fields)
-
-    broken = [problem for found in fields.values() for problem in found.broken]
-    return broken, (fields, jobs, stores, scales)
+    measure(todo)
+    return found
 
 
 # --- the summary --------------------------------------------------------------------------------------------
 
 
-def summarise(
-    fields: dict[str, Field],
-    jobs: Iterable[Job],
-    stores: dict[str, Store],
-    scales: dict[str, NDArray],
-    episodes: int,
-    old: Data,
-) -> Data:
+def summarise(found: Sequence[tuple[Field, list[Job]]], episodes: int, old: Data) -> Data:
     """Return all that page and figures need; agents that were not measured now keep their old numbers."""
-    measured: dict[str, dict[str, Data]] = {env_id: {} for env_id in fields}
-    policies: dict[tuple[str, str], dict[int | None, dict[str, list[float]]]] = {}
-    entrants: dict[tuple[str, str, int | None], Entrant] = {}
-    for job in jobs:
-        e = job.entrant
-        returns = stores[e.env].returns.get(job.key)
-        if returns is not None:
-            entrants[e.env, e.name, e.seed] = e
-            policies.setdefault((e.env, e.name), {}).setdefault(e.seed, {})[job.condition.name] = returns
-    for (env_id, name), by_seed in policies.items():
-        by_seed = {seed: found for seed, found in by_seed.items() if NOMINAL in found}
-        if not by_seed:
-            continue
-        who = [entrants[env_id, name, seed] for seed in by_seed]
-        agent: Data = {"name": name, "kind": who[0].kind, "conditions": {}}
-        for condition in conditions(env_id):
-            groups = [found[condition.name] for found in by_seed.values() if condition.name in found]
-            if groups:
-                agent["conditions"][condition.name] = groups
-        if agent["kind"] == "learned":
-            results = [e.run or {} for e in who]
-            agent |= {
-                "seeds": [r["seed"] for r in results],
-                "steps": [r["trained"] for r in results],
-                "seconds": [r["wall_seconds"] for r in results],
-                "curves": [r["curve"] for r in results],
-            }
-            agent["trained_on"] = sorted({_where(r) for r in results})
-        measured[env_id][name] = agent
-
-    envs: dict[str, Data] = {}
-    for env_id in TASKS:
-        before = old.get("envs", {}).get(env_id)
-        if env_id not in fields:
-            if before is not None:
-                envs[env_id] = before
-            continue
-        scale = known_returns(env_id)
-        known = (scale.random, scale.best) if scale else None
-        found = rounded(summarise_env(measured[env_id].values(), known))
-        if before is not None and before["known"] == found["known"]:
-            found["agents"] = ranked(before["agents"] | found["agents"])
-            found["improvement"] = rounded(compare(found["agents"]))
-        elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
-            print(
-                f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr
-            )
-        if not found["agents"]:
-            continue
-        absent = [text for text in fields[env_id].absent if text.split(":")[0] not in found["agents"]]
-        if any(agent["kind"] == "learned" for agent in found["agents"].values()):
-            absent = [text for text in absent if not text.startswith("learners")]
-        names = TASKS[env_id]().observation
-        found["observation_std"] = rounded(dict(zip(names, scales[env_id].tolist(), strict=True)))
-        found["problems"] = absent
-        envs[env_id] = found
+    envs = dict(old.get("envs", {}))
+    for field, jobs in found:
+        envs[field.env] = summarise_field(field, jobs, envs.get(field.env))
+    envs = {env_id: envs[env_id] for env_id in TASKS if env_id in envs and envs[env_id]["agents"]}
     if not envs:
-        reasons = [problem for found in fields.values() for problem in [*found.broken, *found.absent]]
+        reasons = [problem for field, _ in found for problem in [*field.broken, *field.absent]]
         raise UserError("no agent could be measured" + "".join(f"\n  {reason}" for reason in reasons))
     return {
         "schema": SCHEMA,
@@ -219,10 +145,22 @@ def summarise(
     }
 
 
-def _where(result: Data) -> str:
-    """Return where a run was trained."""
-    found = ", ".join(f"{name} {number}" for name, number in result.get("versions", {}).items())
-    return f"{result.get('machine', 'unknown machine')}: {found}"
+def summarise_field(field: Field, jobs: Sequence[Job], before: Data | None) -> Data:
+    """Return the summary of an environment, with what an earlier one has of other agents."""
+    scale = known_returns(field.env)
+    known = (scale.random, scale.best) if scale else None
+    found = rounded(summarise_env(field.measured(jobs), known))
+    if before is not None and before["known"] == found["known"]:
+        found["agents"] = ranked(before["agents"] | found["agents"])
+        found["improvement"] = rounded(compare(found["agents"]))
+    elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
+        print(f"{field.env}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
+    kinds = {agent["kind"] for agent in found["agents"].values()}
+    there = {*found["agents"], *(["learners"] if "learned" in kinds else [])}
+    names = TASKS[field.env]().observation
+    found["observation_std"] = rounded(dict(zip(names, field.noise.tolist(), strict=True)))
+    found["problems"] = [text for text in field.absent if text.split(":")[0] not in there]
+    return found
 
 
 def versions() -> dict[str, str]:

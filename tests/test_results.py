@@ -128,12 +128,12 @@ def command(monkeypatch, capsys, tmp_path):
         Condition("gravity +20 %", {"gravity": 11.8}),
         Condition("noise 5 %", noise=0.05),
     ]
-    monkeypatch.setattr(results, "conditions", lambda env_id: few)
+    monkeypatch.setattr(measure, "conditions", lambda env_id: few)
     monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
     monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
-    monkeypatch.setattr(results, "observation_std", lambda env_id, seeds: np.array([0.5, 0.1]))
+    monkeypatch.setattr(measure, "observation_std", lambda env_id, seeds: np.array([0.5, 0.1]))
 
     def run(*arguments):
         folders = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
@@ -214,15 +214,15 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     ],
 )
 def test_command_that_is_broken_off(error, status, message, command, tmp_path, monkeypatch):
-    add = measure.Store.add
+    keep = measure.Field.keep
 
     def stop(self, *arguments):
         if self.returns:
             raise error
-        add(self, *arguments)
+        keep(self, *arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(measure.Store, "add", stop)
+        patched.setattr(measure.Field, "keep", stop)
         found, output = command("--envs", ENV)
     assert found == status and message in output and not (tmp_path / results.SUMMARY).exists()
     found, output = command("--envs", ENV)
