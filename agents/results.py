@@ -198,7 +198,8 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 
 def show(data: Data, output: Path) -> int:
     """Write figures, page, and README's table."""
-    from agents.report import figures, page, summary
+    from agents.figures import figures
+    from agents.report import page, summary
     from lag_envs.generated import replaced
 
     files = figures(data, output / PICTURES)

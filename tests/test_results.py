@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents import behaviour, measure, report, results
+from agents import behaviour, figures, measure, report, results
 from agents.analysis import learning_curve, level, summarise_env, summarise_learners
 from agents.run import fresh_seeds
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
@@ -130,7 +130,7 @@ def command(monkeypatch, capsys, tmp_path):
     ]
     monkeypatch.setattr(measure, "conditions", lambda env_id: few)
     monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
-    monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
+    monkeypatch.setattr(figures, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
     monkeypatch.setattr(measure, "observation_std", lambda env_id, seeds: np.array([0.5, 0.1]))
