@@ -16,7 +16,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -309,11 +308,8 @@ class Optimal(LookAhead):
 
 def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
     """Return states and targets at the start of the episodes that agents are compared on."""
-    envs = gym.make_vec(env_id, episodes)
-    envs.reset(seed=FIRST_FRESH_SEED)
-    found = envs.unwrapped.state, envs.unwrapped.target
-    envs.close()
-    return found
+    rollout = Rollout(env_id, None, fresh_seeds(episodes))
+    return rollout.state, rollout.target
 
 
 def proved_bound(env_id: str) -> tuple[float, str]:

@@ -366,8 +366,8 @@ def adapter() -> str:
     found = json.loads(ADAPTER.read_text(encoding="utf-8"))
     rows = []
     for row in found["rows"]:
-        ours, theirs = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
-        rows.append([row["kind"], str(row["num_envs"]), ours, theirs, f"{row['ratio'][1]:.1f}"])
+        adapter, dummy = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
+        rows.append([row["kind"], str(row["num_envs"]), adapter, dummy, f"{row['ratio'][1]:.1f}"])
     text = (
         f"`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +26,7 @@ from agents.results import to_json
 from agents.run import UserError, check_env
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
-from lag_envs.evaluation.rollout import play
+from lag_envs.evaluation.rollout import Rollout, play
 from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
 from lag_envs.store import write
@@ -142,12 +141,8 @@ def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array
 
 def optima(env_id: str, first: int) -> Array:
     """Return the largest returns of a batch of episodes."""
-    envs = gym.make_vec(env_id, BATCH)
-    envs.reset(seed=first)
-    bare: Any = envs.unwrapped
-    best = resolve(bare.task.optimum.place)(bare.task, *bare.state.T)
-    envs.close()
-    return best
+    rollout = Rollout(env_id, None, range(first, first + BATCH))
+    return resolve(rollout.task.optimum.place)(rollout.task, *rollout.state.T)
 
 
 if __name__ == "__main__":

@@ -25,8 +25,10 @@ from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
-from lag_envs.leaderboard.board import Board, board_data, finish
+from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import load
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find, measured

@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import Field
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.board import Board, Neighbours, claimed, others, shown_episodes
+from lag_envs.leaderboard.board import Board, others
 from lag_envs.leaderboard.fields import Strict, checked, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
@@ -47,6 +47,7 @@ from lag_envs.leaderboard.log import (
     parse,
     read_log,
 )
+from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
 from lag_envs.leaderboard.results import apart, build, compare
 from lag_envs.store import write
 
@@ -220,9 +221,9 @@ def _submissions(board: Board, found: Cheap) -> Finding:
             finding.wrong.append(f"{where} is not what was added: {error}; {REMEDY}")
             continue
         if (digest := digest_of(files)) != entry.digest:
-            ours, theirs = entry.digest[:8], digest[:8]
             finding.wrong.append(
-                f"{where} is not what was added: its digest is {theirs}..., not {ours}...; {REMEDY}"
+                f"{where} is not what was added: its digest is {digest[:8]}..., not {entry.digest[:8]}...;"
+                f" {REMEDY}"
             )
             continue
         try:
@@ -337,7 +338,7 @@ def _history(board: Board, log: bytes) -> Finding:
     folder = board.folder
     try:
         listed = ["log", "--full-history", "--format=%H"]
-        ours = git(folder, *listed, "HEAD", "--", f"./{LOG}").decode().split()
+        local = git(folder, *listed, "HEAD", "--", f"./{LOG}").decode().split()
         tagged = git(folder, *listed, "HEAD", "--tags", "--", f"./{LOG}").decode().split()
         if not tagged:
             raise NoHistory("no commit holds the board")
@@ -345,7 +346,7 @@ def _history(board: Board, log: bytes) -> Finding:
         for commit in tagged:
             then = log_at(folder, commit)
             # A release may be later than what is checked out.
-            if log.startswith(then) or (commit not in ours and then.startswith(log)):
+            if log.startswith(then) or (commit not in local and then.startswith(log)):
                 continue
             if b'"prev"' not in then:
                 before += 1  # a board that was begun again, before there was a chain

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.generated import replaced
-from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import boards
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.store import write
 from lag_envs.tasks import TASKS
 
