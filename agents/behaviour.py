@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from agents.results import ROOT, to_json
-from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
+from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
 from lag_envs import TASKS
 from lag_envs.controllers import build
@@ -78,18 +78,13 @@ def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[
     return found
 
 
+@reports_errors("agents.behaviour")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.behaviour", description=__doc__)
     p.add_argument("env", nargs="*", metavar="ID", help="print those of some environments, and write nothing")
     args = p.parse_args(arguments)
-    try:
-        envs = [check_env(name) for name in args.env] or [
-            env_id for env_id, task in TASKS.items() if task.goal
-        ]
-    except UserError as error:
-        print(f"agents.behaviour: error: {error}", file=sys.stderr)
-        return 2
+    envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]
     found: dict[str, Any] = {}
     for env_id in envs:
         found[env_id] = rounded(measured(env_id))

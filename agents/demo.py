@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
-from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env
+from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env, reports_errors
 from agents.train import command, follow, processes
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
@@ -68,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.demo")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
@@ -83,9 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(f"To go on:  {command('agents.demo', arguments)}")
                 return 130 if stopped else 1
         report(run, video=not args.no_video)
-    except UserError as error:
-        print(f"agents.demo: error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("\nInterrupted.", file=sys.stderr)
         return 130

@@ -12,6 +12,7 @@ from lag_envs.benchmark import quartiles, short
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
+from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured
 
@@ -89,7 +90,7 @@ def summary(data: Data) -> str:
         )
     head = ["environment", "score 0", "score 1"]
     head += [f"best {kind} agent: score" for kind in ("classical", "learned")] + ["optimal policy: score"]
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _reading(data: Data) -> str:
@@ -147,7 +148,7 @@ def _env_table(env: Data, episodes: int) -> str:
                 f"{agent['seconds']:,.0f} s" if agent["kind"] == "learned" else "",
             ]
         )
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def labelled(name: str, agent: Data) -> str:
@@ -205,7 +206,7 @@ def _behaviour(env_id: str) -> list[str]:
     )
     if any(name.startswith("lost") for name in head):
         text += " *Lost* is what rewards lack to 1 per step."
-    return [text, table(head, rows)]
+    return [text, markdown_table(head, rows)]
 
 
 def _problems(env: Data) -> str:
@@ -230,7 +231,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
         " algorithms**: look at what each had; compare only equal environments, seeds and steps."
     )
     head = ["learner", f"score ({100 * LEVEL:g} %)", "environments", "seeds of each", "steps of a seed"]
-    return text + "\n\n" + table(head, rows)
+    return text + "\n\n" + markdown_table(head, rows)
 
 
 def _span(values: Iterable[float]) -> str:
@@ -256,7 +257,7 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
     if not rows:
         return "All runs of the one are better than all of the other, in every case."
     text = f"Neither 0 nor 1, with {100 * LEVEL:g} % interval; two learners in the likelier order:"
-    return text + "\n\n" + table(["environment", "learner", "better than", "probability"], rows)
+    return text + "\n\n" + markdown_table(["environment", "learner", "better than", "probability"], rows)
 
 
 def _method(data: Data) -> str:
@@ -308,7 +309,7 @@ def _noise_table(envs: Mapping[str, Data]) -> str:
         for env_id, env in envs.items()
         if env.get("observation_std")
     ]
-    return table(["environment", "standard deviation of each entry under random actions"], rows)
+    return markdown_table(["environment", "standard deviation of each entry under random actions"], rows)
 
 
 def _about(data: Data) -> str:
@@ -373,7 +374,7 @@ def adapter() -> str:
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
         f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
     )
-    return text + "\n\n" + table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
+    return text + "\n\n" + markdown_table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
 
 
 def _ends(interval: Sequence[float] | None) -> Data:
@@ -382,12 +383,6 @@ def _ends(interval: Sequence[float] | None) -> Data:
 
 def _image(file: str, text: str) -> str:
     return f"![{text}]({IMAGES}/{file})"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
 
 
 def number(value: float) -> str:

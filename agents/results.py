@@ -17,7 +17,7 @@ from pathlib import Path
 
 from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
 from agents.measure import Field, Job, measure
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import machine
@@ -63,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.results")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where an agent failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
@@ -87,9 +88,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
-    except UserError as error:
-        print(f"agents.results: error: {error}", file=sys.stderr)
-        return 2
     except OSError as error:
         full = " (no space left)" if error.errno == errno.ENOSPC else ""
         print(f"agents.results: error: {error}{full}; what was measured before is kept", file=sys.stderr)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from agents.optimum import Optimal, played
 from agents.results import to_json
-from agents.run import UserError, check_env
+from agents.run import UserError, check_env, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
@@ -41,6 +41,7 @@ FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 PLANNED, OPTIMAL = 1_000, 4_096
 
 
+@reports_errors("agents.scale")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
@@ -51,13 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
     )
     args = p.parse_args(arguments)
-    try:
-        envs = [check_env(name) for name in args.env] or list(TASKS)
-        if args.batches < 1:
-            raise UserError(f"--batches must be at least 1, got {args.batches}")
-    except UserError as error:
-        print(f"agents.scale: error: {error}", file=sys.stderr)
-        return 2
+    envs = [check_env(name) for name in args.env] or list(TASKS)
+    if args.batches < 1:
+        raise UserError(f"--batches must be at least 1, got {args.batches}")
     kept: dict[str, Any] = {}
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]

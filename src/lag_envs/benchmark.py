@@ -39,7 +39,7 @@ from lag_envs.host import ONE_THREAD, machine
 from lag_envs.own_files import registered
 from lag_envs.progress import progress
 from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.tables import columns, markdown_table
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -638,8 +638,6 @@ def markdown(report: dict[str, Any]) -> str:
 
     sizes = ["1 (`gym.make`)" if t.kind == "made" else f"{t.num_envs:,} at once" for t in TARGETS]
     lines = [
-        ["id", *sizes],
-        ["---"] * (1 + len(sizes)),
         *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in _ours(report)),
         ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
         ["*aim*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
@@ -649,7 +647,7 @@ def markdown(report: dict[str, Any]) -> str:
         "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
         f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
         f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
-        "\n".join("| " + " | ".join(line) + " |" for line in lines),
+        markdown_table(["id", *sizes], lines),
     ]
     exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
     if exact:
