@@ -19,7 +19,7 @@ from agents.results import ROOT, to_json
 from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
 from lag_envs import TASKS
-from lag_envs.controllers import build
+from lag_envs.controllers import Constant, build
 from lag_envs.evaluation.rollout import Episodes, Rollout, record
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard.submission import load
@@ -61,8 +61,9 @@ def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, 
     """Yield our quick agents of an environment: name, and policies, one for each training seed."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        if not found.plans and not found.place.endswith(":constant"):  # that takes long, or shows nothing
-            yield name, [build(task, name)]
+        agent = None if found.plans else build(task, name)  # to plan takes long
+        if agent is not None and not isinstance(agent, Constant):  # which shows nothing
+            yield name, [agent]
     for folder in sorted(submissions.glob(f"{env_id}-*")):
         found = load(folder)
         if found.kind == "learned" and list(found.authors) == AUTHORS:
@@ -89,13 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for env_id in envs:
         found[env_id] = rounded(measured(env_id))
         for name, measures in found[env_id].items():
-            print(
-                env_id,
-                name,
-                *(f"{key}: {values}" for key, values in measures.items()),
-                sep="\n  ",
-                flush=True,
-            )
+            lines = (f"{key}: {values}" for key, values in measures.items())
+            print(env_id, name, *lines, sep="\n  ", flush=True)
     if not args.env:
         write(OUTPUT, to_json({"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED, "envs": found}))
     return 0

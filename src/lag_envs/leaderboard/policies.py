@@ -410,7 +410,8 @@ class _LookUp(Clocked):
     def __init__(self, task: Task, grid: _Grid) -> None:
         super().__init__(task)
         self.grid = grid
-        self.sign = 1.0 if getattr(task.scene, "control", None) == "damping" else -1.0
+        # A control that is zero at an end of its range, such as a drag, has no sign.
+        self.sign = 1.0 if abs(task.rest_action) == 1.0 else -1.0
 
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
         found, mirrored = self.grid.look_up(states, targets, taken)
