@@ -30,7 +30,7 @@ from agents.run import (
 )
 from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
-from lag_envs.evaluation.rollout import Rollout, Step, observation_std
+from lag_envs.evaluation.rollout import Meter, Rollout, Step, observation_std
 from lag_envs.evaluation.statistics import rounded
 
 AGENTS = Path(__file__).parent
@@ -169,7 +169,7 @@ class Job:
     @property
     def steps(self) -> int:
         """Steps that it takes at most."""
-        return int(TASKS[self.entrant.env](**self.condition.options).limit) * self.episodes
+        return self.condition.steps(self.entrant.env) * self.episodes
 
 
 class Field:
@@ -287,8 +287,9 @@ def measure(todo: Sequence[tuple[Field, Job]]) -> None:
     """Measure, policy by policy, and show how far it is and what is left."""
     from tqdm import tqdm
 
-    total, done, started = sum(job.steps for _, job in todo), 0, time.monotonic()
+    total, started = sum(job.steps for _, job in todo), time.monotonic()
     with tqdm(total=total, unit=" steps", unit_scale=True, disable=None, dynamic_ncols=True) as bar:
+        meter = Meter(total, lambda done, total: bar.update(done - bar.n))
         for entrant, group in groupby(todo, key=lambda pair: pair[1].entrant):
             bar.set_description_str(str(entrant))
             agent, said = None, ""
@@ -299,17 +300,17 @@ def measure(todo: Sequence[tuple[Field, Job]]) -> None:
                         agent = entrant.make()
                     if not job.condition.suits(agent, entrant.plans):
                         continue
-                    returns = field.run(job, agent, lambda step: bar.update(len(step.running)))
+                    returns = field.run(job, agent, meter)
                 except Exception as error:  # whatever an agent does; the others are measured all the same
                     first = f"{type(error).__name__}: {error}".splitlines()[0]
                     field.broken.append(f"{entrant}, {job.condition.name}: {first}")
                 else:
                     field.keep(job, returns)
                     said = said or f"{job.condition.name} {returns.mean():.4g}"
-                done += job.steps
-                bar.update(done - bar.n)
+                finally:
+                    meter.close(job.steps)
             seconds = time.monotonic() - started
-            left = seconds * (total - done) / max(done, 1)
+            left = seconds * (total - meter.done) / max(meter.done, 1)
             if said:
                 bar.write(f"{entrant}: {said} ({seconds:.0f} s, {left:.0f} s left)")
                 sys.stdout.flush()

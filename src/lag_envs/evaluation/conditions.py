@@ -38,6 +38,10 @@ class Condition:
     noise: float = 0.0
     late: bool = False
 
+    def steps(self, env_id: str) -> int:
+        """Return the steps of an environment's episode at most."""
+        return int(TASKS[env_id](**self.options).limit)
+
     def suits(self, agent: Any, plans: bool) -> bool:
         """Tell whether an agent can act under it: one that plans does so for one control interval.
 

@@ -124,6 +124,31 @@ def play(env_id: str, agent: Any, seeds: Sequence[int], **options: Any) -> Array
     return Rollout(env_id, agent, seeds, **options).run()
 
 
+class Meter:
+    """Watches roll-outs one after the other, and tells how far they are.
+
+    Parameters
+    ----------
+    total : int
+        Steps that all take at most.
+    show : callable
+        Called now and then with the steps taken, and the total.
+    """
+
+    def __init__(self, total: int, show: Callable[[int, int], Any]) -> None:
+        self.total, self.show, self.done, self.taken = total, show, 0, 0
+
+    def __call__(self, step: Step) -> None:
+        """Count a step of every episode."""
+        self.taken += len(step.running)
+        self.show(self.done + self.taken, self.total)
+
+    def close(self, size: int) -> None:
+        """Count a roll-out that ended early, or was left out, as one of so many steps."""
+        self.done, self.taken = self.done + size, 0
+        self.show(self.done, self.total)
+
+
 def act(agent: Any, observation: Any, memory: Any, start: Mask, shape: tuple[int, ...]) -> tuple[Any, Any]:
     """Return actions of a shape and what the agent remembers; raise PolicyError where there are none."""
     try:

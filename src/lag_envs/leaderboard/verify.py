@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from lag_envs import __version__
 from lag_envs.errors import UserError
-from lag_envs.evaluation.conditions import OFTEN, disturbances, often
-from lag_envs.evaluation.rollout import Outcome, PolicyError, Rollout, Step, play, record
+from lag_envs.evaluation.conditions import OFTEN, Condition, disturbances, often
+from lag_envs.evaluation.rollout import Meter, Outcome, PolicyError, Rollout, play, record
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import plain
@@ -73,32 +73,19 @@ def verify(
     if not 1 <= episodes <= 100_000:
         raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
     started, busy = time.perf_counter(), time.process_time()
-    env, few, task = submission.env, min(episodes, protocol.DISTURBED_EPISODES), TASKS[submission.env]()
+    env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
     # Kicks are others when acting often, and it takes as many episodes again until they make no difference.
     runs = [(condition, few) for condition in disturbances(env)]
-    runs.append((often(env), episodes if task.draws else few))
-    sizes = [int(TASKS[env](**condition.options).limit) * count for condition, count in runs]
-    nominal = int(task.limit) * episodes
-    work = (nominal + sum(sizes)) * len(submission.policies)
-    done, taken = 0, 0  # in runs that are over, and in the one that is not
+    runs.append((often(env), episodes if TASKS[env]().draws else few))
+    nominal, *sizes = (condition.steps(env) * count for condition, count in [(Condition(), episodes), *runs])
 
-    def report() -> None:
+    def show(done: int, work: int) -> None:
         if time.process_time() - busy > protocol.CPU_SECONDS:
             raise Refused(f"verifying it takes more than {protocol.CPU_SECONDS:g} s of CPU time")
         if progress is not None:
-            progress(done + taken, work)
+            progress(done, work)
 
-    def tick(step: Step) -> None:
-        nonlocal taken
-        taken += len(step.running)
-        report()
-
-    def close(size: int) -> None:
-        """Count a run that ended early, or was left out, as run to its end."""
-        nonlocal done, taken
-        done, taken = done + size, 0
-        report()
-
+    meter = Meter((nominal + sum(sizes)) * len(submission.policies), show)
     policies: list[dict[str, Any]] = []
     means: dict[str, list[float | None]] = {condition.name: [] for condition, _ in runs}
     for number, (seed, policy) in enumerate(submission.policies):
@@ -107,15 +94,15 @@ def verify(
         try:
             rollout = Rollout(env, policy.agent(), seeds)
             outcome = Outcome(rollout)
-            returns = rollout.run(outcome, tick)
-            close(nominal)
+            returns = rollout.run(outcome, meter)
+            meter.close(nominal)
             reference = _reference(env, seeds)
             for size, (condition, count) in zip(sizes, runs, strict=True):
                 agent, mean = policy.agent(), None
                 if condition.suits(agent, policy.architecture.plans):
-                    mean = float(Rollout(env, agent, seeds[:count], **condition.options).run(tick).mean())
+                    mean = float(Rollout(env, agent, seeds[:count], **condition.options).run(meter).mean())
                 means[condition.name].append(mean)
-                close(size)
+                meter.close(size)
         except (PolicyError, Refused) as error:
             raise Refused(f"policy of seed {seed}: {error}") from error
         policies.append({"seed": seed, "returns": returns.tolist(), **reference, **outcome.result()})
