@@ -218,7 +218,7 @@ def test_controller_is_the_built_in_one(tmp_path, numbers):
 
     made = built_in(tmp_path / "a", numbers=numbers)
     observations = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 4))
-    wanted = PD(protocol.make_task(ENV), **numbers).predict(observations)[0]
+    wanted = PD(TASKS[ENV](), **numbers).predict(observations)[0]
     assert np.array_equal(made.policies[0][1].agent().predict(observations)[0], wanted)
     assert os.listdir(tmp_path / "a") == ["submission.toml"]
 
