@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.evaluation.conditions import NOMINAL
 from lag_envs.evaluation.statistics import estimate, improvement, interval, iqm, pooled_iqm
+from lag_envs.scores import Scale, normalised
 
 Array = NDArray[np.float64]
 Data = dict[str, Any]
@@ -56,7 +57,7 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
 # --- the numbers that are kept ------------------------------------------------------------------------------
 
 
-def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> Data:
+def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
     """Return all that figures and page need of one environment.
 
     Parameters
@@ -64,13 +65,12 @@ def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> 
     agents : iterable of dict
         For each agent its ``name``, ``kind``, ``conditions`` (by name, the returns of each of its policies),
         and for learners ``seeds``, ``steps``, ``seconds`` and ``curves`` (one for each seed), ``trained_on``.
-    known : tuple of float, optional
+    scale : Scale, optional
         Mean return of the random and of the best known policy. Results are scores then, else returns.
     """
 
     def scored(returns: ArrayLike) -> Array:
-        values = np.asarray(returns, np.float64)
-        return values if known is None else (values - known[0]) / (known[1] - known[0])
+        return np.asarray(returns, np.float64) if scale is None else normalised(scale, returns)
 
     found: dict[str, Data] = {}
     for agent in agents:
@@ -93,7 +93,8 @@ def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> 
                 "curves": {"steps": learning_curve(curves, 0), "seconds": learning_curve(curves, 1)},
             }
         found[agent["name"]] = entry
-    return {"known": list(known) if known else None, "agents": ranked(found), "improvement": compare(found)}
+    known = None if scale is None else [scale.random, scale.best]
+    return {"known": known, "agents": ranked(found), "improvement": compare(found)}
 
 
 def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:

@@ -145,9 +145,7 @@ def summarise(found: Sequence[tuple[Field, list[Job]]], episodes: int, old: Data
 
 def summarise_field(field: Field, jobs: Sequence[Job], before: Data | None) -> Data:
     """Return the summary of an environment, with what an earlier one has of other agents."""
-    scale = known_returns(field.env)
-    known = (scale.random, scale.best) if scale else None
-    found = rounded(summarise_env(field.measured(jobs), known))
+    found = rounded(summarise_env(field.measured(jobs), known_returns(field.env)))
     if before is not None and before["known"] == found["known"]:
         found["agents"] = ranked(before["agents"] | found["agents"])
         found["improvement"] = rounded(compare(found["agents"]))

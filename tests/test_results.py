@@ -15,6 +15,7 @@ from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_contr
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition
 from lag_envs.evaluation.rollout import Episodes, Rollout, play, record
 from lag_envs.generated import replaced
+from lag_envs.scores import KnownReturns
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
@@ -64,13 +65,16 @@ def classical(name, value):
     return {"name": name, "kind": "classical", "conditions": {NOMINAL: returns, "late": returns}}
 
 
+SCALE = KnownReturns(0.0, 10.0, 0.1, "x")
+
+
 def invented():
     """Return a whole summary of invented results."""
     agents = [learner("ppo", 5), learner("sac+", 3, 0.8), learner("td3", 1), classical("a|b", 9.9)]
     envs = {
-        "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], (0.0, 10.0)),
+        "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], SCALE),
         pivoted_bar.Balance.id: summarise_env(agents[::2], None),
-        incline.Tilt.id: summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
+        incline.Tilt.id: summarise_env([classical("zero", 1.0)], SCALE),
     }
     for env in envs.values():
         env |= {"observation_std": {"s": 0.5}, "problems": ["optimal: not computed"]}

@@ -17,7 +17,6 @@ from lag_envs.evaluation.statistics import (
     luck_slope,
     mean_and_error,
     median_time,
-    normalised,
     optimality_gap,
     pooled_iqm,
     profile,
@@ -26,7 +25,7 @@ from lag_envs.evaluation.statistics import (
     wilson,
     without_luck,
 )
-from lag_envs.scores import known_returns
+from lag_envs.scores import known_returns, normalised
 
 
 def rliable(part):

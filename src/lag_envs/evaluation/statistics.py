@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,31 +30,6 @@ THRESHOLDS: Array = np.linspace(-0.25, 1.25, 61)
 
 
 # --- scores -------------------------------------------------------------------------------------------------
-
-
-class Scale(Protocol):
-    """The mean returns that are scores 0 and 1."""
-
-    @property
-    def random(self) -> float:
-        """Of uniformly random actions."""
-
-    @property
-    def best(self) -> float:
-        """Of the best policy known."""
-
-
-def normalised(scale: Scale, returns: ArrayLike) -> Array:
-    """Return the scores of returns: 0 for the random policy's mean, 1 for that of the best policy known.
-
-    Examples
-    --------
-    >>> from lag_envs.scores import known_returns
-    >>> known = known_returns("PivotedBar-v0")
-    >>> normalised(known, [known.random, known.best]).tolist()
-    [0.0, 1.0]
-    """
-    return (np.asarray(returns, np.float64) - scale.random) / (scale.best - scale.random)
 
 
 def optimality_gap(means: ArrayLike) -> float:

@@ -36,18 +36,17 @@ from numpy.typing import NDArray
 from lag_envs.evaluation.statistics import (
     RESAMPLES,
     THRESHOLDS,
-    Scale,
     ends,
     improvement,
     iqm,
     luck_slope,
     median_time,
-    normalised,
     optimality_gap,
     profile,
     redraw,
     wilson,
 )
+from lag_envs.scores import Scale, normalised
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]

@@ -12,6 +12,7 @@ from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import REMEDY, BoardError, Entry, State
 from lag_envs.leaderboard.pending import shown_episodes
 from lag_envs.leaderboard.results import PACKED, checked_value
+from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
 
 
@@ -52,7 +53,7 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
 def _environment(
     board: Board, state: State, results: Mapping[tuple[int, str], dict[str, Any]], env_id: str, number: int
 ) -> dict[str, Any]:
-    from lag_envs.evaluation.statistics import ends, iqm, normalised, rounded
+    from lag_envs.evaluation.statistics import ends, iqm, rounded
     from lag_envs.leaderboard import ranking
     from lag_envs.leaderboard.site.scenery import describe
 
@@ -122,8 +123,6 @@ def _environment(
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
     """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
-    from lag_envs.scores import KnownReturns, known_returns
-
     found = known_returns(env_id)
     known = found and found._asdict()
     if scale is None:
