@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from rollouts import SINGLE, one_by_one
+from rollouts import SINGLE
 
 from agents import tune
 from agents.run import fresh_seeds
@@ -244,11 +244,6 @@ def test_controller_swings_up_and_holds(controller):
     assert returns[:20].mean() > 417.0  # what it is known to reach
     assert returns.min() > 410.0  # none needs one swing more, or falls
     assert score(BAR, returns.mean()) > 0.99
-
-
-def test_controller_acts_on_one_observation_as_on_a_batch(controller):
-    one = one_by_one(BAR, controller, range(5, 8))
-    np.testing.assert_allclose(one, play(BAR, controller, range(5, 8)), rtol=1e-12)
 
 
 def test_controller_hands_over_with_hysteresis(controller):
