@@ -12,7 +12,6 @@ import json
 import re
 import sys
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
@@ -20,7 +19,7 @@ from agents.measure import Field, Job, measure
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded
-from lag_envs.host import machine
+from lag_envs.host import installed, machine
 from lag_envs.scores import known_returns
 from lag_envs.store import write
 
@@ -137,7 +136,7 @@ def summarise(found: Sequence[tuple[Field, list[Job]]], episodes: int, old: Data
         "first_seed": FIRST_FRESH_SEED,
         "episodes": episodes,
         "machine": machine(),
-        "versions": versions(),
+        "versions": {"lag_envs": __version__} | installed(PACKAGES),
         "envs": envs,
         "learners": rounded(summarise_learners(envs)),
     }
@@ -156,17 +155,6 @@ def summarise_field(field: Field, jobs: Sequence[Job], before: Data | None) -> D
     names = TASKS[field.env]().observation
     found["observation_std"] = rounded(dict(zip(names, field.noise.tolist(), strict=True)))
     found["problems"] = [text for text in field.absent if text.split(":")[0] not in there]
-    return found
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what took part."""
-    found = {"lag_envs": __version__}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
     return found
 
 

@@ -22,7 +22,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +34,7 @@ from numpy.typing import NDArray
 import lag_envs
 from lag_envs import benchmark_jacobians
 from lag_envs.benchmark_jacobians import jacobians
-from lag_envs.host import ONE_THREAD, machine
+from lag_envs.host import ONE_THREAD, installed, machine
 from lag_envs.own_files import registered
 from lag_envs.progress import progress
 from lag_envs.store import write
@@ -351,7 +350,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         "date": settings.date,
         "complete": complete,
         "machine": machine() | {"load_at_start": load},
-        "versions": versions(),
+        "versions": {"lag_envs": lag_envs.__version__} | installed(LIBRARIES),
         "settings": asdict(settings),
         "rows": results,
         "cold_start": {
@@ -553,17 +552,6 @@ def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     bars = sorted(times)
     slope = np.polyfit(np.log(bars), np.log([times[n] for n in bars]), 1)[0]
     return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what takes part."""
-    found = {"lag_envs": lag_envs.__version__}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 # --- printing ---

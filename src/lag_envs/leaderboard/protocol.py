@@ -1,4 +1,4 @@
-"""What a score on the leaderboard means: episodes, seeds, success, disturbances, and limits of a submission.
+"""What a score on the leaderboard means: how many episodes, seeds, the reference, and limits of a submission.
 
 A board freezes this, with the scale, when a protocol begins (`rules`); where something of it changes, the
 board has to begin the next one.
