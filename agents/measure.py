@@ -234,12 +234,12 @@ class Field:
 
     def jobs(self, names: Sequence[str] | None, episodes: int) -> list[Job]:
         """Return what is measured of agents of some names; in fewer episodes of those that plan."""
+        few = min(episodes, PLANNED)
         return [
-            Job(entrant, condition, min(episodes, PLANNED) if changed and entrant.plans else episodes)
+            Job(entrant, condition, few if entrant.plans and condition.name != NOMINAL else episodes)
             for entrant in self.entrants
             if names is None or entrant.name in names
             for condition in conditions(self.env)
-            for changed in [condition.name != NOMINAL]
         ]
 
     def run(self, job: Job, agent: Any, tick: Callable[[Step], Any]) -> NDArray[np.float64]:

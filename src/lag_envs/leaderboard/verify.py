@@ -186,18 +186,19 @@ def replay(
     told |= _reference(env, [first + i for i in chosen])
     for name, values in outcome.result().items():
         told[name] = [values[row] for row in rows] if isinstance(values, list) else values
-    return told, [
-        {
+
+    def episode(i: int, row: int) -> dict[str, Any]:
+        steps = int(played.steps[row])
+        return {
             "seed": training_seed, "reset_seed": first + i, "return": float(rollout.returns[row]),
             "dt": played.task.dt,
             "states": rounded(played.states[: steps + 1, row].tolist()),
             "actions": _plain(played.actions[:steps, row]),
             "rewards": rounded(played.rewards[:steps, row].tolist()),
             "target": None if played.targets is None else _plain(played.targets[None, row])[0],
-        }
-        for i, row in zip(chosen, rows, strict=True)
-        for steps in [int(played.steps[row])]
-    ]  # fmt: skip
+        }  # fmt: skip
+
+    return told, [episode(i, row) for i, row in zip(chosen, rows, strict=True)]
 
 
 def _plain(values: Array) -> list[Any]:
