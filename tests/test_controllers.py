@@ -21,6 +21,7 @@ from lag_envs.controllers import (
     make_controller,
 )  # fmt: skip
 from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
@@ -282,3 +283,37 @@ def test_agents_without_knowledge():
     assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
     assert play(BAR, Constant(0.0), range(0, 20)).mean() == pytest.approx(0.0, abs=0.1)
     assert play(BAR, Random(0), range(0, 100)).mean() == pytest.approx(known_returns(BAR).random, abs=3.0)
+
+
+# --- looking ahead ---
+
+
+def test_look_ahead_finds_the_best_action_of_a_step():
+    """Nearly what the best of a thousand actions gets, here with a best one in between."""
+    task, rng = make_task(SHELL), np.random.default_rng(0)
+
+    def value(states, targets, taken):
+        return -1e3 * (states[:, 1] - 0.02 * taken) ** 2
+
+    agent, model = LookAhead(task, value, np.linspace(-1.0, 1.0, 11)), Model(task)
+    states = rng.uniform(-0.1, 0.1, (40, len(task.scene.state_names)))
+    targets, taken = rng.uniform(-0.1, 0.1, 40), np.arange(40.0)
+
+    def gain(actions):
+        ends, rewards, _ = model(states, actions, targets)
+        return rewards + value(ends, targets, taken)
+
+    most = np.max([gain(np.full(40, action)) for action in np.linspace(-1.0, 1.0, 1001)], axis=0)
+    found = agent.act(states, targets, taken)
+    assert (np.abs(found) < 0.99).any() and (most - gain(found) < 0.01 * np.ptp(most)).all()
+
+
+def test_agents_count_the_steps_of_each_episode():
+    agent = LookAhead(make_task(FREE), lambda states, targets, taken: 0.0 * taken, np.linspace(-1.0, 1.0, 3))
+    seen = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.2]])
+    action, taken = agent.predict(seen)
+    assert action.shape == (2, 1) and action.dtype == np.float32 and taken.tolist() == [1.0, 1.0]
+    agent.pace = 0.1
+    _, taken = agent.predict(seen, taken, np.array([False, True]))
+    assert taken.tolist() == [1.1, 0.1]
+    assert agent.predict(seen[0], np.array([3.0]))[0].shape == (1,)
