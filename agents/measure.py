@@ -172,7 +172,7 @@ class Job:
         return self.condition.steps(self.entrant.env) * self.episodes
 
 
-class Field:
+class Evaluation:
     """The agents of an environment, and what was measured of them.
 
     Measurements are kept as soon as they are there, a line of JSON each; a damaged one is made again.
@@ -283,7 +283,7 @@ def _where(run: Data) -> str:
     return f"{run.get('machine', 'unknown machine')}: {found}"
 
 
-def measure(todo: Sequence[tuple[Field, Job]]) -> None:
+def measure(todo: Sequence[tuple[Evaluation, Job]]) -> None:
     """Measure, policy by policy, and show how far it is and what is left."""
     from tqdm import tqdm
 
@@ -293,19 +293,19 @@ def measure(todo: Sequence[tuple[Field, Job]]) -> None:
         for entrant, group in groupby(todo, key=lambda pair: pair[1].entrant):
             bar.set_description_str(str(entrant))
             agent, said = None, ""
-            for field, job in group:
+            for evaluation, job in group:
                 try:
                     # What draws random numbers begins anew, so that the order of measurements is all one.
                     if agent is None or hasattr(agent, "rng"):
                         agent = entrant.make()
                     if not job.condition.suits(agent, entrant.plans):
                         continue
-                    returns = field.run(job, agent, meter)
+                    returns = evaluation.run(job, agent, meter)
                 except Exception as error:  # whatever an agent does; the others are measured all the same
                     first = f"{type(error).__name__}: {error}".splitlines()[0]
-                    field.broken.append(f"{entrant}, {job.condition.name}: {first}")
+                    evaluation.broken.append(f"{entrant}, {job.condition.name}: {first}")
                 else:
-                    field.keep(job, returns)
+                    evaluation.keep(job, returns)
                     said = said or f"{job.condition.name} {returns.mean():.4g}"
                 finally:
                     meter.close(job.steps)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
-from agents.measure import Field, Job, measure
+from agents.measure import Evaluation, Job, measure
 from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
 from lag_envs.evaluation.statistics import rounded
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             data = summarise(found, usual, {} if args.new else load_summary(output))
             write(output / SUMMARY, to_json(data))
             show(data, output)
-        broken = [problem for field, _ in found for problem in field.broken]
+        broken = [problem for evaluation, _ in found for problem in evaluation.broken]
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
@@ -101,18 +101,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int
-) -> list[tuple[Field, list[Job]]]:
+) -> list[tuple[Evaluation, list[Job]]]:
     """Measure what has not been measured; return the environments with all that there is to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
-    fields = [Field(env_id, runs) for env_id in envs]
+    evaluations = [Evaluation(env_id, runs) for env_id in envs]
     if names is not None:
-        there = {entrant.name for field in fields for entrant in field.entrants}
+        there = {entrant.name for evaluation in evaluations for entrant in evaluation.entrants}
         if unknown := sorted(set(names) - there):
             raise UserError(f"there is no agent {unknown[0]!r} here; there are {', '.join(sorted(there))}")
-    found = [(field, field.jobs(names, episodes)) for field in fields]
-    jobs = [(field, job) for field, own in found for job in own]
-    todo = [(field, job) for field, job in jobs if job.key not in field.returns]
+    found = [(evaluation, evaluation.jobs(names, episodes)) for evaluation in evaluations]
+    jobs = [(evaluation, job) for evaluation, own in found for job in own]
+    todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
     measure(todo)
     return found
@@ -121,14 +121,14 @@ def measure_all(
 # --- the summary --------------------------------------------------------------------------------------------
 
 
-def summarise(found: Sequence[tuple[Field, list[Job]]], episodes: int, old: Data) -> Data:
+def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old: Data) -> Data:
     """Return all that page and figures need; agents that were not measured now keep their old numbers."""
     envs = dict(old.get("envs", {}))
-    for field, jobs in found:
-        envs[field.env] = summarise_field(field, jobs, envs.get(field.env))
+    for evaluation, jobs in found:
+        envs[evaluation.env] = summarise_evaluation(evaluation, jobs, envs.get(evaluation.env))
     envs = {env_id: envs[env_id] for env_id in TASKS if env_id in envs and envs[env_id]["agents"]}
     if not envs:
-        reasons = [problem for field, _ in found for problem in [*field.broken, *field.absent]]
+        reasons = [problem for evaluation, _ in found for problem in [*evaluation.broken, *evaluation.absent]]
         raise UserError("no agent could be measured" + "".join(f"\n  {reason}" for reason in reasons))
     return {
         "schema": SCHEMA,
@@ -142,19 +142,20 @@ def summarise(found: Sequence[tuple[Field, list[Job]]], episodes: int, old: Data
     }
 
 
-def summarise_field(field: Field, jobs: Sequence[Job], before: Data | None) -> Data:
+def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[Job], before: Data | None) -> Data:
     """Return the summary of an environment, with what an earlier one has of other agents."""
-    found = rounded(summarise_env(field.measured(jobs), known_returns(field.env)))
+    env_id = evaluation.env
+    found = rounded(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
     if before is not None and before["known"] == found["known"]:
         found["agents"] = ranked(before["agents"] | found["agents"])
         found["improvement"] = rounded(compare(found["agents"]))
     elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
-        print(f"{field.env}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
+        print(f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
     kinds = {agent["kind"] for agent in found["agents"].values()}
     there = {*found["agents"], *(["learners"] if "learned" in kinds else [])}
-    names = TASKS[field.env]().observation
-    found["observation_std"] = rounded(dict(zip(names, field.noise.tolist(), strict=True)))
-    found["problems"] = [text for text in field.absent if text.split(":")[0] not in there]
+    names = TASKS[env_id]().observation
+    found["observation_std"] = rounded(dict(zip(names, evaluation.noise.tolist(), strict=True)))
+    found["problems"] = [text for text in evaluation.absent if text.split(":")[0] not in there]
     return found
 
 

@@ -218,7 +218,7 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     ],
 )
 def test_command_that_is_broken_off(error, status, message, command, tmp_path, monkeypatch):
-    keep = measure.Field.keep
+    keep = measure.Evaluation.keep
 
     def stop(self, *arguments):
         if self.returns:
@@ -226,7 +226,7 @@ def test_command_that_is_broken_off(error, status, message, command, tmp_path, m
         keep(self, *arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(measure.Field, "keep", stop)
+        patched.setattr(measure.Evaluation, "keep", stop)
         found, output = command("--envs", ENV)
     assert found == status and message in output and not (tmp_path / results.SUMMARY).exists()
     found, output = command("--envs", ENV)
