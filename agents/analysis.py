@@ -2,95 +2,25 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import bootstrap
 
-from lag_envs.leaderboard import ranking
-from lag_envs.leaderboard.ranking import iqm
+from lag_envs.evaluation.conditions import NOMINAL
+from lag_envs.evaluation.statistics import estimate, improvement, interval, iqm, pooled_iqm
+from lag_envs.scores import Scale, normalised
 
 Array = NDArray[np.float64]
 Data = dict[str, Any]
 
-#: Bootstrap samples of an interval, as many as rliable draws, and how likely the interval is to cover.
-RESAMPLES, LEVEL = 2000, 0.95
-NOMINAL, OFTEN = "nominal", "ten times as often"
 #: Points of a learning curve.
 POINTS = 33
 
 
 # --- statistics ---------------------------------------------------------------------------------------------
-
-
-def interval(statistic: Callable[..., Any], *strata: ArrayLike) -> list[float] | None:
-    """Return the percentile bootstrap interval of a statistic, each stratum resampled by itself.
-
-    That is rliable's stratified bootstrap [1]_, with an environment as stratum and a seed as element.
-
-    Parameters
-    ----------
-    statistic : callable
-        Takes the strata and ``axis``; works on arrays of any number of dimensions.
-    *strata : array_like, shape (n_i,)
-        The samples.
-
-    Returns
-    -------
-    list of float, or None
-        Lower and upper end; None where a stratum has a single element, which tells nothing of the spread.
-
-    References
-    ----------
-    .. [1] R. Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
-       NeurIPS 2021.
-    """
-    if any(np.size(s) < 2 for s in strata):
-        return None
-    found = bootstrap(
-        strata, statistic, n_resamples=RESAMPLES, confidence_level=LEVEL, method="percentile",
-        vectorized=True, axis=-1, rng=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
-    return [float(found.low), float(found.high)]
-
-
-def iqm_of_all(*strata: ArrayLike, axis: int = -1) -> Any:
-    """Return the interquartile mean of all strata together."""
-    return iqm(np.concatenate(strata, axis=axis), axis=axis)
-
-
-def improvement(x: ArrayLike, y: ArrayLike, axis: int = -1) -> Any:
-    """Return `ranking.improvement`, as SciPy's bootstrap calls it: with the axis, which is the last."""
-    return ranking.improvement(x, y)
-
-
-def estimate(groups: Sequence[ArrayLike]) -> Data:
-    """Return what several policies of one agent reach, from each one's results.
-
-    Parameters
-    ----------
-    groups : sequence of array_like, shape (episodes,)
-        One for each training seed; one only for an agent that was not trained.
-
-    Returns
-    -------
-    dict
-        ``value`` and the ends of its interval ``low`` and ``high``: the interquartile mean over seeds with a
-        bootstrap over them, or for a single policy the mean with 1.96 standard errors over episodes. ``mean``
-        and its standard ``error``, over seeds or else over episodes; ``each`` policy's mean.
-    """
-    means = np.array([np.mean(g) for g in groups], np.float64)
-    sample = means if len(means) > 1 else np.asarray(groups[0], np.float64)
-    error = float(sample.std(ddof=1) / math.sqrt(len(sample))) if len(sample) > 1 else 0.0
-    mean = float(means.mean())
-    if len(means) > 1:
-        value, (low, high) = float(iqm(means)), interval(iqm, means)
-    else:
-        value, low, high = mean, mean - 1.96 * error, mean + 1.96 * error
-    return {"value": value, "low": low, "high": high, "mean": mean, "error": error, "each": means.tolist()}
 
 
 def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> Data | None:
@@ -127,7 +57,7 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
 # --- the numbers that are kept ------------------------------------------------------------------------------
 
 
-def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> Data:
+def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
     """Return all that figures and page need of one environment.
 
     Parameters
@@ -135,13 +65,12 @@ def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> 
     agents : iterable of dict
         For each agent its ``name``, ``kind``, ``conditions`` (by name, the returns of each of its policies),
         and for learners ``seeds``, ``steps``, ``seconds`` and ``curves`` (one for each seed), ``trained_on``.
-    known : tuple of float, optional
+    scale : Scale, optional
         Mean return of the random and of the best known policy. Results are scores then, else returns.
     """
 
     def scored(returns: ArrayLike) -> Array:
-        values = np.asarray(returns, np.float64)
-        return values if known is None else (values - known[0]) / (known[1] - known[0])
+        return np.asarray(returns, np.float64) if scale is None else normalised(scale, returns)
 
     found: dict[str, Data] = {}
     for agent in agents:
@@ -164,7 +93,8 @@ def summarise_env(agents: Iterable[Data], known: tuple[float, float] | None) -> 
                 "curves": {"steps": learning_curve(curves, 0), "seconds": learning_curve(curves, 1)},
             }
         found[agent["name"]] = entry
-    return {"known": list(known) if known else None, "agents": ranked(found), "improvement": compare(found)}
+    known = None if scale is None else [scale.random, scale.best]
+    return {"known": known, "agents": ranked(found), "improvement": compare(found)}
 
 
 def level(conditions: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:
@@ -198,11 +128,7 @@ def compare(agents: Mapping[str, Data]) -> Data:
             if len(y) > 1:
                 ends = interval(improvement, x, y)
             else:  # against one policy only the runs can be drawn anew
-
-                def against(a: Array, axis: int = -1, y: Array = y) -> Any:
-                    return improvement(a, y, axis)
-
-                ends = interval(against, x)
+                ends = interval(partial(improvement, y=y), x)
             found.setdefault(one, {})[other] = {"value": float(improvement(x, y)), "interval": ends}
     return found
 
@@ -216,19 +142,10 @@ def summarise_learners(envs: Mapping[str, Data]) -> Data:
                 scores.setdefault(name, {})[env_id] = agent["conditions"][NOMINAL]["each"]
     return {
         name: {
-            "value": float(iqm_of_all(*per_env.values())),
-            "interval": interval(iqm_of_all, *per_env.values()),
+            "value": float(pooled_iqm(*per_env.values())),
+            "interval": interval(pooled_iqm, *per_env.values()),
             "envs": sorted(per_env),
             "runs": sum(map(len, per_env.values())),
         }
         for name, per_env in sorted(scores.items())
     }
-
-
-def rounded(value: Any) -> Any:
-    """Return JSON-like data with numbers of 6 digits; what is beyond is noise and makes files large."""
-    if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [rounded(v) for v in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -10,106 +10,29 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.analysis import rounded
 from agents.results import ROOT, to_json
-from agents.run import FIRST_FRESH_SEED, UserError, check_env
+from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
 from lag_envs import TASKS
-from lag_envs.controllers import build
+from lag_envs.controllers import Constant, build
+from lag_envs.evaluation.rollout import Episodes, Rollout, record
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard.submission import load
 from lag_envs.store import write
-from lag_envs.tasks.base import Task
-
-Array = NDArray[np.float64]
 
 SUBMISSIONS, OUTPUT = ROOT / "leaderboard" / "submissions", ROOT / "agents" / "results" / "behaviour.json"
 EPISODES = 1_000
 
 
-@dataclass(frozen=True)
-class Played:
-    """Episodes that were stepped together.
-
-    Parameters
-    ----------
-    task : Task
-        Its task.
-    states : ndarray, shape (steps + 1, episodes, n_state)
-        Where each step begins, and the last one ends; after an episode's end what its last step left.
-    actions : ndarray, shape (steps, episodes), or (steps, episodes, n_actions) where there are several
-        The actions.
-    targets : ndarray, shape (episodes,), or (episodes, n_targets) where there are several
-        Targets; 0 where the task has none.
-    steps : ndarray of int, shape (episodes,)
-        Steps that each episode took.
-    rewards : ndarray, shape (steps, episodes)
-        Rewards; 0 after an episode's end.
-    """
-
-    task: Task
-    states: Array
-    actions: Array
-    targets: Array
-    steps: NDArray[np.int64]
-    rewards: Array
-
-    def settled(self) -> Array:
-        """Return after how many seconds the board's goal holds for good; inf where it does not at the end."""
-        inside = np.stack([self.task.goal_holds(states, self.targets) for states in self.states])
-        outside = ~inside & (np.arange(len(inside))[:, None] <= self.steps)
-        last = np.where(outside.any(axis=0), len(outside) - np.argmax(outside[::-1], axis=0), 0)
-        return np.where(last > self.steps, np.inf, last * self.task.dt)
-
-
-def play(env_id: str, agent: Any, episodes: int = EPISODES) -> Played:
-    """Play the first of the episodes that agents are compared in.
-
-    Parameters
-    ----------
-    env_id : str
-        The environment.
-    agent : object
-        Anything with the `predict` of Stable-Baselines3.
-    episodes : int
-        How many.
-    """
-    # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
-    envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep")
-    bare: Any = envs.unwrapped
-    observation, _ = envs.reset(seed=FIRST_FRESH_SEED)
-    targets = np.zeros(episodes) if bare.target is None else bare.target.copy()
-    states, actions, rewards, state = [bare.state.copy()], [], [], None
-    steps = np.zeros(episodes, np.int64)
-    running = np.ones(episodes, np.bool_)
-    start = running.copy()
-    while running.any():
-        action, state = agent.predict(observation, state, start, deterministic=True)
-        observation, reward, terminated, truncated, _ = envs.step(action)
-        rewards.append(np.where(running, reward, 0.0))
-        steps += running
-        taken = np.clip(action, -1.0, 1.0)
-        actions.append(taken[:, 0] if taken.shape[1:] == (1,) else taken)
-        states.append(np.where(running[:, None], bare.state, states[-1]))
-        running &= ~(terminated | truncated)
-        start = np.zeros(episodes, np.bool_)
-    envs.close()
-    return Played(
-        bare.task, np.array(states), np.array(actions, np.float64), targets, steps, np.array(rewards)
-    )
-
-
 # --- what is measured ---------------------------------------------------------------------------------------
 
 
-def arrival(what: str, played: Played) -> dict[str, float]:
+def arrival(what: str, played: Episodes) -> dict[str, float]:
     """Measure when the board's goal is reached for good, and what is lost by then and afterwards.
 
     Lost is what a step's reward lacks to 1, the most that it may be. Means are over the episodes in which the
@@ -127,9 +50,9 @@ def arrival(what: str, played: Played) -> dict[str, float]:
     }
 
 
-def measures(played: Played) -> dict[str, float]:
+def measures(played: Episodes) -> dict[str, float]:
     """Return what is told of episodes: the arrival at the goal, and what the task itself adds."""
-    task: Task = played.task
+    task = played.task
     found = arrival(task.goal.arrival, played) if task.goal and task.goal.arrival else {}
     return found | dict(task.behaviour(played))
 
@@ -138,8 +61,9 @@ def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, 
     """Yield our quick agents of an environment: name, and policies, one for each training seed."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
-        if not found.plans and not found.place.endswith(":constant"):  # that takes long, or shows nothing
-            yield name, [build(task, name)]
+        agent = None if found.plans else build(task, name)  # to plan takes long
+        if agent is not None and not isinstance(agent, Constant):  # which shows nothing
+            yield name, [agent]
     for folder in sorted(submissions.glob(f"{env_id}-*")):
         found = load(folder)
         if found.kind == "learned" and list(found.authors) == AUTHORS:
@@ -150,34 +74,24 @@ def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[
     """Return what is measured of an environment's agents: by agent and measure a number for each policy."""
     found: dict[str, dict[str, list[float]]] = {}
     for name, policies in agents(env_id):
-        rows = [measures(play(env_id, policy, episodes)) for policy in policies]
+        rows = [measures(record(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}
     return found
 
 
+@reports_errors("agents.behaviour")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.behaviour", description=__doc__)
     p.add_argument("env", nargs="*", metavar="ID", help="print those of some environments, and write nothing")
     args = p.parse_args(arguments)
-    try:
-        envs = [check_env(name) for name in args.env] or [
-            env_id for env_id, task in TASKS.items() if task.goal
-        ]
-    except UserError as error:
-        print(f"agents.behaviour: error: {error}", file=sys.stderr)
-        return 2
+    envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]
     found: dict[str, Any] = {}
     for env_id in envs:
         found[env_id] = rounded(measured(env_id))
         for name, measures in found[env_id].items():
-            print(
-                env_id,
-                name,
-                *(f"{key}: {values}" for key, values in measures.items()),
-                sep="\n  ",
-                flush=True,
-            )
+            lines = (f"{key}: {values}" for key, values in measures.items())
+            print(env_id, name, *lines, sep="\n  ", flush=True)
     if not args.env:
         write(OUTPUT, to_json({"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED, "envs": found}))
     return 0

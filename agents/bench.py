@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.analysis import rounded
 from agents.results import to_json
+from agents.run import UserError, reports_errors
 from lag_envs.benchmark import (
     Contestant,
     Run,
@@ -27,6 +27,7 @@ from lag_envs.benchmark import (
     ratios,
     short,
 )
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import ONE_THREAD, machine
 from lag_envs.store import write
 from lag_envs.tables import columns
@@ -47,12 +48,12 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.bench")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command."""
     args = parser().parse_args(arguments)
     if args.rounds < 1:
-        print(f"agents.bench: error: --rounds must be at least 1, got {args.rounds}", file=sys.stderr)
-        return 2
+        raise UserError(f"--rounds must be at least 1, got {args.rounds}")
     os.environ.update(ONE_THREAD)
     kinds = {"adapter": adapter, "DummyVecEnv": dummy}
     steps = [Contestant(k, ENV, "step", n, partial(stepping, f, n)) for n in SIZES for k, f in kinds.items()]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from agents.optimum import DEFAULT_FOLDER, Solution, solvable
-from agents.run import UserError, check_env
+from agents.run import check_env, reports_errors
 from lag_envs import TASKS
 from lag_envs.store import write
 
@@ -60,19 +60,15 @@ def coarse(env_id: str, folder: Path | None = DEFAULT_FOLDER) -> dict[str, Any]:
     return {"axes": axes, "values": rounded}
 
 
+@reports_errors("agents.board_values")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the files."""
     parser = argparse.ArgumentParser(prog="python -m agents.board_values", description=__doc__)
     parser.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
     parser.add_argument("--board", type=Path, default=Path("leaderboard"), help="default: leaderboard")
     args = parser.parse_args(arguments)
-    try:
-        envs = [check_env(name) for name in args.env] or [
-            id for id, task in TASKS.items() if task.value_iteration
-        ]
-    except UserError as error:
-        print(f"agents.board_values: error: {error}", file=sys.stderr)
-        return 2
+    solved = [env_id for env_id, task in TASKS.items() if task.value_iteration]
+    envs = [check_env(name) for name in args.env] or solved
     for env_id in envs:
         path = args.board / "values" / f"{env_id}.json"
         write(path, json.dumps(coarse(env_id), separators=(",", ":")) + "\n")

@@ -18,13 +18,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.evaluate import evaluate
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
-from agents.run import FIRST_FRESH_SEED, RESULT, Run, UserError, check_name, own_env
+from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env, reports_errors
 from agents.train import command, follow, processes
+from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write
 from lag_envs.tables import columns
+from lag_envs.tasks.registration import make_task
 
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
@@ -67,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.demo")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where training failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
@@ -82,9 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(f"To go on:  {command('agents.demo', arguments)}")
                 return 130 if stopped else 1
         report(run, video=not args.no_video)
-    except UserError as error:
-        print(f"agents.demo: error: {error}", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         print("\nInterrupted.", file=sys.stderr)
         return 130
@@ -120,13 +119,12 @@ def report(run: Run, video: bool) -> None:
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())
     learner = run.algo.upper()
-    seeds = range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + EPISODES)
+    seeds = fresh_seeds(EPISODES)
     started = time.perf_counter()
-    with gym.make(run.env) as env:
-        task = env.unwrapped.task
-        quick = [name for name, found in controllers(task).items() if not found.plans]
-        agents = {learner: policy} | {name: build(task, name) for name in quick}
-        returns = {name: evaluate(env, agent, seeds) for name, agent in agents.items()}
+    task = make_task(run.env)
+    quick = [name for name, found in controllers(task).items() if not found.plans]
+    agents = {learner: policy} | {name: build(task, name) for name in quick}
+    returns = {name: play(run.env, agent, seeds) for name, agent in agents.items()}
     seconds = time.perf_counter() - started
     draw_curve(run, learner, result, returns)
     if video:
@@ -193,7 +191,12 @@ def record(policy: Any, run: Run, seed: int) -> None:
         with RecordVideo(
             env, f"{folder}/video", episode_trigger=lambda n: n == 0, disable_logger=True
         ) as env:
-            evaluate(env, policy, [seed])
+            observation, _ = env.reset(seed=seed)
+            memory, over = None, False
+            while not over:
+                action, memory = policy.predict(observation, memory, deterministic=True)
+                observation, _, terminated, truncated, _ = env.step(action)
+                over = terminated or truncated
         (video,) = Path(folder, "video").glob("*.mp4")
         shutil.move(video, run.folder / "episode.mp4")
 

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lag_envs.hyperparams
-from agents.evaluate import evaluate_batch
 from agents.run import (
     CHECKPOINT,
     FIRST_FRESH_SEED,
@@ -30,9 +29,11 @@ from agents.run import (
     Run,
     UserError,
     check_name,
+    fresh_seeds,
     read_result,
 )
 from lag_envs import __version__
+from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import DISCRETISE
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write
@@ -250,7 +251,8 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
         def keep(self) -> None:
             """Test the policy as it is, and save all."""
             content = freeze(self.model)
-            mean = evaluate_batch(run.env, policy_of(run, self.model), FIRST_TEST_SEED, TEST_EPISODES).mean()
+            seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
+            mean = play(run.env, policy_of(run, self.model), seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.seconds = before + time.perf_counter() - started
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
@@ -277,7 +279,7 @@ def finish(run: Run, model: Any) -> None:
     if normalise is not None and normalise.norm_obs:
         write(run.path(NORMALISATION), pickle.dumps(normalise))
     started = time.perf_counter()
-    returns = evaluate_batch(run.env, policy_of(run, model), FIRST_FRESH_SEED, EPISODES)
+    returns = play(run.env, policy_of(run, model), fresh_seeds(EPISODES))
     known = known_returns(run.env)
     result = {
         **run.settings,

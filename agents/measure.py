@@ -6,25 +6,40 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.analysis import NOMINAL, OFTEN, Data, rounded
-from agents.evaluate import Sensor, evaluate_batch
-from agents.run import FIRST_FRESH_SEED, MODEL, NORMALISATION, RESULT, SCHEMA, UserError, read_result
+from agents.analysis import Data
+from agents.run import (
+    FIRST_FRESH_SEED,
+    MODEL,
+    NORMALISATION,
+    RESULT,
+    SCHEMA,
+    UserError,
+    fresh_seeds,
+    read_result,
+)
 from lag_envs import TASKS, __version__, controllers, store
-from lag_envs.leaderboard import protocol
+from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
+from lag_envs.evaluation.rollout import Meter, Rollout, Step, observation_std
+from lag_envs.evaluation.statistics import rounded
 
 AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
 CONTROLLERS = Path(controllers.__file__).parent
+#: Episodes of agents that take long, where something is changed.
+PLANNED = 200
+#: First seed of the episodes of random actions from which the noise's size is taken.
+NOISE_SEED = 3_000_000_000
 
 # --- who is measured ----------------------------------------------------------------------------------------
 
@@ -43,6 +58,8 @@ class Entrant:
         Changes with what decides how it acts.
     run : dict, optional
         What ``result.json`` holds, for a learner.
+    plans : bool
+        Whether it plans before each episode, which takes long.
     """
 
     env: str
@@ -51,6 +68,7 @@ class Entrant:
     make: Callable[[], Any]
     mark: str
     run: Data | None = None
+    plans: bool = False
 
     @property
     def seed(self) -> int | None:
@@ -60,45 +78,6 @@ class Entrant:
     def __str__(self) -> str:
         seed = "" if self.seed is None else f" seed {self.seed}"
         return f"{self.env} {self.name}{seed}"
-
-
-@dataclass
-class Field:
-    """Who is measured on an environment, and what is wrong with others."""
-
-    env: str
-    entrants: list[Entrant] = field(default_factory=list)
-    #: Agents that are not there, and those with which something is wrong.
-    absent: list[str] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-
-
-def gather(env_id: str, runs: Path) -> Field:
-    """Return the classical controllers, the optimal policy and the learners' runs of an environment."""
-    found = Field(env_id)
-    task = TASKS[env_id]()
-    for name in controllers.controllers(task):
-        make = partial(controllers.build, task, name)
-        found.entrants.append(Entrant(env_id, name, "classical", make, digest(CONTROLLERS)))
-    if reason := no_optimum(env_id):
-        found.absent.append(f"optimal: {reason}")
-    else:
-        mark = digest("optimum.py", "value_iteration.py", OPTIMA / f"{env_id}.json")
-        found.entrants.append(Entrant(env_id, "optimal", "optimal", partial(_optimal, env_id), mark))
-    folders = [file.parent for file in runs.glob(f"{env_id}/*/seed*/{RESULT}")]
-    folders.sort(key=lambda p: (p.parent.name, len(p.name), p.name))
-    first: dict[str, Entrant] = {}
-    for folder in folders:
-        try:
-            entrant = learned(env_id, folder)
-            check_alike(entrant, first.setdefault(entrant.name, entrant))
-        except UserError as error:
-            found.broken.append(str(error))
-        else:
-            found.entrants.append(entrant)
-    if not first:
-        found.absent.append("learners: no finished run")
-    return found
 
 
 def no_optimum(env_id: str) -> str:
@@ -169,63 +148,7 @@ def digest(*files: Path | str) -> str:
     return total.hexdigest()[:16]
 
 
-# --- conditions ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What differs from the environment as it is.
-
-    Parameters
-    ----------
-    name : str
-        As tables call it.
-    options : dict
-        The environment's arguments.
-    noise : float
-        Standard deviation of the observation's noise, relative to its own under random actions.
-    late : bool
-        Whether the agent sees the observation before.
-    """
-
-    name: str
-    options: Data = field(default_factory=dict)
-    noise: float = 0.0
-    late: bool = False
-
-
-def conditions(env_id: str) -> list[Condition]:
-    """Return the conditions under which agents are measured on an environment."""
-    found = [Condition(NOMINAL), Condition(OFTEN, protocol.often(env_id))]
-    found += [Condition(name, options) for name, options in protocol.disturbances(env_id).items()]
-    found += [Condition(f"noise {level:.0%}".replace("%", " %"), noise=level) for level in (0.01, 0.05)]
-    return [*found, Condition("late", late=True)]
-
-
 # --- measuring ----------------------------------------------------------------------------------------------
-
-
-class Store:
-    """Measurements of an environment, a line of JSON for each, written as soon as it is there.
-
-    Parameters
-    ----------
-    file : Path
-        Where they are kept. Lines that cannot be read are measured again.
-    """
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.returns: dict[str, list[float]] = {}
-        for row in store.rows(file):
-            with suppress(ValueError, KeyError, TypeError):  # damaged
-                self.returns[row["key"]] = [float(x) for x in row["returns"]]
-
-    def add(self, key: str, about: Data, returns: NDArray) -> None:
-        """Keep a measurement."""
-        row = {"key": key, **about, "returns": rounded(returns.tolist())}
-        store.append(self.file, row)
-        self.returns[key] = row["returns"]
 
 
 @dataclass(frozen=True)
@@ -246,92 +169,148 @@ class Job:
     @property
     def steps(self) -> int:
         """Steps that it takes at most."""
-        return int(TASKS[self.entrant.env](**self.condition.options).limit)
+        return self.condition.steps(self.entrant.env) * self.episodes
 
 
-def plans(entrant: Entrant) -> bool:
-    """Tell whether an agent plans before each episode: that takes long, and is for one control interval."""
-    found = controllers.controllers(TASKS[entrant.env]).get(entrant.name)
-    return entrant.kind == "classical" and found is not None and found.plans
+class Evaluation:
+    """The agents of an environment, and what was measured of them.
 
-
-def set_pace(agent: Any, job: Job) -> bool:
-    """Tell an agent that counts steps how much of one of its own steps passes; return whether it can take it.
-
-    Such an agent has an attribute `pace`: what its clock advances by at each `predict`.
-    """
-    interval = TASKS[job.entrant.env].interval
-    pace = job.condition.options.get("dt", interval) / interval
-    if hasattr(agent, "pace"):
-        agent.pace = pace
-        return True
-    return pace == 1.0 or not plans(job.entrant)
-
-
-def measure(job: Job, agent: Any, scale: NDArray, tick: Callable[[], Any]) -> NDArray[np.float64]:
-    """Return the returns of a policy under a condition, shape (episodes,).
+    Measurements are kept as soon as they are there, a line of JSON each; a damaged one is made again.
 
     Parameters
     ----------
-    job : Job
-        What to measure.
-    agent : object
-        The policy.
-    scale : ndarray, shape (n_observation,)
-        What noise is relative to.
-    tick : callable
-        Called at each step.
+    env_id : str
+        The environment.
+    runs : Path
+        Where learners' runs and the measurements lie.
+
+    Attributes
+    ----------
+    entrants : list of Entrant
+        The classical controllers, the optimal policy and the learners' runs, each agent's side by side.
+    absent, broken : list of str
+        Agents that are not there, and those with which something is wrong.
+    returns : dict of str to list of float
+        By the key of a `Job`.
+    noise : ndarray, shape (n_observation,)
+        What the observation's noise is relative to.
     """
-    sensor = Sensor(job.condition.noise * scale, job.condition.late)
 
-    def observe(observation: NDArray, start: NDArray[np.bool_]) -> NDArray:
-        tick()
-        return sensor(observation, start)
+    def __init__(self, env_id: str, runs: Path) -> None:
+        self.env = env_id
+        self.entrants: list[Entrant] = []
+        self.absent: list[str] = []
+        self.broken: list[str] = []
+        self._gather(runs)
+        self.file, self.returns = runs / "measurements" / f"{env_id}.jsonl", {}
+        for row in store.rows(self.file):
+            with suppress(ValueError, KeyError, TypeError):  # damaged
+                self.returns[row["key"]] = [float(x) for x in row["returns"]]
+        self.noise = observation_std(env_id, range(NOISE_SEED, NOISE_SEED + 100))
 
-    return evaluate_batch(
-        job.entrant.env, agent, FIRST_FRESH_SEED, job.episodes, observe=observe, **job.condition.options
-    )
+    def _gather(self, runs: Path) -> None:
+        task = TASKS[self.env]()
+        for name, found in controllers.controllers(task).items():
+            make = partial(controllers.build, task, name)
+            entrant = Entrant(self.env, name, "classical", make, digest(CONTROLLERS), plans=found.plans)
+            self.entrants.append(entrant)
+        if reason := no_optimum(self.env):
+            self.absent.append(f"optimal: {reason}")
+        else:
+            mark = digest("optimum.py", "value_iteration.py", OPTIMA / f"{self.env}.json")
+            self.entrants.append(Entrant(self.env, "optimal", "optimal", partial(_optimal, self.env), mark))
+        folders = [file.parent for file in runs.glob(f"{self.env}/*/seed*/{RESULT}")]
+        first: dict[str, Entrant] = {}
+        for folder in sorted(folders, key=lambda p: (p.parent.name, len(p.name), p.name)):
+            try:
+                entrant = learned(self.env, folder)
+                check_alike(entrant, first.setdefault(entrant.name, entrant))
+            except UserError as error:
+                self.broken.append(str(error))
+            else:
+                self.entrants.append(entrant)
+        if not first:
+            self.absent.append("learners: no finished run")
+
+    def jobs(self, names: Sequence[str] | None, episodes: int) -> list[Job]:
+        """Return what is measured of agents of some names; in fewer episodes of those that plan."""
+        few = min(episodes, PLANNED)
+        return [
+            Job(entrant, condition, few if entrant.plans and condition.name != NOMINAL else episodes)
+            for entrant in self.entrants
+            if names is None or entrant.name in names
+            for condition in conditions(self.env)
+        ]
+
+    def run(self, job: Job, agent: Any, tick: Callable[[Step], Any]) -> NDArray[np.float64]:
+        """Return an agent's returns under a condition, shape (episodes,); `tick` is called with each step."""
+        found = job.condition
+        sensor = Sensor(found.noise * self.noise, found.late)
+        return Rollout(self.env, agent, fresh_seeds(job.episodes), sensor, **found.options).run(tick)
+
+    def keep(self, job: Job, returns: NDArray) -> None:
+        """Keep a measurement."""
+        about = {"key": job.key, "agent": str(job.entrant), "condition": job.condition.name}
+        row = about | {"returns": rounded(returns.tolist())}
+        store.append(self.file, row)
+        self.returns[job.key] = row["returns"]
+
+    def measured(self, jobs: Iterable[Job]) -> Iterator[Data]:
+        """Yield for each agent what `summarise_env` takes, from those of the jobs that were done."""
+        order = [condition.name for condition in conditions(self.env)]
+        for name, group in groupby(jobs, key=lambda job: job.entrant.name):
+            entrants, policies = [], []
+            for entrant, own in groupby(group, key=lambda job: job.entrant):
+                found = {job.condition.name: self.returns[job.key] for job in own if job.key in self.returns}
+                if NOMINAL in found:
+                    entrants.append(entrant)
+                    policies.append(found)
+            if not policies:
+                continue
+            agent: Data = {"name": name, "kind": entrants[0].kind}
+            groups = {c: [found[c] for found in policies if c in found] for c in order}
+            agent["conditions"] = {c: returns for c, returns in groups.items() if returns}
+            if runs := [entrant.run for entrant in entrants if entrant.run is not None]:
+                told = {"seeds": "seed", "steps": "trained", "seconds": "wall_seconds", "curves": "curve"}
+                agent |= {many: [run[one] for run in runs] for many, one in told.items()}
+                agent["trained_on"] = sorted(set(map(_where, runs)))
+            yield agent
 
 
-def follow(
-    todo: Iterable[Job],
-    stores: dict[str, Store],
-    scales: dict[str, NDArray],
-    fields: dict[str, Field],
-) -> None:
+def _where(run: Data) -> str:
+    """Return where a run was trained."""
+    found = ", ".join(f"{name} {number}" for name, number in run.get("versions", {}).items())
+    return f"{run.get('machine', 'unknown machine')}: {found}"
+
+
+def measure(todo: Sequence[tuple[Evaluation, Job]]) -> None:
     """Measure, policy by policy, and show how far it is and what is left."""
     from tqdm import tqdm
 
-    groups: dict[str, list[Job]] = {}
-    for job in todo:
-        groups.setdefault(str(job.entrant), []).append(job)
-    total = sum(job.steps for jobs in groups.values() for job in jobs)
-    started = time.monotonic()
+    total, started = sum(job.steps for _, job in todo), time.monotonic()
     with tqdm(total=total, unit=" steps", unit_scale=True, disable=None, dynamic_ncols=True) as bar:
-        done = 0
-        for name, jobs in groups.items():
-            bar.set_description_str(name)
-            env_id, agent = jobs[0].entrant.env, None
-            said = ""
-            for job in jobs:
+        meter = Meter(total, lambda done, total: bar.update(done - bar.n))
+        for entrant, group in groupby(todo, key=lambda pair: pair[1].entrant):
+            bar.set_description_str(str(entrant))
+            agent, said = None, ""
+            for evaluation, job in group:
                 try:
                     # What draws random numbers begins anew, so that the order of measurements is all one.
                     if agent is None or hasattr(agent, "rng"):
-                        agent = job.entrant.make()
-                    if not set_pace(agent, job):
+                        agent = entrant.make()
+                    if not job.condition.suits(agent, entrant.plans):
                         continue
-                    returns = measure(job, agent, scales[env_id], bar.update)
+                    returns = evaluation.run(job, agent, meter)
                 except Exception as error:  # whatever an agent does; the others are measured all the same
                     first = f"{type(error).__name__}: {error}".splitlines()[0]
-                    fields[env_id].broken.append(f"{name}, {job.condition.name}: {first}")
+                    evaluation.broken.append(f"{entrant}, {job.condition.name}: {first}")
                 else:
-                    about = {"agent": name, "condition": job.condition.name}
-                    stores[env_id].add(job.key, about, returns)
+                    evaluation.keep(job, returns)
                     said = said or f"{job.condition.name} {returns.mean():.4g}"
-                done += job.steps
-                bar.update(done - bar.n)
+                finally:
+                    meter.close(job.steps)
             seconds = time.monotonic() - started
-            left = seconds * (total - done) / max(done, 1)
+            left = seconds * (total - meter.done) / max(meter.done, 1)
             if said:
-                bar.write(f"{name}: {said} ({seconds:.0f} s, {left:.0f} s left)")
+                bar.write(f"{entrant}: {said} ({seconds:.0f} s, {left:.0f} s left)")
                 sys.stdout.flush()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import math
 import signal
 import sys
 import time
@@ -17,12 +16,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.evaluate import evaluate_batch
-from agents.run import FIRST_FRESH_SEED, UserError, check_env
+from agents.run import FIRST_FRESH_SEED, UserError, check_env, fresh_seeds
 from agents.value_iteration import (
     CacheError,
     Grid,
@@ -33,8 +30,10 @@ from agents.value_iteration import (
 )
 from agents.value_iteration import ValueIteration as Programme
 from lag_envs import TASKS, __version__
-from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.envs.model import Model
+from lag_envs.evaluation import statistics
+from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
@@ -256,11 +255,8 @@ class Solution:
         return sum(w * self.value(times, p, targets) for w, p in zip(weights, outcomes, strict=True))
 
 
-class Optimal:
-    """The greedy policy of a computed value function, with Stable-Baselines3's `predict`.
-
-    It looks one step ahead with the exact model: over a set of actions, then over finer ones around the best.
-    Its state is the number of steps taken in each episode.
+class Optimal(LookAhead):
+    """The greedy policy of a computed value function.
 
     Parameters
     ----------
@@ -296,43 +292,15 @@ class Optimal:
             raise ValueError(
                 f"value iteration gives no policy for {env_id!r}, only for {', '.join(played())}"
             )
-        self.solution = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
-        self.read = ObservationDecoder(self.solution.task)
-        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
-        self.pace = 1.0
+        found = solution or Solution(env_id, level or solvable()[env_id].levels[-1], folder)
+        self.solution = found
+        super().__init__(found.task, self._value, found.programs[0].actions)
 
-    def predict(
-        self,
-        observation: ArrayLike,
-        state: Array | None = None,
-        episode_start: ArrayLike | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Array]:
-        """Return actions and the numbers of steps taken then, for one observation or a batch."""
-        observation = np.asarray(observation, np.float64)
-        single, batch = observation.ndim == 1, np.atleast_2d(observation)
-        n = len(batch)
-        taken = np.zeros(n) if state is None else np.broadcast_to(np.asarray(state, np.float64), n)
-        if episode_start is not None:
-            taken = np.where(np.broadcast_to(episode_start, n), 0.0, taken)
-        points, goals = self.read(batch)
-        targets = goals if self.solution.problem.targets else None
+    def _value(self, ends: Array, targets: Array, taken: Array) -> Array:
+        solution = self.solution
         # The margin is for a clock that has gone tenths of a step.
-        after = np.minimum((taken + 1e-6).astype(np.int64) + 1, self.solution.steps)
-        coarse = self.solution.programs[0].actions
-        action = self._best(points, np.tile(coarse, (n, 1)), targets, after)
-        around = action[:, None] + (coarse[1] - coarse[0]) * np.linspace(-1.0, 1.0, 17)
-        action = self._best(points, np.clip(around, -1.0, 1.0), targets, after).astype(np.float32)
-        return (action if single else action[:, None]), taken + self.pace
-
-    def _best(self, points: Array, actions: Array, targets: Array | None, after: Any) -> Array:
-        """Return the best of each row's actions."""
-        n, m = actions.shape
-        goals = None if targets is None else np.repeat(targets, m)
-        ends, rewards, ended = self.solution.step(np.repeat(points, m, axis=0), actions.ravel(), goals)
-        later = self.solution.expected(np.repeat(after, m), ends, goals)
-        gains = (rewards + np.where(ended, 0.0, later)).reshape(n, m)
-        return np.take_along_axis(actions, gains.argmax(axis=1)[:, None], axis=1)[:, 0]
+        after = np.minimum((taken + 1e-6).astype(np.int64) + 1, solution.steps)
+        return solution.expected(after, ends[:, solution.keep], targets if solution.problem.targets else None)
 
 
 # --- numbers ------------------------------------------------------------------------------------------------
@@ -340,31 +308,8 @@ class Optimal:
 
 def starts(env_id: str, episodes: int = EPISODES) -> tuple[Array, Array | None]:
     """Return states and targets at the start of the episodes that agents are compared on."""
-    envs = gym.make_vec(env_id, episodes)
-    envs.reset(seed=FIRST_FRESH_SEED)
-    found = envs.unwrapped.state, envs.unwrapped.target
-    envs.close()
-    return found
-
-
-def trajectory(env_id: str, agent: Any, seed: int = FIRST_FRESH_SEED) -> Array:
-    """Return the states of an episode, shape (steps + 1, n_state)."""
-    env = gym.make(env_id)
-    observation, _ = env.reset(seed=seed)
-    states, state, over = [env.unwrapped.state.copy()], None, False
-    while not over:
-        action, state = agent.predict(observation, state)
-        observation, _, terminated, truncated, _ = env.step(action)
-        states.append(env.unwrapped.state.copy())
-        over = terminated or truncated
-    env.close()
-    return np.array(states)
-
-
-def mean_and_interval(returns: Array) -> dict[str, Any]:
-    """Return the mean with its 95 % confidence interval."""
-    mean, half = float(returns.mean()), 1.96 * float(returns.std(ddof=1)) / math.sqrt(len(returns))
-    return {"mean": round(mean, 4), "interval": [round(mean - half, 4), round(mean + half, 4)]}
+    rollout = Rollout(env_id, None, fresh_seeds(episodes))
+    return rollout.state, rollout.target
 
 
 def proved_bound(env_id: str) -> tuple[float, str]:
@@ -436,7 +381,9 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     lower, started = None, time.process_time()
     if not relaxed:
         agent = Optimal(env_id, solution=solution)
-        lower = mean_and_interval(evaluate_batch(env_id, agent, FIRST_FRESH_SEED, EPISODES))
+        found = statistics.estimate([play(env_id, agent, fresh_seeds(EPISODES))])
+        low, high = (round(found[end], 4) for end in ("low", "high"))
+        lower = {"mean": round(found["mean"], 4), "interval": [low, high]}
     limit, error, order = extrapolated([grid["value"] for grid in grids])
     bound, why = proved_bound(env_id)
     broken = lower is not None and lower["mean"] > limit + error
@@ -539,7 +486,8 @@ def draw(env_id: str, folder: Path, file: Path, level: float) -> None:
                 plot.set_title(f"{name} = {axes[2][i]:.3g} {unit.strip('[]')}", fontsize=9)
         plots[0].set_ylabel(problem.axes[1].label)
         if not problem.options and len(axes) == 2:
-            states = trajectory(env_id, Optimal(env_id, solution=solution))[:, solution.keep]
+            played = record(Rollout(env_id, Optimal(env_id, solution=solution), fresh_seeds(1)))
+            states = played.states[:, 0, solution.keep]
             if problem.axes[0].periodic:
                 states[:, 0] = np.mod(states[:, 0], problem.axes[0].high)
                 jumps = np.abs(np.diff(states[:, 0])) > 0.5 * problem.axes[0].high

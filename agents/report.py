@@ -1,19 +1,18 @@
-"""What is shown of the agents' results: figures, and the page docs/agents.md."""
+"""The page docs/agents.md, and README's table of agents, from the summary of the agents' results."""
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from agents.analysis import LEVEL, NOMINAL, OFTEN, RESAMPLES, Data
+from agents.analysis import Data
 from lag_envs.benchmark import quartiles, short
+from lag_envs.evaluation.conditions import NOMINAL, OFTEN
+from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns
+from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured
 
@@ -22,203 +21,6 @@ ADAPTER = Path(__file__).with_name("results") / "adapter.json"
 OPTIMA = Path(__file__).with_name("results") / "optimum"
 BEHAVIOUR = Path(__file__).with_name("results") / "behaviour.json"
 DOCS = Path(__file__).parents[1] / "docs"
-
-# --- figures -----------------------------------------------------------------------------------------------
-
-#: Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = {"learned": "#0072B2", "classical": "#D55E00", "optimal": "#000000"}
-MARKS = {"learned": "o", "classical": "s", "optimal": "D"}
-LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-#: Scores below this are drawn at the edge, with their number.
-LOWEST = -0.1
-
-
-def figures(data: Data, folder: Path) -> list[Path]:
-    """Draw all figures into a folder and return their files."""
-    envs = data["envs"]
-    drawn = {"agents-scores.png": scores_figure(envs)}
-    if any(agent["kind"] == "learned" for env in envs.values() for agent in env["agents"].values()):
-        drawn["agents-steps.png"] = curves_figure(envs, "steps")
-        drawn["agents-seconds.png"] = curves_figure(envs, "seconds")
-        drawn["agents-improvement.png"] = improvement_figure(envs)
-    for env_id, env in envs.items():
-        drawn[f"agents-robustness-{env_id}.png"] = robustness_figure(env_id, env)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in drawn.items():
-        save(figure, folder / name)
-    return [folder / name for name in drawn]
-
-
-def save(figure: Any, file: Path) -> None:
-    """Write a figure as a PNG of few colours, which is a third as large."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    Image.open(buffer).convert("RGB").quantize(96).save(file, optimize=True)
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def _panels(envs: Mapping[str, Data], heights: Sequence[float] | None = None) -> tuple[Any, list[Any]]:
-    """Return a figure and a panel for each environment, two beside each other."""
-    rows = -(-len(envs) // 2)
-    tall = heights or [2.6] * len(envs)
-    ratios = [max(tall[2 * i : 2 * i + 2]) for i in range(rows)]
-    figure = _figure(10.0, sum(ratios) + 0.3)
-    axes = figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": ratios}).ravel()
-    for ax in axes[len(envs) :]:
-        ax.remove()
-    for ax, env_id in zip(axes, envs, strict=False):
-        ax.set_title(env_id, fontsize=10)
-        ax.tick_params(labelsize=8)
-    return figure, list(axes[: len(envs)])
-
-
-def _what(env: Data) -> str:
-    return "score" if env["known"] else "mean return"
-
-
-def scores_figure(envs: Mapping[str, Data]) -> Any:
-    """Draw each agent's result, and beside it that of acting ten times as often."""
-    figure, axes = _panels(envs, [0.9 + 0.3 * len(env["agents"]) for env in envs.values()])
-    for ax, env in zip(axes, envs.values(), strict=True):
-        lowest = LOWEST if env["known"] else _lowest(env["agents"])
-        shown = env["agents"].values()
-        for row, agent in enumerate(shown):
-            colour = COLOURS[agent["kind"]]
-            for name, shift, face in ((NOMINAL, -0.14, colour), (OFTEN, 0.14, "white")):
-                found = agent["conditions"].get(name)
-                if found is None:
-                    continue
-                value = max(found["value"], lowest)
-                if value > lowest:
-                    ends = [max(found["low"], lowest), found["high"]]
-                    ax.plot(ends, [row + shift] * 2, "-", color=colour, lw=1.2)
-                    ax.plot(value, row + shift, MARKS[agent["kind"]], color=colour, mfc=face, ms=5)
-                else:
-                    text = f"◂ {number(found['value'])}{'' if name == NOMINAL else ' (often)'}"
-                    ax.text(lowest, row + shift, text, va="center", fontsize=7, color=colour)
-        names = [brief(name, agent) for name, agent in env["agents"].items()]
-        ax.set_yticks(range(len(names)), names, fontsize=8)
-        ax.set_ylim(len(env["agents"]) - 0.5, -0.5)
-        ax.set_xlabel(_what(env), fontsize=8)
-        if lowest > -math.inf:
-            ax.set_xlim(left=lowest)
-        if env["known"]:
-            values = [
-                a["conditions"].get(c, {"value": 0.0})["value"] for a in shown for c in (NOMINAL, OFTEN)
-            ]
-            ax.set_xlim(lowest, max(1.02, *values) + 0.03)
-            ax.axvline(1.0, color="0.6", lw=0.8)
-        ax.grid(axis="x", color="0.9")
-    from matplotlib.lines import Line2D
-
-    keys = [Line2D([], [], ls="", marker=MARKS[k], color=c, label=k) for k, c in COLOURS.items()]
-    keys.append(Line2D([], [], ls="", marker="o", color="0.3", mfc="white", label="open: ten times as often"))
-    figure.legend(handles=keys, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    return figure
-
-
-def _lowest(agents: Mapping[str, Data]) -> float:
-    """Return the return below which agents are drawn at the edge."""
-    values = {name: agent["conditions"][NOMINAL]["value"] for name, agent in agents.items()}
-    low, high = values.get("random", -math.inf), max(values.values())
-    return low + LOWEST * (high - low) if low < high else -math.inf
-
-
-def curves_figure(envs: Mapping[str, Data], over: str) -> Any:
-    """Draw what learners reach over the steps, or the seconds, of training."""
-    shown = {i: e for i, e in envs.items() if any(a["kind"] == "learned" for a in e["agents"].values())}
-    names = sorted({n for e in shown.values() for n, a in e["agents"].items() if a["kind"] == "learned"})
-    figure, axes = _panels(shown)
-    for ax, env in zip(axes, shown.values(), strict=True):
-        for name in names:
-            curve = (env["agents"].get(name, {}).get("curves") or {}).get(over)
-            if curve is None:
-                continue
-            colour = LINES[names.index(name) % len(LINES)]
-            x = np.array(curve["x"]) / (1e3 if over == "steps" else 1.0)
-            ax.plot(x, curve["value"], color=colour, lw=1.5, ls=["-", "--", "-."][names.index(name) % 3])
-            if curve["low"] is not None:
-                ax.fill_between(x, curve["low"], curve["high"], color=colour, alpha=0.2, lw=0)
-        if env["known"]:
-            ax.set_ylim(LOWEST, 1.05)
-            ax.axhline(1.0, color="0.6", lw=0.8)
-        ax.set_xlabel("steps of the environment [thousands]" if over == "steps" else "time [s]", fontsize=8)
-        ax.set_ylabel(_what(env), fontsize=8)
-        ax.grid(color="0.9")
-    from matplotlib.lines import Line2D
-
-    keys = [
-        Line2D([], [], color=LINES[i % len(LINES)], ls=["-", "--", "-."][i % 3], label=name)
-        for i, name in enumerate(names)
-    ]
-    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), fontsize=8, frameon=False)
-    return figure
-
-
-def robustness_figure(env_id: str, env: Data) -> Any:
-    """Draw each agent's result under each condition, as a table with colours."""
-    agents = env["agents"]
-    most = max((agent["conditions"] for agent in agents.values()), key=len)
-    columns = list(dict.fromkeys([*most, *(c for agent in agents.values() for c in agent["conditions"])]))
-    values = np.array(
-        [[a["conditions"].get(c, {}).get("value", math.nan) for c in columns] for a in agents.values()]
-    )
-    if env["known"]:
-        low, high = 0.0, 1.0
-    else:
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    figure = _figure(1.6 + 0.52 * len(columns), 1.5 + 0.3 * len(agents))
-    ax = figure.subplots()
-    ax.set_facecolor("0.85")
-    ax.imshow(values, cmap="cividis", vmin=low, vmax=high, aspect="auto")
-    for (i, j), value in np.ndenumerate(values):
-        if not math.isnan(value):
-            bright = value > low + 0.55 * (high - low)
-            text = f"{value:.2f}" if abs(value) < 10.0 else f"{value:.0f}"
-            text = text.replace("-0.00", "0.00")
-            ax.text(j, i, text, ha="center", va="center", fontsize=7, color="black" if bright else "white")
-    ax.set_xticks(range(len(columns)), columns, rotation=45, ha="right", rotation_mode="anchor", fontsize=8)
-    ax.set_yticks(range(len(agents)), [brief(name, agent) for name, agent in agents.items()], fontsize=8)
-    ax.set_title(f"{env_id}: {_what(env)}", fontsize=10)
-    return figure
-
-
-def improvement_figure(envs: Mapping[str, Data]) -> Any:
-    """Draw how likely a run of one learner is to be better than another agent."""
-    shown = {env_id: env for env_id, env in envs.items() if env["improvement"]}
-    figure, axes = _panels(shown, [1.4 + 0.3 * len(env["improvement"]) for env in shown.values()])
-    for ax, env in zip(axes, shown.values(), strict=True):
-        rows, columns = list(env["improvement"]), list(env["agents"])
-        values = np.array(
-            [[env["improvement"][r].get(c, {}).get("value", math.nan) for c in columns] for r in rows]
-        )
-        ax.set_facecolor("0.85")
-        ax.imshow(values, cmap="cividis", vmin=0.0, vmax=1.0, aspect="auto")
-        for (i, j), value in np.ndenumerate(values):
-            if not math.isnan(value):
-                colour = "black" if value > 0.55 else "white"
-                ax.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
-        names = {name: brief(name, agent) for name, agent in env["agents"].items()}
-        ax.set_xticks(
-            range(len(columns)),
-            [names[name] for name in columns],
-            rotation=40,
-            ha="right",
-            rotation_mode="anchor",
-            fontsize=7,
-        )
-        ax.set_yticks(range(len(rows)), [names[name] for name in rows], fontsize=8)
-    figure.supylabel("probability that a run of this ...", fontsize=9)
-    figure.supxlabel("... is better than this", fontsize=9)
-    return figure
-
 
 # --- the page -----------------------------------------------------------------------------------------------
 
@@ -288,7 +90,7 @@ def summary(data: Data) -> str:
         )
     head = ["environment", "score 0", "score 1"]
     head += [f"best {kind} agent: score" for kind in ("classical", "learned")] + ["optimal policy: score"]
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _reading(data: Data) -> str:
@@ -346,7 +148,7 @@ def _env_table(env: Data, episodes: int) -> str:
                 f"{agent['seconds']:,.0f} s" if agent["kind"] == "learned" else "",
             ]
         )
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def labelled(name: str, agent: Data) -> str:
@@ -404,7 +206,7 @@ def _behaviour(env_id: str) -> list[str]:
     )
     if any(name.startswith("lost") for name in head):
         text += " *Lost* is what rewards lack to 1 per step."
-    return [text, table(head, rows)]
+    return [text, markdown_table(head, rows)]
 
 
 def _problems(env: Data) -> str:
@@ -429,7 +231,7 @@ def _learners_table(learners: Data, envs: Mapping[str, Data]) -> str:
         " algorithms**: look at what each had; compare only equal environments, seeds and steps."
     )
     head = ["learner", f"score ({100 * LEVEL:g} %)", "environments", "seeds of each", "steps of a seed"]
-    return text + "\n\n" + table(head, rows)
+    return text + "\n\n" + markdown_table(head, rows)
 
 
 def _span(values: Iterable[float]) -> str:
@@ -455,7 +257,7 @@ def _improvement_table(envs: Mapping[str, Data]) -> str:
     if not rows:
         return "All runs of the one are better than all of the other, in every case."
     text = f"Neither 0 nor 1, with {100 * LEVEL:g} % interval; two learners in the likelier order:"
-    return text + "\n\n" + table(["environment", "learner", "better than", "probability"], rows)
+    return text + "\n\n" + markdown_table(["environment", "learner", "better than", "probability"], rows)
 
 
 def _method(data: Data) -> str:
@@ -474,7 +276,7 @@ def _method(data: Data) -> str:
             "- *Noise*: Gaussian, drawn anew for each entry of the observation at each step, with a standard"
             " deviation of 1 % and 5 % of what the entry itself has over random actions (100 episodes).",
             "- *Late*: the agent sees the observation of the step before.",
-            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, SciPy's, strata being the"
+            f"- Intervals: percentile bootstrap with {RESAMPLES:,} samples, strata being the"
             " environments and elements the seeds, as in rliable (Agarwal et al., NeurIPS 2021), with whose"
             " functions tests compare ours. The probability of improvement compares runs: an agent that was"
             " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"
@@ -507,7 +309,7 @@ def _noise_table(envs: Mapping[str, Data]) -> str:
         for env_id, env in envs.items()
         if env.get("observation_std")
     ]
-    return table(["environment", "standard deviation of each entry under random actions"], rows)
+    return markdown_table(["environment", "standard deviation of each entry under random actions"], rows)
 
 
 def _about(data: Data) -> str:
@@ -565,14 +367,14 @@ def adapter() -> str:
     found = json.loads(ADAPTER.read_text(encoding="utf-8"))
     rows = []
     for row in found["rows"]:
-        ours, theirs = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
-        rows.append([row["kind"], str(row["num_envs"]), ours, theirs, f"{row['ratio'][1]:.1f}"])
+        adapter, dummy = (short(quartiles(row[name])[1]) for name in ("adapter", "dummy"))
+        rows.append([row["kind"], str(row["num_envs"]), adapter, dummy, f"{row['ratio'][1]:.1f}"])
     text = (
         f"`lag_envs.sb3.VecEnv` against Stable-Baselines3's `DummyVecEnv` over single ones: {found['env']},"
         f" steps a second on one core of {found['machine']['processor']}, {found['date']}; medians of"
         f" {found['rounds']} interleaved rounds (`python -m agents.bench`). Learning takes the most time."
     )
-    return text + "\n\n" + table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
+    return text + "\n\n" + markdown_table(["what", "environments", "adapter", "DummyVecEnv", "ratio"], rows)
 
 
 def _ends(interval: Sequence[float] | None) -> Data:
@@ -581,12 +383,6 @@ def _ends(interval: Sequence[float] | None) -> Data:
 
 def _image(file: str, text: str) -> str:
     return f"![{text}]({IMAGES}/{file})"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
 
 
 def number(value: float) -> str:

@@ -11,27 +11,22 @@ import errno
 import json
 import re
 import sys
-from collections.abc import Iterable, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Sequence
 from pathlib import Path
 
-from numpy.typing import NDArray
-
-from agents.analysis import NOMINAL, Data, compare, ranked, rounded, summarise_env, summarise_learners
-from agents.evaluate import observation_std
-from agents.measure import Entrant, Field, Job, Store, conditions, follow, gather, plans
-from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, terminable
+from agents.analysis import Data, compare, ranked, summarise_env, summarise_learners
+from agents.measure import Evaluation, Job, measure
+from agents.run import FIRST_FRESH_SEED, SCHEMA, UserError, check_env, reports_errors, terminable
 from lag_envs import TASKS, __version__
-from lag_envs.host import machine
+from lag_envs.evaluation.statistics import rounded
+from lag_envs.host import installed, machine
 from lag_envs.scores import known_returns
 from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
-#: Episodes under each condition; those of agents that take long, where something is changed; with --quick.
-EPISODES, PLANNED, QUICK = 1000, 200, 20
-#: Seed of the random actions from which the noise's size is taken.
-SCALE_SEED = 3_000_000_000
+#: Episodes under each condition, and with --quick.
+EPISODES, QUICK = 1000, 20
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
 
 EPILOG = f"""what it reads and writes:
@@ -67,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
+@reports_errors("agents.results")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, 1 where an agent failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
@@ -82,17 +78,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not args.new:
             load_summary(output)  # better now than when all is measured
         with terminable():
-            broken, parts = measure_all(envs, args.agents, args.runs, episodes)
+            found = measure_all(envs, args.agents, args.runs, episodes)
             # Only now: another command may have written it meanwhile.
-            data = summarise(*parts, usual, {} if args.new else load_summary(output))
+            data = summarise(found, usual, {} if args.new else load_summary(output))
             write(output / SUMMARY, to_json(data))
             show(data, output)
+        broken = [problem for evaluation, _ in found for problem in evaluation.broken]
         for problem in broken:
             print(f"left out: {problem}", file=sys.stderr)
         return 1 if broken else 0
-    except UserError as error:
-        print(f"agents.results: error: {error}", file=sys.stderr)
-        return 2
     except OSError as error:
         full = " (no space left)" if error.errno == errno.ENOSPC else ""
         print(f"agents.results: error: {error}{full}; what was measured before is kept", file=sys.stderr)
@@ -107,103 +101,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def measure_all(
     envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int
-) -> tuple[list[str], tuple]:
-    """Measure what has not been measured; return what is wrong, and what `summarise` begins with."""
+) -> list[tuple[Evaluation, list[Job]]]:
+    """Measure what has not been measured; return the environments with all that there is to measure."""
     if runs.exists() and not runs.is_dir():
         raise UserError(f"--runs must be a folder, {runs} is not")
-    fields = {env_id: gather(env_id, runs) for env_id in envs}
+    evaluations = [Evaluation(env_id, runs) for env_id in envs]
     if names is not None:
-        there = {entrant.name for found in fields.values() for entrant in found.entrants}
+        there = {entrant.name for evaluation in evaluations for entrant in evaluation.entrants}
         if unknown := sorted(set(names) - there):
             raise UserError(f"there is no agent {unknown[0]!r} here; there are {', '.join(sorted(there))}")
-    stores = {env_id: Store(runs / "measurements" / f"{env_id}.jsonl") for env_id in envs}
-    jobs = [
-        Job(entrant, condition, episodes if condition.name == NOMINAL else min(episodes, few))
-        for env_id, found in fields.items()
-        for entrant in found.entrants
-        if names is None or entrant.name in names
-        for few in [PLANNED if plans(entrant) else episodes]
-        for condition in conditions(env_id)
-    ]
-    todo = [job for job in jobs if job.key not in stores[job.entrant.env].returns]
+    found = [(evaluation, evaluation.jobs(names, episodes)) for evaluation in evaluations]
+    jobs = [(evaluation, job) for evaluation, own in found for job in own]
+    todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)
-    scales = {env_id: observation_std(env_id, SCALE_SEED) for env_id in envs}
-    follow(todo, stores, scales, fields)
-
-    broken = [problem for found in fields.values() for problem in found.broken]
-    return broken, (fields, jobs, stores, scales)
+    measure(todo)
+    return found
 
 
 # --- the summary --------------------------------------------------------------------------------------------
 
 
-def summarise(
-    fields: dict[str, Field],
-    jobs: Iterable[Job],
-    stores: dict[str, Store],
-    scales: dict[str, NDArray],
-    episodes: int,
-    old: Data,
-) -> Data:
+def summarise(found: Sequence[tuple[Evaluation, list[Job]]], episodes: int, old: Data) -> Data:
     """Return all that page and figures need; agents that were not measured now keep their old numbers."""
-    measured: dict[str, dict[str, Data]] = {env_id: {} for env_id in fields}
-    policies: dict[tuple[str, str], dict[int | None, dict[str, list[float]]]] = {}
-    entrants: dict[tuple[str, str, int | None], Entrant] = {}
-    for job in jobs:
-        e = job.entrant
-        returns = stores[e.env].returns.get(job.key)
-        if returns is not None:
-            entrants[e.env, e.name, e.seed] = e
-            policies.setdefault((e.env, e.name), {}).setdefault(e.seed, {})[job.condition.name] = returns
-    for (env_id, name), by_seed in policies.items():
-        by_seed = {seed: found for seed, found in by_seed.items() if NOMINAL in found}
-        if not by_seed:
-            continue
-        who = [entrants[env_id, name, seed] for seed in by_seed]
-        agent: Data = {"name": name, "kind": who[0].kind, "conditions": {}}
-        for condition in conditions(env_id):
-            groups = [found[condition.name] for found in by_seed.values() if condition.name in found]
-            if groups:
-                agent["conditions"][condition.name] = groups
-        if agent["kind"] == "learned":
-            results = [e.run or {} for e in who]
-            agent |= {
-                "seeds": [r["seed"] for r in results],
-                "steps": [r["trained"] for r in results],
-                "seconds": [r["wall_seconds"] for r in results],
-                "curves": [r["curve"] for r in results],
-            }
-            agent["trained_on"] = sorted({_where(r) for r in results})
-        measured[env_id][name] = agent
-
-    envs: dict[str, Data] = {}
-    for env_id in TASKS:
-        before = old.get("envs", {}).get(env_id)
-        if env_id not in fields:
-            if before is not None:
-                envs[env_id] = before
-            continue
-        scale = known_returns(env_id)
-        known = (scale.random, scale.best) if scale else None
-        found = rounded(summarise_env(measured[env_id].values(), known))
-        if before is not None and before["known"] == found["known"]:
-            found["agents"] = ranked(before["agents"] | found["agents"])
-            found["improvement"] = rounded(compare(found["agents"]))
-        elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
-            print(
-                f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr
-            )
-        if not found["agents"]:
-            continue
-        absent = [text for text in fields[env_id].absent if text.split(":")[0] not in found["agents"]]
-        if any(agent["kind"] == "learned" for agent in found["agents"].values()):
-            absent = [text for text in absent if not text.startswith("learners")]
-        names = TASKS[env_id]().observation
-        found["observation_std"] = rounded(dict(zip(names, scales[env_id].tolist(), strict=True)))
-        found["problems"] = absent
-        envs[env_id] = found
+    envs = dict(old.get("envs", {}))
+    for evaluation, jobs in found:
+        envs[evaluation.env] = summarise_evaluation(evaluation, jobs, envs.get(evaluation.env))
+    envs = {env_id: envs[env_id] for env_id in TASKS if env_id in envs and envs[env_id]["agents"]}
     if not envs:
-        reasons = [problem for found in fields.values() for problem in [*found.broken, *found.absent]]
+        reasons = [problem for evaluation, _ in found for problem in [*evaluation.broken, *evaluation.absent]]
         raise UserError("no agent could be measured" + "".join(f"\n  {reason}" for reason in reasons))
     return {
         "schema": SCHEMA,
@@ -211,26 +136,26 @@ def summarise(
         "first_seed": FIRST_FRESH_SEED,
         "episodes": episodes,
         "machine": machine(),
-        "versions": versions(),
+        "versions": {"lag_envs": __version__} | installed(PACKAGES),
         "envs": envs,
         "learners": rounded(summarise_learners(envs)),
     }
 
 
-def _where(result: Data) -> str:
-    """Return where a run was trained."""
-    found = ", ".join(f"{name} {number}" for name, number in result.get("versions", {}).items())
-    return f"{result.get('machine', 'unknown machine')}: {found}"
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of what took part."""
-    found = {"lag_envs": __version__}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
+def summarise_evaluation(evaluation: Evaluation, jobs: Sequence[Job], before: Data | None) -> Data:
+    """Return the summary of an environment, with what an earlier one has of other agents."""
+    env_id = evaluation.env
+    found = rounded(summarise_env(evaluation.measured(jobs), known_returns(env_id)))
+    if before is not None and before["known"] == found["known"]:
+        found["agents"] = ranked(before["agents"] | found["agents"])
+        found["improvement"] = rounded(compare(found["agents"]))
+    elif before is not None and (lost := sorted(set(before["agents"]) - set(found["agents"]))):
+        print(f"{env_id}: forgotten, as scores have another range now: {', '.join(lost)}", file=sys.stderr)
+    kinds = {agent["kind"] for agent in found["agents"].values()}
+    there = {*found["agents"], *(["learners"] if "learned" in kinds else [])}
+    names = TASKS[env_id]().observation
+    found["observation_std"] = rounded(dict(zip(names, evaluation.noise.tolist(), strict=True)))
+    found["problems"] = [text for text in evaluation.absent if text.split(":")[0] not in there]
     return found
 
 
@@ -258,7 +183,8 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 
 def show(data: Data, output: Path) -> int:
     """Write figures, page, and README's table."""
-    from agents.report import figures, page, summary
+    from agents.figures import figures
+    from agents.report import page, summary
     from lag_envs.generated import replaced
 
     files = figures(data, output / PICTURES)

@@ -10,10 +10,12 @@ from __future__ import annotations
 import json
 import pickle
 import signal
+import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,11 @@ SCHEMA = 1
 FIRST_FRESH_SEED = 1_000_000_000
 FIRST_TEST_SEED = 2_000_000_000
 CHECKPOINT, MODEL, NORMALISATION, RESULT = "checkpoint.pkl", "model.zip", "vecnormalize.pkl", "result.json"
+
+
+def fresh_seeds(episodes: int) -> range:
+    """Return the seeds of the first of the episodes on which agents are compared."""
+    return range(FIRST_FRESH_SEED, FIRST_FRESH_SEED + episodes)
 
 
 @dataclass
@@ -194,6 +201,23 @@ def check_name(kind: str, name: str, known: Iterable[str]) -> str:
     if name in known:
         return name
     raise UserError(f"there is no {kind} {name!r}; {hint(name, known)}")
+
+
+def reports_errors(program: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Let a command's function print a UserError, and return 2 then."""
+
+    def decorated(main: Callable[..., int]) -> Callable[..., int]:
+        @wraps(main)
+        def run(arguments: Sequence[str] | None = None) -> int:
+            try:
+                return main(arguments)
+            except UserError as error:
+                print(f"{program}: error: {error}", file=sys.stderr)
+                return 2
+
+        return run
+
+    return decorated
 
 
 @contextmanager

@@ -13,22 +13,21 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluate import evaluate_batch
 from agents.optimum import Optimal, played
 from agents.results import to_json
-from agents.run import UserError, check_env
+from agents.run import UserError, check_env, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
+from lag_envs.evaluation.rollout import Rollout, play
+from lag_envs.evaluation.statistics import mean_and_error, without_luck
 from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
@@ -42,6 +41,7 @@ FIRST_SEED, REFERENCE_SEED, BATCH = 4_000_000_000, 5_000_000_000, 65_536
 PLANNED, OPTIMAL = 1_000, 4_096
 
 
+@reports_errors("agents.scale")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
@@ -52,13 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
     )
     args = p.parse_args(arguments)
-    try:
-        envs = [check_env(name) for name in args.env] or list(TASKS)
-        if args.batches < 1:
-            raise UserError(f"--batches must be at least 1, got {args.batches}")
-    except UserError as error:
-        print(f"agents.scale: error: {error}", file=sys.stderr)
-        return 2
+    envs = [check_env(name) for name in args.env] or list(TASKS)
+    if args.batches < 1:
+        raise UserError(f"--batches must be at least 1, got {args.batches}")
     kept: dict[str, Any] = {}
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
@@ -115,7 +111,7 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
             agent = Optimal(env_id) if name == "optimal" else build(task, name)
-            returns = evaluate_batch(env_id, agent, FIRST_SEED, slow[name])
+            returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
             same = many(env_id, task.reference, batches) if task.reference else None
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
@@ -137,42 +133,13 @@ def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
     firsts = (first + k * BATCH for k in range(batches))
-    return np.concatenate([evaluate_batch(env_id, agent, first, BATCH) for first in firsts])
+    return np.concatenate([play(env_id, agent, range(first, first + BATCH)) for first in firsts])
 
 
 def optima(env_id: str, first: int) -> Array:
     """Return the largest returns of a batch of episodes."""
-    envs = gym.make_vec(env_id, BATCH)
-    envs.reset(seed=first)
-    bare: Any = envs.unwrapped
-    best = resolve(bare.task.optimum.place)(bare.task, *bare.state.T)
-    envs.close()
-    return best
-
-
-def without_luck(returns: Array, reference: Array | None) -> tuple[float, float]:
-    """Return mean and standard error of returns in the first of the episodes that a reference played.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> luck = np.random.default_rng(0).normal(size=10_000)
-    >>> mean, error = without_luck(5.0 + 2.0 * luck[:100], luck)
-    >>> abs(mean - 5.0) < 0.05, error < 0.03
-    (True, True)
-    """
-    if reference is None:
-        return mean_and_error(returns)
-    same = reference[: len(returns)]
-    slope = float(np.cov(returns, same)[0, 1] / same.var(ddof=1))
-    rest, its = mean_and_error(returns - slope * same)
-    mean, error = mean_and_error(reference)
-    return rest + slope * mean, math.hypot(its, slope * error)
-
-
-def mean_and_error(returns: Array) -> tuple[float, float]:
-    """Return the mean and its standard error."""
-    return float(returns.mean()), float(returns.std(ddof=1)) / math.sqrt(len(returns))
+    rollout = Rollout(env_id, None, range(first, first + BATCH))
+    return resolve(rollout.task.optimum.place)(rollout.task, *rollout.state.T)
 
 
 if __name__ == "__main__":

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 
 from scipy.optimize import differential_evolution
 
-from agents.evaluate import evaluate_batch
-from agents.run import UserError, check_env
+from agents.run import UserError, check_env, reports_errors
 from lag_envs.controllers import build
 from lag_envs.errors import hint
+from lag_envs.evaluation.rollout import play
 from lag_envs.tasks import TASKS
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
@@ -33,7 +33,7 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
 
     def loss(values: Sequence[float]) -> float:
         agent = build(task, name, **dict(zip(ranges, values, strict=True)))
-        return -float(evaluate_batch(env_id, agent, FIRST_TUNING_SEED, episodes).mean())
+        return -float(play(env_id, agent, range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)).mean())
 
     found = differential_evolution(
         loss, list(ranges.values()), maxiter=generations, popsize=12, seed=0, polish=False
@@ -41,30 +41,22 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
     return {n: float(f"{v:.3g}") for n, v in zip(ranges, found.x, strict=True)}, -float(found.fun)
 
 
+@reports_errors("agents.tune")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 for an environment that does not exist."""
+    """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.tune", description=__doc__)
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
     p.add_argument("--episodes", type=int, default=2000, help="episodes per trial (default %(default)s)")
     p.add_argument("--generations", type=int, default=15, help="default %(default)s")
     args = p.parse_args(arguments)
-    try:
-        check_env(args.env)
-    except UserError as error:
-        print(f"agents.tune: error: {error}", file=sys.stderr)
-        return 2
-    known = tunable(args.env)
+    known = tunable(check_env(args.env))
     if args.only not in (None, *known):
         there = hint(args.only, known, "" if known else "there is nothing to tune")
-        print(f"agents.tune: error: nothing of {args.only!r} can be tuned; {there}", file=sys.stderr)
-        return 2
+        raise UserError(f"nothing of {args.only!r} can be tuned; {there}")
     for name in ("episodes", "generations"):
         if getattr(args, name) < 1:
-            print(
-                f"agents.tune: error: --{name} must be at least 1, got {getattr(args, name)}", file=sys.stderr
-            )
-            return 2
+            raise UserError(f"--{name} must be at least 1, got {getattr(args, name)}")
     for name in known:
         if args.only in (None, name):
             numbers, mean = tune(args.env, name, args.episodes, args.generations)

@@ -17,7 +17,8 @@ from lag_envs.leaderboard import (
     ranking,  # noqa: F401, so that not every process imports SciPy
     submission,
 )
-from lag_envs.leaderboard.board import Board, finish
+from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.pending import finish
 
 #: What changes files. Each call is a moment to be killed at.
 CALLS = ("open", "write", "fsync", "ftruncate", "rename", "replace", "mkdir", "rmdir", "unlink", "close")

@@ -41,6 +41,21 @@ def actions(steps, *shape, seed=0):
     return np.select([temper == 0, temper == 1], [noise, swings], 2.0 * noise).astype(np.float32)
 
 
+def one_by_one(env_id, agent, seeds, **options):
+    """Return an agent's returns in single environments, one episode after the other."""
+    returns = []
+    with gym.make(env_id, **options) as env:
+        for seed in seeds:
+            observation, _ = env.reset(seed=seed)
+            memory, over, total, start = None, False, 0.0, np.ones(1, np.bool_)
+            while not over:
+                action, memory = agent.predict(observation, memory, start, deterministic=True)
+                observation, reward, terminated, truncated, _ = env.step(action)
+                total, over, start = total + reward, terminated or truncated, np.zeros(1, np.bool_)
+            returns.append(total)
+    return np.array(returns)
+
+
 def trace(env, given):
     """Return what the steps return, as bytes where arrays; after an episode comes the next."""
     out = []

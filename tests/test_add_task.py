@@ -17,16 +17,18 @@ from scipy.integrate import solve_ivp
 from toy_pendulum import Pendulum, Swing
 
 from agents import behaviour, results, scale, submit, train
-from agents.evaluate import evaluate_batch
 from agents.learners import load_policy
 from agents.report import page
 from lag_envs import TASKS, cli, register
 from lag_envs.controllers import controllers, make_controller
 from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.leaderboard import docs, protocol
 from lag_envs.leaderboard.audit import audit
-from lag_envs.leaderboard.board import Board, board_data, finish
+from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.site.build import build
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import load
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find, measured
@@ -93,7 +95,7 @@ def test_vector_is_single(task):
 
 def test_controllers(task):
     assert list(controllers(task)) == ["zero", "random", "springs"]
-    mean = {name: evaluate_batch(ID, make_controller(ID, name), 0, 50).mean() for name in controllers(task)}
+    mean = {name: play(ID, make_controller(ID, name), range(0, 50)).mean() for name in controllers(task)}
     assert mean["springs"] > max(mean["zero"], mean["random"]) + 20.0
     with gym.make(ID) as env:
         observation, _ = env.reset(seed=0)
@@ -129,7 +131,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     given = ["--output", str(runs), "--seeds", "2", "--steps", "4096"]
     assert train.main([str(file), *given]) == 0, capsys.readouterr()
     learned = sorted((runs / ID / "ppo").glob("seed*"))
-    assert len(learned) == 2 and -100.0 < evaluate_batch(ID, load_policy(learned[0]), 0, 5).mean() < 100.0
+    assert len(learned) == 2 and -100.0 < play(ID, load_policy(learned[0]), range(0, 5)).mean() < 100.0
 
     # Results, and the page of docs/agents.md.
     output = tmp_path / "output"
@@ -140,7 +142,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     assert set(data["envs"][ID]["agents"]) == {"zero", "random", "springs", "ppo"}
     text = (output / "docs" / "agents.md").read_text(encoding="utf-8")
     assert text == page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
-    found = behaviour.measures(behaviour.play(ID, make_controller(ID, "springs"), 20))
+    found = behaviour.measures(record(Rollout(ID, make_controller(ID, "springs"), range(20))))
     assert found["there after [s]"] < 1.5 and found["episodes without"] < 10
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.

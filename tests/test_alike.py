@@ -20,7 +20,8 @@ from test_submission import (
 
 from lag_envs.leaderboard import alike
 from lag_envs.leaderboard.alike import Likeness, check_twins
-from lag_envs.leaderboard.board import Board, Neighbours, others
+from lag_envs.leaderboard.board import Board, others
+from lag_envs.leaderboard.pending import Neighbours
 from lag_envs.leaderboard.ranking import policy_error
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.tasks import cylinder_in_cylinder, incline
@@ -271,7 +272,8 @@ def test_five_trainings_are_five(tmp_path, size):
 
 def test_on_a_board(tmp_path):
     """From adding to the ranking, with real submissions."""
-    from lag_envs.leaderboard.board import board_data, finish
+    from lag_envs.leaderboard.pending import finish
+    from lag_envs.leaderboard.standings import board_data
 
     board = Board(tmp_path / "board")
     policy = {"architecture": "linear"}

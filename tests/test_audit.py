@@ -15,8 +15,10 @@ from fake_submissions import ENV, write
 
 from lag_envs import cli
 from lag_envs.leaderboard import audit, log
-from lag_envs.leaderboard.board import Board, board_data, finish
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import BoardError
+from lag_envs.leaderboard.pending import finish
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]

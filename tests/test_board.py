@@ -17,11 +17,13 @@ from fake_submissions import ENV, write
 
 from lag_envs import scores
 from lag_envs.leaderboard import board as module
-from lag_envs.leaderboard import protocol, ranking, submission
-from lag_envs.leaderboard.board import Board, BoardError, board_data, closed, finish, id_of
+from lag_envs.leaderboard import protocol, ranking, standings, submission
+from lag_envs.leaderboard.board import Board, BoardError, closed, id_of
 from lag_envs.leaderboard.log import fold, parse
 from lag_envs.leaderboard.parallel import map_submissions, packed
+from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import Refused
 from lag_envs.leaderboard.verify import verify_folder
 from lag_envs.scores import known_returns, score
@@ -394,7 +396,7 @@ def test_the_board_of_an_environment_that_is_gone_is_still_shown(board, monkeypa
     other = add(board, env=pivoted_bar.SwingUpFree.id, nonce="2")
     before = board_data(board, "today")["environments"][0]
     tasks = {name: task for name, task in module.TASKS.items() if name != ENV}
-    for place in (module, ranking):
+    for place in (module, ranking, standings):
         monkeypatch.setattr(place, "TASKS", tasks)
     real = fake_submissions.about
 

@@ -9,7 +9,7 @@ import pytest
 from rollouts import SINGLE
 
 from agents import tune
-from agents.evaluate import evaluate, evaluate_batch
+from agents.run import fresh_seeds
 from lag_envs.controllers import (
     ILQR,
     PD,
@@ -21,8 +21,10 @@ from lag_envs.controllers import (
     make_controller,
 )  # fmt: skip
 from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
 from lag_envs.envs.model import Model
+from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.registration import make_task
@@ -52,7 +54,7 @@ def kept(env_id, name):
 
 @pytest.mark.parametrize(("env_id", "name"), [(env_id, name) for env_id, name, c in ALL if not c.plans])
 def test_controller_reaches(env_id, name):
-    returns = evaluate_batch(env_id, make_controller(env_id, name), SEED, 1000)
+    returns = play(env_id, make_controller(env_id, name), range(SEED, SEED + 1000))
     assert returns.mean() > kept(env_id, name)[0] - 0.1
 
 
@@ -63,8 +65,8 @@ def test_plan_reaches(env_id, name):
     n = 4 if env_id == FREE else 32
     quick = (name for name, found in TASKS[env_id].controllers.items() if not found.plans)
     start = max(quick, key=lambda name: kept(env_id, name)[0])
-    returns = evaluate_batch(env_id, make_controller(env_id, name), SEED, n)
-    before = evaluate_batch(env_id, make_controller(env_id, start), SEED, n)
+    returns = play(env_id, make_controller(env_id, name), range(SEED, SEED + n))
+    before = play(env_id, make_controller(env_id, start), range(SEED, SEED + n))
     mean, error = kept(env_id, name)
     assert returns.mean() > mean - 4.0 * error * math.sqrt(1000 / n)
     assert (returns > before - 0.01).all()
@@ -85,7 +87,7 @@ def test_plan_reaches(env_id, name):
 )
 def test_controller_takes_parameters_from_the_task(env_id, name, least, options):
     agent = make_controller(env_id, name, **options)
-    assert evaluate_batch(env_id, agent, SEED, 32, **options).mean() > least
+    assert play(env_id, agent, range(SEED, SEED + 32), **options).mean() > least
 
 
 # --- how they are asked ---
@@ -217,11 +219,11 @@ def test_tuning(capsys, monkeypatch):
     assert tune.tunable(BRAKE) and tune.tunable(BAR)
     used = []
 
-    def evaluated(env_id, agent, seed, episodes):
-        used.append(range(seed, seed + episodes))
+    def evaluated(env_id, agent, seeds):
+        used.append(seeds)
         return np.array([-((agent.action - 0.4) ** 2)])
 
-    monkeypatch.setattr(tune, "evaluate_batch", evaluated)
+    monkeypatch.setattr(tune, "play", evaluated)
     assert tune.main([BRAKE, "--only", "best constant", "--episodes", "5"]) == 0
     assert "best constant: {'action': 0.4}" in capsys.readouterr().out
     assert {(r.start, len(r)) for r in used} == {(3_000_000_000, 5)}
@@ -239,16 +241,10 @@ def controller():
 
 
 def test_controller_swings_up_and_holds(controller):
-    returns = evaluate_batch(BAR, controller, 1_000_000_000, 100)
+    returns = play(BAR, controller, fresh_seeds(100))
     assert returns[:20].mean() > 417.0  # what it is known to reach
     assert returns.min() > 410.0  # none needs one swing more, or falls
     assert score(BAR, returns.mean()) > 0.99
-
-
-def test_controller_acts_on_one_observation_as_on_a_batch(controller):
-    with gym.make(BAR) as env:
-        one = evaluate(env, controller, range(5, 8))
-    np.testing.assert_allclose(one, evaluate_batch(BAR, controller, 5, 3), rtol=1e-12)
 
 
 def test_controller_hands_over_with_hysteresis(controller):
@@ -285,5 +281,39 @@ def test_agents_without_knowledge():
     assert Constant(0.5).predict(np.zeros((3, 5)))[0].tolist() == [[0.5]] * 3
     first, second = (Random(1).predict(np.zeros((3, 5)))[0] for _ in range(2))
     assert first.shape == (3, 1) and (first == second).all() and len(set(first.ravel())) == 3
-    assert evaluate_batch(BAR, Constant(0.0), 0, 20).mean() == pytest.approx(0.0, abs=0.1)
-    assert evaluate_batch(BAR, Random(0), 0, 100).mean() == pytest.approx(known_returns(BAR).random, abs=3.0)
+    assert play(BAR, Constant(0.0), range(0, 20)).mean() == pytest.approx(0.0, abs=0.1)
+    assert play(BAR, Random(0), range(0, 100)).mean() == pytest.approx(known_returns(BAR).random, abs=3.0)
+
+
+# --- looking ahead ---
+
+
+def test_look_ahead_finds_the_best_action_of_a_step():
+    """Nearly what the best of a thousand actions gets, here with a best one in between."""
+    task, rng = make_task(SHELL), np.random.default_rng(0)
+
+    def value(states, targets, taken):
+        return -1e3 * (states[:, 1] - 0.02 * taken) ** 2
+
+    agent, model = LookAhead(task, value, np.linspace(-1.0, 1.0, 11)), Model(task)
+    states = rng.uniform(-0.1, 0.1, (40, len(task.scene.state_names)))
+    targets, taken = rng.uniform(-0.1, 0.1, 40), np.arange(40.0)
+
+    def gain(actions):
+        ends, rewards, _ = model(states, actions, targets)
+        return rewards + value(ends, targets, taken)
+
+    most = np.max([gain(np.full(40, action)) for action in np.linspace(-1.0, 1.0, 1001)], axis=0)
+    found = agent.act(states, targets, taken)
+    assert (np.abs(found) < 0.99).any() and (most - gain(found) < 0.01 * np.ptp(most)).all()
+
+
+def test_agents_count_the_steps_of_each_episode():
+    agent = LookAhead(make_task(FREE), lambda states, targets, taken: 0.0 * taken, np.linspace(-1.0, 1.0, 3))
+    seen = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.2]])
+    action, taken = agent.predict(seen)
+    assert action.shape == (2, 1) and action.dtype == np.float32 and taken.tolist() == [1.0, 1.0]
+    agent.pace = 0.1
+    _, taken = agent.predict(seen, taken, np.array([False, True]))
+    assert taken.tolist() == [1.1, 0.1]
+    assert agent.predict(seen[0], np.array([3.0]))[0].shape == (1,)

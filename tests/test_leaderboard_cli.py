@@ -19,10 +19,11 @@ import pytest
 from fake_submissions import ENV, write
 
 from lag_envs import cli
+from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.leaderboard import alike, audit, docs, protocol
-from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import STATES
-from lag_envs.leaderboard.ranking import LEVEL, RESAMPLES
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.tasks import incline
 
 ROOT = Path(__file__).parents[1]

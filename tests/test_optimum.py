@@ -15,15 +15,17 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from rollouts import one_by_one
 from scipy.optimize import brentq, minimize_scalar
 
 from agents import optimum
-from agents.evaluate import evaluate, evaluate_batch
 from agents.optimum import IMAGES, RESULTS, Optimal, Solution, extrapolated, grid, played, solvable
+from agents.run import fresh_seeds
 from agents.value_iteration import PROGRESS, VALUES, CacheError, Grid, ValueIteration, stretched
 from lag_envs.controllers import make_controller, optimal_return
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
+from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.leaderboard.protocol import first_seed
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
@@ -261,14 +263,13 @@ def brake():
 
 
 def test_brake_in_a_few_seconds(brake):
-    returns = evaluate_batch(incline.Brake.id, brake, 1_000_000_000, 500)
+    returns = play(incline.Brake.id, brake, fresh_seeds(500))
     assert returns.mean() > -1.78
 
 
 def test_agent_takes_one_observation_as_a_batch(brake):
-    with gym.make(incline.Brake.id) as env:
-        one = evaluate(env, brake, range(5, 8))
-    np.testing.assert_allclose(one, evaluate_batch(incline.Brake.id, brake, 5, 3), rtol=1e-12)
+    one = one_by_one(incline.Brake.id, brake, range(5, 8))
+    np.testing.assert_allclose(one, play(incline.Brake.id, brake, range(5, 8)), rtol=1e-12)
 
 
 def test_agent_counts_the_steps_of_each_episode(brake):
@@ -381,10 +382,9 @@ def test_killed_command_goes_on(tmp_path, number):
 @pytest.mark.slow
 def test_bar_is_up_in_two_seconds():
     agent = Optimal(pivoted_bar.SwingUpFree.id, level=2.0, folder=None)
-    states = optimum.trajectory(pivoted_bar.SwingUpFree.id, agent)
-    outside = ~agent.solution.task.goal_holds(states)
-    assert 1.5 < 0.02 * (np.flatnonzero(outside)[-1] + 1) < 2.5  # up for good
-    assert evaluate_batch(pivoted_bar.SwingUpFree.id, agent, 1_000_000_000, 100).mean() > 419.5
+    played = record(Rollout(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(1)))
+    assert 1.5 < played.settled()[0] < 2.5  # up for good
+    assert play(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(100)).mean() > 419.5
 
 
 # --- what is committed ---

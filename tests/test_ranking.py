@@ -1,50 +1,30 @@
-"""Statistics of the leaderboard: by hand, against rliable, and what intervals promise."""
+"""Ranks of the leaderboard: scores without luck, their intervals, places and the other columns."""
 
 import time
-import warnings
 
 import numpy as np
 import pytest
 
-from agents.evaluate import evaluate_batch
 from lag_envs.controllers import make_controller
+from lag_envs.evaluation.rollout import play
+from lag_envs.evaluation.statistics import RESAMPLES, THRESHOLDS, ends, iqm
 from lag_envs.leaderboard.protocol import Reference, reference
 from lag_envs.leaderboard.ranking import (
-    RESAMPLES,
-    THRESHOLDS,
     Scores,
     columns,
     compare,
     corrected,
-    ends,
-    improvement,
-    iqm,
-    median_time,
-    normalised,
-    optimality_gap,
     policy_error,
-    profile,
     ranked,
     redrawn,
     scored,
     slope,
-    wilson,
 )
 from lag_envs.scores import known_returns, score
 from lag_envs.tasks import TASKS, incline
 
 ENV = incline.Brake.id
 KNOWN = known_returns(ENV)
-
-
-def rliable(part):
-    """Return a part of rliable; all but its metrics do not import beside every pandas."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            return pytest.importorskip(f"rliable.{part}")
-        except TypeError as error:
-            pytest.skip(f"rliable.{part} does not import here: {error}")
 
 
 def returns(scores):
@@ -68,40 +48,7 @@ def policies(*means, episodes=4):
     return [[mean - 0.01, mean + 0.01] * (episodes // 2) for mean in means]
 
 
-# --- by hand ---
-
-
-def test_scale_is_that_of_the_scores():
-    assert normalised(KNOWN, [KNOWN.random, KNOWN.best]).tolist() == [0.0, 1.0]
-    assert normalised(KNOWN, returns([[0.5, 2.0]])) == pytest.approx(np.array([[0.5, 2.0]]))
-
-
-def test_interquartile_mean():
-    assert iqm([0.0, 1.0, 2.0, 3.0, 100.0]) == 2.0  # five seeds: the middle three
-    assert iqm([3.0]) == 3.0 and iqm([0.0, 6.0, 3.0]) == 3.0
-    np.testing.assert_array_equal(iqm([[0.0, 1.0, 2.0, 90.0], [4.0, 4.0, 4.0, 4.0]]), [1.5, 4.0])
-
-
-def test_optimality_gap_profile_and_times():
-    assert optimality_gap([0.5, 1.5, 0.9]) == pytest.approx(0.2)
-    shares = dict(zip(THRESHOLDS.round(3).tolist(), profile([[0.0, 0.5], [0.5, 1.0]]), strict=True))
-    # Above, not at: a score of 0.5 is not above 0.5.
-    assert (shares[-0.025], shares[0.0], shares[0.475], shares[0.5], shares[1.0]) == (
-        1.0,
-        0.75,
-        0.75,
-        0.25,
-        0,
-    )
-    assert median_time([3.0, None, 1.0]) == 3.0 and median_time([None, 1.0]) is None
-    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)  # as in any table
-    assert wilson(10, 10) == pytest.approx((10 / (10 + 1.959964**2), 1.0))
-
-
-def test_probability_of_improvement():
-    assert improvement([1.0, 3.0], [0.0, 1.0]) == 0.875  # three pairs of four, and a tie
-    assert improvement([[1.0, 2.0], [0.0, 0.0]], [[0.0, 1.5], [1.0, 1.0]]).tolist() == [0.75, 0.0]
-    assert improvement([2.0], [2.0]) == 0.5
+# --- samples ---
 
 
 def test_intervals_of_two_policies():
@@ -322,59 +269,11 @@ def test_references_are_controllers_that_are_known_and_help(env_id):
     known = known_returns(env_id)
     assert 0.9 < score(env_id, mean) <= 1.003 and episodes >= 65_536
     agent = make_controller(env_id, name)
-    few = evaluate_batch(env_id, agent, 10**10, 500)
+    few = play(env_id, agent, range(10**10, 10**10 + 500))
     assert abs(few.mean() - mean) < 5.0 * few.std() / len(few) ** 0.5  # not another controller's mean
     assert error == pytest.approx(few.std() / episodes**0.5, rel=0.25)
     if known.policy == name:
         assert known.best == pytest.approx(mean, abs=5.0 * error)
-
-
-# --- against rliable ---
-
-
-def test_point_estimates_are_those_of_rliable():
-    metrics = rliable("metrics")
-    rng = np.random.default_rng(6)
-    for n, m in ((5, 5), (10, 7), (20, 1)):
-        x, y = rng.normal(0.9, 0.2, (n, 30)), rng.normal(0.8, 0.2, (m, 30))
-        runs_x, runs_y = x.mean(axis=1)[:, None], y.mean(axis=1)[:, None]
-        assert iqm(x.mean(axis=1)) == pytest.approx(metrics.aggregate_iqm(runs_x), rel=1e-12)
-        assert optimality_gap(x.mean(axis=1)) == pytest.approx(
-            metrics.aggregate_optimality_gap(runs_x), rel=1e-12
-        )
-        expected = metrics.probability_of_improvement(runs_x, runs_y)
-        assert improvement(runs_x[:, 0], runs_y[:, 0]) == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning")  # of arch, which rliable calls
-def test_intervals_and_profile_are_those_of_rliable():
-    library, metrics = rliable("library"), rliable("metrics")
-    rng = np.random.default_rng(7)
-    x, y = rng.normal(0.9, 0.2, (10, 5)), rng.normal(0.85, 0.2, (8, 5))
-    runs_x, runs_y = x.mean(axis=1)[:, None], y.mean(axis=1)[:, None]
-    state = np.random.RandomState(0)
-
-    def theirs(data, statistic):
-        found = library.get_interval_estimates({"a": data}, statistic, reps=2000, random_state=state)
-        return found[1]["a"].ravel()
-
-    x, y = table(x), table(y)
-    assert ends(iqm(redrawn("x", x))) == pytest.approx(theirs(runs_x, metrics.aggregate_iqm), abs=0.01)
-    chance = compare(x, y, redrawn("x", x), redrawn("y", y))
-    expected = theirs((runs_x, runs_y), metrics.probability_of_improvement)
-    assert chance[1:] == pytest.approx(expected, abs=0.04)
-    shares, _ = library.create_performance_profile({"a": x.table.reshape(-1, 1)}, THRESHOLDS, reps=2)
-    np.testing.assert_allclose(profile(x.table), shares["a"])
-
-
-# --- what intervals promise, and the time it takes ---
-
-
-def test_intervals_cover_as_often_as_they_say():
-    rng = np.random.default_rng(8)
-    samples = rng.normal(0.5, 0.2, (80, 20))
-    found = [ends(iqm(redrawn(str(i), table(np.stack([s, s], axis=1))))) for i, s in enumerate(samples)]
-    assert 0.85 <= np.mean([low < 0.5 < high for low, high in found]) <= 1.0
 
 
 def test_a_full_board_is_ranked_in_seconds():

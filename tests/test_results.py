@@ -1,101 +1,28 @@
-"""What was measured of agents: statistics against known answers, the command, figures and page."""
+"""What was measured of agents: the summary, the command, figures and page."""
 
 import errno
 import json
 import re
-import warnings
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents import behaviour, measure, report, results
-from agents.analysis import (
-    NOMINAL,
-    OFTEN,
-    estimate,
-    improvement,
-    interval,
-    iqm,
-    iqm_of_all,
-    learning_curve,
-    level,
-    summarise_env,
-    summarise_learners,
-)
-from agents.evaluate import Sensor, evaluate, evaluate_batch, observation_std
-from agents.measure import Condition, Entrant, Job, conditions
+from agents import behaviour, figures, measure, report, results
+from agents.analysis import learning_curve, level, summarise_env, summarise_learners
+from agents.run import fresh_seeds
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
+from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition
+from lag_envs.evaluation.rollout import Episodes, Rollout, play, record
 from lag_envs.generated import replaced
+from lag_envs.scores import KnownReturns
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 ENV = incline.Brake.id
 
 
-def rliable_metrics():
-    """Return rliable's metrics; its other parts do not import beside every pandas."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return pytest.importorskip("rliable.metrics")
-
-
-# --- statistics ---
-
-
-def test_iqm_by_hand():
-    assert iqm([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 70.0]) == np.mean([2.0, 3.0, 4.0, 5.0])
-    assert iqm([1.0, 3.0]) == 2.0  # too few to leave any out
-    assert iqm_of_all([0.0, 5.0], [1.0, 3.0]) == 2.0
-    np.testing.assert_array_equal(iqm([[0.0, 1.0, 2.0, 90.0], [4.0, 4.0, 4.0, 4.0]], axis=1), [1.5, 4.0])
-
-
-def test_improvement_by_hand():
-    assert improvement([2.0, 2.0], [1.0]) == 1.0
-    assert improvement([1.0], [1.0, 2.0]) == 0.25
-    assert improvement([[1.0, 2.0], [0.0, 0.0]], [[0.0, 1.5], [1.0, 1.0]]).tolist() == [0.75, 0.0]
-
-
-def test_statistics_agree_with_rliable():
-    metrics = rliable_metrics()
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(size=(10, 3)), rng.normal(0.3, size=(10, 3))
-    assert iqm_of_all(*x.T) == pytest.approx(metrics.aggregate_iqm(x), rel=1e-12)
-    ours = np.mean([improvement(a, b) for a, b in zip(x.T, y.T, strict=True)])
-    assert ours == pytest.approx(metrics.probability_of_improvement(x, y), rel=1e-12)
-
-
-def test_interval_is_that_of_resampling_each_stratum():
-    # Two elements: their mean takes the lower, the upper or the middle with 1/4, 1/4, 1/2.
-    assert interval(iqm, [0.0, 1.0]) == [0.0, 1.0]
-    assert interval(iqm, [3.0, 3.0, 3.0]) == [3.0, 3.0]
-    assert interval(iqm, [3.0]) is None and interval(iqm_of_all, [1.0, 2.0], [3.0]) is None
-    # As rliable does it: rows of a matrix (runs, tasks) are drawn anew for each column by itself.
-    rng = np.random.default_rng(1)
-    scores = rng.normal([0.0, 1.0, 5.0], size=(8, 3))
-    drawn = [iqm_of_all(*(column[rng.integers(8, size=8)] for column in scores.T)) for _ in range(1500)]
-    expected = np.quantile(drawn, [0.025, 0.975])
-    np.testing.assert_allclose(interval(iqm_of_all, *scores.T), expected, atol=0.1)
-    assert interval(iqm_of_all, *scores.T) == interval(iqm_of_all, *scores.T)  # same numbers each time
-
-
-def test_interval_covers_as_often_as_it_says():
-    rng = np.random.default_rng(2)
-    ends = [interval(iqm, sample) for sample in rng.normal(size=(60, 20))]
-    assert 0.8 <= np.mean([low < 0.0 < high for low, high in ends]) <= 1.0
-
-
-def test_estimate_by_hand():
-    single = estimate([[1.0, 3.0, 1.0, 3.0]])
-    error = np.sqrt(4.0 / 3.0) / 2.0
-    assert single["value"] == single["mean"] == 2.0 and single["error"] == pytest.approx(error)
-    assert single["high"] - 2.0 == pytest.approx(1.96 * error) == 2.0 - single["low"]
-    several = estimate([[0.0, 2.0], [2.0, 4.0], [8.0, 8.0]])
-    assert several["each"] == [1.0, 3.0, 8.0] and several["mean"] == several["value"] == 4.0
-    assert several["error"] == pytest.approx(np.std([1.0, 3.0, 8.0], ddof=1) / np.sqrt(3.0))
-    assert several["low"] == 1.0 and several["high"] == 8.0
-    assert estimate([[5.0]])["error"] == 0.0
+# --- the summary ---
 
 
 def test_fewer_episodes_are_levelled():
@@ -138,13 +65,16 @@ def classical(name, value):
     return {"name": name, "kind": "classical", "conditions": {NOMINAL: returns, "late": returns}}
 
 
+SCALE = KnownReturns(0.0, 10.0, 0.1, "x")
+
+
 def invented():
     """Return a whole summary of invented results."""
     agents = [learner("ppo", 5), learner("sac+", 3, 0.8), learner("td3", 1), classical("a|b", 9.9)]
     envs = {
-        "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], (0.0, 10.0)),
+        "PivotedBar-v0": summarise_env([*agents, classical("zero", -30.0)], SCALE),
         pivoted_bar.Balance.id: summarise_env(agents[::2], None),
-        incline.Tilt.id: summarise_env([classical("zero", 1.0)], (0.0, 10.0)),
+        incline.Tilt.id: summarise_env([classical("zero", 1.0)], SCALE),
     }
     for env in envs.values():
         env |= {"observation_std": {"s": 0.5}, "problems": ["optimal: not computed"]}
@@ -175,72 +105,6 @@ def test_summary_of_an_environment():
     assert invented()["learners"]["ppo"]["envs"] == ["PivotedBar-v0"]  # the others have no score
 
 
-# --- measuring ---
-
-
-def test_sensor():
-    start, on = np.ones(2, np.bool_), np.array([False, True])
-    observations = [np.full((2, 3), float(i), np.float32) for i in range(3)]
-    late = Sensor(late=True)
-    assert late(observations[0], start).tolist() == [[0.0] * 3] * 2
-    assert late(observations[1], ~start).tolist() == [[0.0] * 3] * 2
-    # The second begins an episode: there is nothing from before.
-    assert late(observations[2], on).tolist() == [[1.0] * 3, [2.0] * 3]
-    noisy = Sensor(noise=[0.0, 1.0, 5.0])
-    seen = noisy(np.zeros((20_000, 3), np.float32), np.ones(20_000, np.bool_))
-    assert seen.dtype == np.float32
-    np.testing.assert_allclose(seen.std(axis=0), [0.0, 1.0, 5.0], rtol=0.02)
-    assert (noisy(np.zeros((20_000, 3), np.float32), start) != seen)[:, 1:].any()
-
-
-def test_what_an_agent_sees_in_a_batch():
-    """Noise and delay change what it sees, not what happens; without them nothing changes."""
-    agent = Constant(0.3)
-    plain = evaluate_batch(ENV, agent, 7, 3)
-    np.testing.assert_array_equal(evaluate_batch(ENV, agent, 7, 3, observe=Sensor(1.0, True)), plain)
-    with gym.make(ENV) as env:
-        np.testing.assert_allclose(evaluate(env, agent, range(7, 10)), plain, rtol=1e-12)
-
-
-def test_observation_std():
-    rng, seen = np.random.default_rng(5), []
-    with gym.make(ENV) as env:
-        seen.append(env.reset(seed=5)[0])
-        while True:
-            observation, _, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, 1).astype(np.float32))
-            if terminated or truncated:
-                break
-            seen.append(observation)
-    np.testing.assert_allclose(observation_std(ENV, 5, 1), np.std(seen, axis=0), rtol=1e-5)
-
-
-@pytest.mark.parametrize("env_id", TASKS)
-def test_conditions_make_environments(env_id):
-    found = {c.name: c for c in conditions(env_id)}
-    assert list(found)[:2] == [NOMINAL, OFTEN] and {"noise 1 %", "noise 5 %", "late"} <= set(found)
-    assert {"mass -20 %", "mass +20 %", "gravity -20 %", "gravity +20 %"} <= set(found)
-    tasks = {name: TASKS[env_id](**condition.options) for name, condition in found.items()}
-    assert tasks[OFTEN].dt == pytest.approx(tasks[NOMINAL].interval / 10.0)
-    assert tasks[OFTEN].limit == 10.0 * tasks[NOMINAL].steps
-    assert tasks["gravity +20 %"].scene.gravity == pytest.approx(1.2 * tasks[NOMINAL].scene.gravity)
-
-
-def test_agents_with_a_clock_are_told_its_pace():
-    class Clock:
-        pace = 1.0
-
-    entrant = Entrant(ENV, "clock", "classical", Clock, "")
-    usual, often = (Job(entrant, c, 1) for c in conditions(ENV)[:2])
-    assert often.steps == 10 * usual.steps
-    clock = Clock()
-    assert measure.set_pace(clock, often) and clock.pace == pytest.approx(0.1)
-    assert measure.set_pace(clock, usual) and clock.pace == 1.0
-    assert measure.set_pace(Constant(0.0), often)
-    plan = Entrant("PivotedBar-v0", "iLQR", "classical", Clock, "")
-    usual, often = (Job(plan, c, 1) for c in conditions("PivotedBar-v0")[:2])
-    assert measure.set_pace(Constant(0.0), usual) and not measure.set_pace(Constant(0.0), often)
-
-
 # --- the command ---
 
 
@@ -268,13 +132,12 @@ def command(monkeypatch, capsys, tmp_path):
         Condition("gravity +20 %", {"gravity": 11.8}),
         Condition("noise 5 %", noise=0.05),
     ]
-    for module in (measure, results):
-        monkeypatch.setattr(module, "conditions", lambda env_id: few)
+    monkeypatch.setattr(measure, "conditions", lambda env_id: few)
     monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
-    monkeypatch.setattr(report, "figures", lambda data, folder: [])  # another test draws
+    monkeypatch.setattr(figures, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
     monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
-    monkeypatch.setattr(results, "observation_std", lambda env_id, seed: np.array([0.5, 0.1]))
+    monkeypatch.setattr(measure, "observation_std", lambda env_id, seeds: np.array([0.5, 0.1]))
 
     def run(*arguments):
         folders = ["--runs", str(tmp_path / "runs"), "--output", str(tmp_path)]
@@ -295,7 +158,7 @@ def test_command_measures_and_resumes(command, tmp_path, monkeypatch):
     data = summary(tmp_path)
     agents = data["envs"][ENV]["agents"]
     assert set(agents) == {"ppo", "zero"} and agents["ppo"]["seeds"] == [0, 1, 10]
-    expected = [evaluate_batch(ENV, Constant(0.1 * k), 10**9, 4).mean() for k in (0, 1, 0)]
+    expected = [play(ENV, Constant(0.1 * k), fresh_seeds(4)).mean() for k in (0, 1, 0)]
     np.testing.assert_allclose(agents["ppo"]["conditions"][NOMINAL]["return"], np.mean(expected), rtol=1e-4)
     assert agents["zero"]["conditions"]["gravity +20 %"] != agents["zero"]["conditions"][NOMINAL]
     assert (tmp_path / results.PAGE).read_text() == report.page(data)
@@ -355,15 +218,15 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     ],
 )
 def test_command_that_is_broken_off(error, status, message, command, tmp_path, monkeypatch):
-    add = measure.Store.add
+    keep = measure.Evaluation.keep
 
     def stop(self, *arguments):
         if self.returns:
             raise error
-        add(self, *arguments)
+        keep(self, *arguments)
 
     with monkeypatch.context() as patched:
-        patched.setattr(measure.Store, "add", stop)
+        patched.setattr(measure.Evaluation, "keep", stop)
         found, output = command("--envs", ENV)
     assert found == status and message in output and not (tmp_path / results.SUMMARY).exists()
     found, output = command("--envs", ENV)
@@ -417,7 +280,7 @@ def assert_reproduced(env_id, name, policies):
     """Play the committed episodes again."""
     agents = summary(ROOT)["envs"][env_id]["agents"]
     stated = agents[name]["conditions"][NOMINAL]["return"]
-    found = np.mean([evaluate_batch(env_id, policy, 1_000_000_000, 1000).mean() for policy in policies])
+    found = np.mean([play(env_id, policy, fresh_seeds(1000)).mean() for policy in policies])
     assert found == pytest.approx(stated, rel=1e-4, abs=1e-6), name
 
 
@@ -453,7 +316,7 @@ def test_how_agents_act_is_what_is_committed():
 
 def test_how_agents_act_by_hand():
     """Constant brakes: nothing has to be learnt, and time and speed have closed forms."""
-    played = behaviour.play(ENV, Constant(1.0), 50)
+    played = record(Rollout(ENV, Constant(1.0), fresh_seeds(50)))
     measured = behaviour.measures(played)
     x, v = played.states[0].T
     rate = 6.0 * 2.0 / 3.0  # a solid cylinder of 1 kg
@@ -476,9 +339,9 @@ def test_arrival_by_hand():
     """One episode is there for good after the second step, one never."""
     task = pivoted_bar.SwingUpFree()
     angles = np.array([[0.0, 0.0], [np.pi, np.pi], [0.0, 0.0], [np.pi, 0.0], [np.pi - 0.1, 0.0]])
-    played = behaviour.Played(
-        task, np.stack([angles, 0.0 * angles], axis=-1), np.zeros((4, 2)), np.zeros(2),
-        np.array([4, 4]), np.array([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [0.75, 0.0]]),
+    played = Episodes(
+        task, np.empty((4, 2, 5)), np.stack([angles, 0.0 * angles], axis=-1), np.zeros((4, 2, 1)),
+        np.array([[0.0, 0.0], [0.5, 0.0], [0.25, 0.0], [0.75, 0.0]]), np.array([4, 4]), None,
     )  # fmt: skip
     assert played.settled().tolist() == [3 * task.dt, np.inf]
     found = behaviour.measures(played)

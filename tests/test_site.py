@@ -22,10 +22,11 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import sync_playwright
 from toy_pendulum import Swing
 
-from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.site import build as site
 from lag_envs.leaderboard.site.build import build, render
 from lag_envs.leaderboard.site.scenery import Scenery, picture
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Arrow, Circle, Frame, Line, Magnifier, Polygon

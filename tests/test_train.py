@@ -15,12 +15,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from rollouts import one_by_one
 
 from agents import learners, run, train
-from agents.evaluate import evaluate, evaluate_batch
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
 from agents.run import Run, UserError
 from lag_envs import cli
+from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import as_yaml
 from lag_envs.leaderboard.policies import bin_centres
 from lag_envs.tasks import TASKS, incline
@@ -123,10 +124,9 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
     assert not cut.path(run.CHECKPOINT).exists()
     # The policy that was written acts like the one that was evaluated, one by one and together.
     policy = load_policy(tmp_path / "cut")
-    returns = evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3)
+    returns = play(ENV, policy, run.fresh_seeds(3))
     assert returns.tolist() == first["evaluation"]["returns"]
-    with gym.make(ENV) as env:
-        one = evaluate(env, policy, [run.FIRST_FRESH_SEED])
+    one = one_by_one(ENV, policy, [run.FIRST_FRESH_SEED])
     np.testing.assert_allclose(one, returns[:1], rtol=1e-4)
 
 
@@ -136,9 +136,9 @@ def test_normalised_observations_belong_to_the_policy(tmp_path):
     policy = load_policy(tmp_path)
     assert policy.normalise is not None
     expected = json.loads(going.path(run.RESULT).read_text())["evaluation"]["returns"]
-    assert evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3).tolist() == expected
+    assert play(ENV, policy, run.fresh_seeds(3)).tolist() == expected
     policy.normalise = None
-    assert evaluate_batch(ENV, policy, run.FIRST_FRESH_SEED, 3).tolist() != expected
+    assert play(ENV, policy, run.fresh_seeds(3)).tolist() != expected
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
@@ -436,7 +436,7 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
     assert result["env"] == env_id and result["trained"] == 4096 and result["score"] is None
     assert ("use_sde" in result["hyperparameters"]) == (env_id != "OwnSwitched-v0")
     policy = load_policy(tmp_path / env_id / "ppo" / "seed0")
-    returns = evaluate_batch(env_id, policy, run.FIRST_FRESH_SEED, 100)
+    returns = play(env_id, policy, run.fresh_seeds(100))
     np.testing.assert_allclose(returns.mean(), result["mean_return"], rtol=1e-6)
     assert train.main(arguments) == 0  # finished before
 

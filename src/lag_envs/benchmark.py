@@ -22,7 +22,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,11 +34,11 @@ from numpy.typing import NDArray
 import lag_envs
 from lag_envs import benchmark_jacobians
 from lag_envs.benchmark_jacobians import jacobians
-from lag_envs.host import ONE_THREAD, machine
+from lag_envs.host import ONE_THREAD, installed, machine
 from lag_envs.own_files import registered
 from lag_envs.progress import progress
 from lag_envs.store import write
-from lag_envs.tables import columns
+from lag_envs.tables import columns, markdown_table
 from lag_envs.tasks import TASKS
 
 SIZES = (1, 64, 1024, 16384)
@@ -351,7 +350,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         "date": settings.date,
         "complete": complete,
         "machine": machine() | {"load_at_start": load},
-        "versions": versions(),
+        "versions": {"lag_envs": lag_envs.__version__} | installed(LIBRARIES),
         "settings": asdict(settings),
         "rows": results,
         "cold_start": {
@@ -555,17 +554,6 @@ def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of what takes part."""
-    found = {"lag_envs": lag_envs.__version__}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
 # --- printing ---
 
 
@@ -638,8 +626,6 @@ def markdown(report: dict[str, Any]) -> str:
 
     sizes = ["1 (`gym.make`)" if t.kind == "made" else f"{t.num_envs:,} at once" for t in TARGETS]
     lines = [
-        ["id", *sizes],
-        ["---"] * (1 + len(sizes)),
         *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in _ours(report)),
         ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
         ["*aim*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
@@ -649,7 +635,7 @@ def markdown(report: dict[str, Any]) -> str:
         "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
         f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
         f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
-        "\n".join("| " + " | ".join(line) + " |" for line in lines),
+        markdown_table(["id", *sizes], lines),
     ]
     exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
     if exact:

@@ -5,9 +5,36 @@ The numbers belong to a version of an environment: with ``-v1`` come new ones, a
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.tasks.measured import measured
+
+
+class Scale(Protocol):
+    """The mean returns that are scores 0 and 1."""
+
+    @property
+    def random(self) -> float:
+        """Of uniformly random actions."""
+
+    @property
+    def best(self) -> float:
+        """Of the best policy known."""
+
+
+def normalised(scale: Scale, returns: ArrayLike) -> NDArray[np.float64]:
+    """Return the scores of returns: 0 for the random policy's mean, 1 for that of the best policy known.
+
+    Examples
+    --------
+    >>> known = known_returns("PivotedBar-v0")
+    >>> normalised(known, [known.random, known.best]).tolist()
+    [0.0, 1.0]
+    """
+    return (np.asarray(returns, np.float64) - scale.random) / (scale.best - scale.random)
 
 
 class KnownReturns(NamedTuple):
@@ -67,7 +94,7 @@ def score(env_id: str, mean_return: float) -> float | None:
     1.0
     """
     known = known_returns(env_id)
-    return None if known is None else (mean_return - known.random) / (known.best - known.random)
+    return None if known is None else float(normalised(known, mean_return))
 
 
 def in_words(env_id: str, total: float, whole: bool = True) -> str:

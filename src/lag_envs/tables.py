@@ -1,9 +1,9 @@
-"""Tables in a terminal: the only printer of the commands, so that the core asks for no library for it."""
+"""The only printers of tables, in a terminal and in Markdown, so that the core asks for no library for it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -22,3 +22,17 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
         for line, cell in zip(lines, cells, strict=True):
             line.append(cell.rjust(width) if right else cell.ljust(width))
     return ["  ".join(line).rstrip() for line in lines]
+
+
+def markdown_table(head: Sequence[object], rows: Iterable[Sequence[object]]) -> str:
+    r"""Return a table in Markdown.
+
+    Examples
+    --------
+    >>> print(markdown_table(["name", "return"], [("a|b", 1)]))
+    | name | return |
+    | --- | --- |
+    | a\|b | 1 |
+    """
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)

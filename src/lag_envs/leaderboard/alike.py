@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lag_envs.evaluation.rollout import Episodes, PolicyError, Rollout, act, record
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import Policy
 from lag_envs.leaderboard.submission import Refused, Submission
-from lag_envs.leaderboard.verify import act, play
 
 Array = NDArray[Any]
 
@@ -57,12 +57,8 @@ class Track:
     ----------
     policy : Policy
         The policy.
-    observations : ndarray, shape (steps, episodes, n)
-        What it saw.
-    actions : ndarray, shape (steps, episodes, n_actions)
-        What it did.
-    running : ndarray of bool, shape (steps, episodes)
-        Which episodes had not ended.
+    played : Episodes
+        The episodes.
     returns : ndarray, shape (episodes,)
         What it got.
     quick : bool
@@ -70,36 +66,33 @@ class Track:
     """
 
     policy: Policy
-    observations: Array
-    actions: Array
-    running: Array
+    played: Episodes
     returns: Array
     quick: bool
 
     def asked(self, other: Track) -> float:
         """Return the mean square of how another's actions differ on this path, the largest where it fails."""
-        agent = other.policy.agent()
+        agent, seen, did = other.policy.agent(), self.played.observations, self.played.actions
         start = np.ones(len(self.returns), np.bool_)
         try:
             if other.quick:
                 return self._asked_at_once(agent)
-            shape = self.actions.shape[1:]
-            action, state = act(agent, self.observations[0], None, start, shape)
-            total = float(np.sum((action - self.actions[0]) ** 2))
-            for step in range(1, len(self.actions)):
-                action, state = act(agent, self.observations[step], state, np.zeros_like(start), shape)
-                off = np.where(self.running[step][:, None], action - self.actions[step], 0.0)
+            memory, total = None, 0.0
+            for observation, own, running in zip(seen, did, self.played.running, strict=True):
+                action, memory = act(agent, observation, memory, start, own.shape)
+                off = np.where(running[:, None], action - own, 0.0)
                 total += float(np.sum(off * off))
-        except Refused:
+                start = np.zeros_like(start)
+        except PolicyError:
             return FAR.actions**2
-        return total / float(self.running.sum()) / shape[1]
+        return total / float(self.played.steps.sum()) / did.shape[-1]
 
     def _asked_at_once(self, agent: Any) -> float:
-        where = np.flatnonzero(self.running.ravel())
+        where = np.flatnonzero(self.played.running.ravel())
         # Evenly over all times and episodes; which episodes these are follows from the nonce.
         where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
-        seen = self.observations.reshape(-1, self.observations.shape[-1])[where]
-        did = self.actions.reshape(-1, self.actions.shape[-1])[where]
+        arrays = self.played.observations, self.played.actions
+        seen, did = (array.reshape(-1, array.shape[-1])[where] for array in arrays)
         action, _ = act(agent, seen, None, np.ones(len(seen), np.bool_), did.shape)
         off = action.astype(np.float64) - did
         return float(np.mean(off * off))
@@ -108,31 +101,12 @@ class Track:
 def track(env_id: str, policy: Policy, nonce: str) -> Track:
     """Let a policy play the episodes that follow from a nonce; raise Refused where it fails."""
     first = protocol.first_seed(f"alike {env_id}", nonce, 0)
-    watched = _Watched(policy.agent())
-    returns = play(env_id, watched, range(first, first + EPISODES), watch=watched.watch)
-    seen, done = np.array(watched.seen), np.array(watched.done, np.float64)
-    return Track(policy, seen, done, np.array(watched.running), returns, watched.quick)
-
-
-class _Watched:
-    """An agent, and note of what it sees and does."""
-
-    def __init__(self, agent: Any) -> None:
-        self.agent, self.quick = agent, True
-        self.seen: list[Array] = []
-        self.done: list[Array] = []
-        self.running: list[Array] = []
-
-    def predict(self, observation: Any, state: Any, start: Any, deterministic: bool) -> tuple[Any, Any]:
-        action, state = self.agent.predict(observation, state, start, deterministic=deterministic)
-        self.quick &= state is None
-        self.seen.append(np.array(observation))
-        self.done.append(action.copy())
-        return action, state
-
-    def watch(self, bare: Any, action: Array, reward: Array, *ends: Array) -> None:
-        if len(action):
-            self.running.append(ends[-1].copy())
+    rollout = Rollout(env_id, policy.agent(), range(first, first + EPISODES))
+    try:
+        played = record(rollout)
+    except PolicyError as error:
+        raise Refused(str(error)) from error
+    return Track(policy, played, rollout.returns, rollout.memory is None)
 
 
 def distance(a: Track, b: Track, error: float) -> Distance:
@@ -192,13 +166,13 @@ class Likeness:
         error : float
             Standard error of a policy's mean return on their board.
         """
-        ours, theirs = self.tracks(newer), self.tracks(older)
+        those = self.tracks(older)
         nearest = [
             min(
-                (distance(a, b, error) if a and b else FAR for b in theirs),
+                (distance(a, b, error) if a and b else FAR for b in those),
                 key=lambda found: found.closeness,
             )
-            for a in ours
+            for a in self.tracks(newer)
         ]
         return sorted(nearest, key=lambda found: found.closeness)[(len(nearest) - 1) // 2]
 

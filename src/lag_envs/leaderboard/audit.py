@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import Field
 
 from lag_envs.leaderboard import protocol
-from lag_envs.leaderboard.board import Board, Neighbours, claimed, others, shown_episodes
+from lag_envs.leaderboard.board import Board, others
 from lag_envs.leaderboard.fields import Strict, checked, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.log import (
@@ -47,6 +47,7 @@ from lag_envs.leaderboard.log import (
     parse,
     read_log,
 )
+from lag_envs.leaderboard.pending import Neighbours, claimed, shown_episodes
 from lag_envs.leaderboard.results import apart, build, compare
 from lag_envs.store import write
 
@@ -220,9 +221,9 @@ def _submissions(board: Board, found: Cheap) -> Finding:
             finding.wrong.append(f"{where} is not what was added: {error}; {REMEDY}")
             continue
         if (digest := digest_of(files)) != entry.digest:
-            ours, theirs = entry.digest[:8], digest[:8]
             finding.wrong.append(
-                f"{where} is not what was added: its digest is {theirs}..., not {ours}...; {REMEDY}"
+                f"{where} is not what was added: its digest is {digest[:8]}..., not {entry.digest[:8]}...;"
+                f" {REMEDY}"
             )
             continue
         try:
@@ -337,7 +338,7 @@ def _history(board: Board, log: bytes) -> Finding:
     folder = board.folder
     try:
         listed = ["log", "--full-history", "--format=%H"]
-        ours = git(folder, *listed, "HEAD", "--", f"./{LOG}").decode().split()
+        local = git(folder, *listed, "HEAD", "--", f"./{LOG}").decode().split()
         tagged = git(folder, *listed, "HEAD", "--tags", "--", f"./{LOG}").decode().split()
         if not tagged:
             raise NoHistory("no commit holds the board")
@@ -345,7 +346,7 @@ def _history(board: Board, log: bytes) -> Finding:
         for commit in tagged:
             then = log_at(folder, commit)
             # A release may be later than what is checked out.
-            if log.startswith(then) or (commit not in ours and then.startswith(log)):
+            if log.startswith(then) or (commit not in local and then.startswith(log)):
                 continue
             if b'"prev"' not in then:
                 before += 1  # a board that was begun again, before there was a chain
@@ -505,6 +506,7 @@ def _load(board: Board, entry: Entry) -> Any:
 
 def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
     """Play some episodes of each policy again, which nobody can foresee, and those that were recorded."""
+    from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import replay
 
@@ -524,7 +526,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
                 chosen += [i for i in recorded.values() if i not in chosen]
             try:
                 again, episodes = replay(submission, dict(result), number, chosen)
-            except Refused as error:
+            except (PolicyError, Refused) as error:
                 odd.append(f"a policy that {error}")
                 continue
             played += len(chosen)
@@ -613,7 +615,7 @@ def _links(board: Board, found: Cheap) -> Iterator[str]:
 def _references(found: Cheap) -> Iterator[str]:
     """Yield what is stated of a reference's mean and is not what it gets."""
     from lag_envs.controllers import make_controller
-    from lag_envs.leaderboard.verify import play
+    from lag_envs.evaluation.rollout import play
 
     told = found.state.protocols.get(found.state.number)
     for env_id, reference in (told.references if told else {}).items():

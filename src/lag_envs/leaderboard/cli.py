@@ -11,8 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish
-from lag_envs.leaderboard.log import COMMIT
+from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.log import COMMIT, BoardError, Entry, State
+from lag_envs.leaderboard.pending import Check, finish
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.tables import columns
 
 #: How each action is called; the first line of each is its plainest use.
@@ -147,7 +149,7 @@ def _add(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.submission import Refused, load
 
     board = Board(args.board)
-    failed, ours = 0, []
+    failed, added = 0, []
     for folder in args.folders:
         try:
             entry = board.add(load(folder))
@@ -155,14 +157,14 @@ def _add(args: argparse.Namespace) -> int:
             failed += 1
             print(f"{plain(folder)}: refused: {error}", file=sys.stderr)
             continue
-        ours.append(entry.id)
+        added.append(entry.id)
         if entry.state != "pending":
             print(f"{entry.id}: is there already, {entry.state}")
     if args.nonce is not None:
         state = board.read()
         waiting = [e for e in state.waiting() if state.nonce(e) is None]
         # Where the same command was broken off before, the nonce is published already.
-        if any(not args.folders or e.id in ours for e in waiting):
+        if any(not args.folders or e.id in added for e in waiting):
             _publish(board, args.nonce, args.source)
     return 1 if _finish(board, args) + failed else 0
 

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from lag_envs.generated import replaced
-from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import boards
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.store import write
+from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
 #: Rows of each board that README shows.
@@ -51,7 +53,7 @@ def top(data: dict[str, Any]) -> str:
     if not rows:
         return "Nothing has been submitted yet."
     head = ("environment", "rank", "agent", "score (95 % interval)", "success", "acting 10 × as often")
-    return "\n".join(map(_row, [head, ["---"] * len(head), *rows]))
+    return markdown_table(head, rows)
 
 
 def _line(environment: str, row: dict[str, Any]) -> list[str]:
@@ -66,17 +68,13 @@ def goals() -> str:
     """Return a table of what counts as success."""
     texts = {env_id: TASKS[env_id].goal.text for env_id in boards()}
     rows = [(env_id, text[0].upper() + text[1:]) for env_id, text in texts.items()]
-    return "\n".join(map(_row, [("environment", "success and time"), ("---", "---"), *rows]))
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return markdown_table(("environment", "success and time"), rows)
 
 
 def _text(text: str) -> str:
     """Return text that means nothing but itself in Markdown and HTML."""
     escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return "".join("\\" + c if c in "\\`*_{}[]()#!|~" else c for c in " ".join(escaped.split()))
+    return "".join("\\" + c if c in "\\`*_{}[]()#!~" else c for c in " ".join(escaped.split()))
 
 
 if __name__ == "__main__":

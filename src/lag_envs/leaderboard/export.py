@@ -22,6 +22,7 @@ from lag_envs.errors import UserError
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.submission import Refused, Submission, write
+from lag_envs.tasks import TASKS
 
 #: Algorithms: where the class is, and the module that a model's file names for its policy.
 ALGORITHMS = {
@@ -234,7 +235,7 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     agent_centres = getattr(agent, "centres", None)
     envs = gym.make_vec(env_id, 64, autoreset_mode="SameStep")
     observation, _ = envs.reset(seed=0)
-    for _ in range(int(protocol.make_task(env_id).limit)):
+    for _ in range(int(TASKS[env_id]().limit)):
         seen.append(observation)
         action = act(observation)
         action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))
@@ -243,11 +244,11 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     path = rng.permutation(np.concatenate(seen))[:8192]
     far = np.abs(path).max(axis=0)
     both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
-    theirs, ours = act(both), agent.predict(both)[0]
-    off = np.abs(theirs.astype(np.float64) - ours).max(axis=1)
+    model_action, action = act(both), agent.predict(both)[0]
+    off = np.abs(model_action.astype(np.float64) - action).max(axis=1)
     if agent_centres is not None:
         worth = agent.outputs(both.astype(np.float64))
-        chosen = np.abs(agent_centres - theirs).argmin(axis=1)
+        chosen = np.abs(agent_centres - model_action).argmin(axis=1)
         lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
         off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
     return float(off.max()), len(both)

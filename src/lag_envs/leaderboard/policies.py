@@ -29,10 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, create_model, model_validator
 
+from lag_envs.controllers.basic import ObservationDecoder
+from lag_envs.controllers.lookahead import Clocked, LookAhead
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, shown
 from lag_envs.leaderboard.protocol import Refused
-from lag_envs.tasks import resolve
+from lag_envs.tasks import TASKS, resolve
+from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 #: Lengths of an array's axes; a name stands for any length of at least 2, the same wherever it occurs.
@@ -199,10 +202,10 @@ class MLP(Architecture):
     table = MLPTable
 
     def __init__(self, env_id: str, table: MLPTable) -> None:
-        wide = len(protocol.make_task(env_id).observation)
+        wide = len(TASKS[env_id]().observation)
         self.activation, self.bins, self.squash = table.activation, table.bins, table.squash
         self.mean_limit, self.normalise = table.mean_limit, table.normalise
-        self.controls = protocol.make_task(env_id).formulas.actions
+        self.controls = TASKS[env_id]().formulas.actions
         widths = [wide, *table.hidden, self.controls * (self.bins or 1)]
         self.arrays = {}
         for k, (rows, columns) in enumerate(zip(widths[1:], widths[:-1], strict=True)):
@@ -264,7 +267,7 @@ class Linear(Architecture):
     """
 
     def __init__(self, env_id: str, table: PolicyTable) -> None:
-        task = protocol.make_task(env_id)
+        task = TASKS[env_id]()
         wide, count = len(task.observation), task.formulas.actions
         self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
 
@@ -327,7 +330,7 @@ class Table(Architecture):
     table = GridTable
 
     def __init__(self, env_id: str, table: GridTable) -> None:
-        self.task = protocol.make_task(env_id)
+        self.task = TASKS[env_id]()
         if self.task.formulas.actions != 1 or self.task.formulas.targets > 1:
             raise Refused(f"{POLICY}: tables are for tasks with one control and at most one target")
         names = list(self.task.scene.state_names)
@@ -351,56 +354,36 @@ class Table(Architecture):
         self.arrays = {f"axis_{j}": (f"n{j}",) for j in range(len(self.axes))}
         self.arrays["table"] = tuple(f"n{j}" for j in range(len(self.axes)))
 
-    def agent(self, arrays: Mapping[str, Array]) -> _LookUp:
-        """Return what looks up."""
+    def agent(self, arrays: Mapping[str, Array]) -> Clocked:
+        """Return what acts by the numbers."""
         axes = [arrays[f"axis_{j}"] for j in range(len(self.axes))]
         for j, axis in enumerate(axes):
             if not (axis[1:] > axis[:-1]).all():
                 raise Refused(f"the nodes of axis_{j} must grow")
-        return _LookUp(self, axes, arrays["table"])
+        grid = _Grid(self, axes, arrays["table"])
+        if self.kind == "action":
+            return _LookUp(self.task, grid)
+        return LookAhead(self.task, grid.value, np.linspace(-1.0, 1.0, self.actions))
 
 
-class _LookUp:
-    """Acts by a table; its state is the number of steps taken."""
+class _Grid:
+    """Numbers over a grid."""
 
     def __init__(self, about: Table, axes: list[Array], values: Array) -> None:
-        from lag_envs.controllers.basic import ObservationDecoder
-        from lag_envs.envs.model import Model
-
-        self.about, self.axes = about, axes
+        self.about, self.axes, self.wrapped = about, axes, ObservationDecoder(about.task).wrapped
         self.strides = np.array([math.prod(values.shape[j + 1 :]) for j in range(values.ndim)])
         self.values = np.ascontiguousarray(values).reshape(-1)
-        self.read = ObservationDecoder(about.task)
-        self.model = Model(about.task) if about.kind == "value" else None
-        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
-        self.pace = 1.0
-        self.sign = 1.0 if getattr(about.task.scene, "control", None) == "damping" else -1.0
 
-    def predict(
-        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[NDArray[np.float32], Array]:
-        """Return the action for each observation, and the steps taken then."""
-        values = np.asarray(observation, np.float64)
-        batch = np.atleast_2d(values)
-        taken = np.zeros(len(batch)) if state is None else np.asarray(state, np.float64)
-        if episode_start is not None:
-            taken = np.where(np.broadcast_to(episode_start, len(batch)), 0.0, taken)
-        states, targets = self.read(batch)
-        with np.errstate(all="ignore"):
-            if self.model is None:
-                found, mirrored = self.look_up(states, targets, taken)
-                actions = np.where(mirrored, self.sign * found, found)
-            else:
-                actions = self._greedy(states, targets, taken)
-            actions = np.clip(actions, -1.0, 1.0)
-        return actions.astype(np.float32).reshape(*values.shape[:-1], 1), taken + self.pace
+    def value(self, states: Array, targets: Array, taken: Array) -> Array:
+        """Return the numbers (n,) where steps end that began with so many taken."""
+        return self.look_up(states, targets, taken + 1.0)[0]
 
     def look_up(self, states: Array, targets: Array, taken: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the table's numbers (n,), and where they are those of the mirror image."""
+        """Return the numbers (n,), and where they are those of the mirror image."""
         from lag_envs.leaderboard.kernels import interpolate
 
         time = taken * self.about.task.interval
-        if (angle := self.read.wrapped) is not None:
+        if (angle := self.wrapped) is not None:
             states = states.copy()
             states[:, angle] = np.remainder(states[:, angle] + math.pi, 2.0 * math.pi) - math.pi
         given = [*states.T, targets, time]
@@ -420,23 +403,19 @@ class _LookUp:
             places[:, j] = np.clip((x - axis[cell]) / (axis[cell + 1] - axis[cell]), 0.0, 1.0)
         return interpolate(self.values, self.strides, cells, places), mirrored
 
-    def _greedy(self, states: Array, targets: Array, taken: Array) -> Array:
-        coarse = np.linspace(-1.0, 1.0, self.about.actions)
-        best = self._best(states, targets, taken, np.tile(coarse, (len(states), 1)))
-        around = best[:, None] + (coarse[1] - coarse[0]) * np.linspace(-1.0, 1.0, 17)
-        return self._best(states, targets, taken, np.clip(around, -1.0, 1.0))
 
-    def _best(self, states: Array, targets: Array, taken: Array, actions: Array) -> Array:
-        assert self.model is not None
-        n, m = actions.shape
-        goals = np.repeat(targets, m)
-        wants = self.about.task.target_range is not None
-        ends, rewards, ended = self.model(
-            np.repeat(states, m, axis=0), actions.ravel(), goals if wants else None
-        )
-        later = self.look_up(ends, goals, np.repeat(taken, m) + 1.0)[0]
-        gains = (rewards + np.where(ended, 0.0, later)).reshape(n, m)
-        return np.take_along_axis(actions, gains.argmax(axis=1)[:, None], axis=1)[:, 0]
+class _LookUp(Clocked):
+    """Reads actions off a grid."""
+
+    def __init__(self, task: Task, grid: _Grid) -> None:
+        super().__init__(task)
+        self.grid = grid
+        # A control that is zero at an end of its range, such as a drag, has no sign.
+        self.sign = 1.0 if abs(task.rest_action) == 1.0 else -1.0
+
+    def act(self, states: Array, targets: Array, taken: Array) -> Array:
+        found, mirrored = self.grid.look_up(states, targets, taken)
+        return np.where(mirrored, self.sign * found, found)
 
 
 # --- controllers --------------------------------------------------------------------------------------------
@@ -465,7 +444,7 @@ class Controller(Architecture):
     def __init__(self, env_id: str, table: ControllerTable) -> None:
         from lag_envs.controllers import build, controllers
 
-        self.task = protocol.make_task(env_id)
+        self.task = TASKS[env_id]()
         known = controllers(self.task)
         if table.name not in known:
             raise Refused(f"{POLICY}: name must be one of {', '.join(known)}, got {shown(table.name)}")

@@ -1,4 +1,4 @@
-"""What a score on the leaderboard means: episodes, seeds, success, disturbances, and limits of a submission.
+"""What a score on the leaderboard means: how many episodes, seeds, the reference, and limits of a submission.
 
 A board freezes this, with the scale, when a protocol begins (`rules`); where something of it changes, the
 board has to begin the next one.
@@ -6,13 +6,10 @@ board has to begin the next one.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import math
 from typing import Any, NamedTuple
 
 from lag_envs.tasks import TASKS
-from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
 
 #: Version of ``submission.toml``.
@@ -105,30 +102,6 @@ def reference(env_id: str) -> Reference | None:
 def boards() -> list[str]:
     """Return the ids that have a board: those whose task has a goal."""
     return [env_id for env_id, task in TASKS.items() if task.goal is not None]
-
-
-# --- disturbances -------------------------------------------------------------------------------------------
-
-
-def make_task(env_id: str, **options: Any) -> Task:
-    """Return the task of an environment, with parameters that differ from its own."""
-    return TASKS[env_id](**options)
-
-
-def often(env_id: str) -> dict[str, Any]:
-    """Return the environment's arguments for acting ten times as often; a second is worth the same."""
-    return {"dt": make_task(env_id).interval / 10.0}
-
-
-def disturbances(env_id: str) -> dict[str, dict[str, Any]]:
-    """Return the environment's arguments for each of its numbers off by 20 %; policies don't know of it."""
-    scene, found = make_task(env_id).scene, {}
-    for parameter in dataclasses.fields(scene):
-        value = getattr(scene, parameter.name)
-        if isinstance(value, float) and 0.0 < value < math.inf:
-            for share, sign in ((0.8, "-"), (1.2, "+")):
-                found[f"{parameter.name} {sign}20 %"] = {parameter.name: share * value}
-    return found
 
 
 # --- what a board freezes -----------------------------------------------------------------------------------

@@ -31,30 +31,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.stats import binomtest, trim_mean
+from numpy.typing import NDArray
 
-from lag_envs.leaderboard.protocol import make_task
+from lag_envs.evaluation.statistics import (
+    RESAMPLES,
+    THRESHOLDS,
+    ends,
+    improvement,
+    iqm,
+    luck_slope,
+    median_time,
+    optimality_gap,
+    profile,
+    redraw,
+    wilson,
+)
+from lag_envs.scores import Scale, normalised
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
-
-#: Bootstrap samples, and how likely an interval is to cover.
-RESAMPLES, LEVEL = 2000, 0.95
-#: Scores at which performance profiles are given.
-THRESHOLDS: Array = np.linspace(-0.25, 1.25, 61)
-
-
-class Scale(Protocol):
-    """The mean returns that are scores 0 and 1."""
-
-    @property
-    def random(self) -> float:
-        """Of uniformly random actions."""
-
-    @property
-    def best(self) -> float:
-        """Of the best policy known."""
 
 
 class Reference(Protocol):
@@ -100,28 +95,11 @@ class Place(NamedTuple):
     above: Chance | None
 
 
-def normalised(scale: Scale, returns: ArrayLike) -> Array:
-    """Return the scores of returns: 0 for the random policy's mean, 1 for that of the best policy known.
-
-    Examples
-    --------
-    >>> from lag_envs.scores import known_returns
-    >>> known = known_returns("PivotedBar-v0")
-    >>> normalised(known, [known.random, known.best]).tolist()
-    [0.0, 1.0]
-    """
-    return (np.asarray(returns, np.float64) - scale.random) / (scale.best - scale.random)
-
-
 def slope(policies: Sequence[Mapping[str, Any]]) -> float:
     """Return by how much policies' returns go with the reference's in the same episodes; 0 without one."""
     if any(p.get("reference") is None for p in policies):
         return 0.0
-    luck = np.array([p["reference"] for p in policies], np.float64)
-    apart = luck - luck.mean(axis=1, keepdims=True)
-    spread = np.sum(apart * apart)
-    returns = np.array([p["returns"] for p in policies], np.float64)
-    return float(np.sum(apart * returns) / spread) if spread > 0.0 else 0.0
+    return luck_slope([p["returns"] for p in policies], [p["reference"] for p in policies])
 
 
 def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Array:
@@ -181,60 +159,6 @@ def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, An
     return float(np.hypot(table.std(axis=1).mean() / np.sqrt(table.shape[1]), error))
 
 
-def iqm(values: ArrayLike, axis: int | None = -1) -> Any:
-    """Return the interquartile mean: of the values without the lowest and the highest quarter.
-
-    Of five values that is the mean of the middle three, of fewer than four the mean of all.
-
-    Examples
-    --------
-    >>> float(iqm([0.0, 1.0, 2.0, 3.0, 100.0]))
-    2.0
-    """
-    return trim_mean(values, 0.25, axis=axis)
-
-
-def optimality_gap(means: ArrayLike) -> float:
-    """Return how much policies lack to a score of 1 on average; what is above 1 makes up for nothing.
-
-    Examples
-    --------
-    >>> optimality_gap([0.5, 1.5])
-    0.25
-    """
-    return float(1.0 - np.minimum(means, 1.0).mean())
-
-
-def profile(scores: ArrayLike) -> Array:
-    """Return the share of all episodes whose score is above each of the `THRESHOLDS`."""
-    ordered = np.sort(np.ravel(scores))
-    return 1.0 - np.searchsorted(ordered, THRESHOLDS, side="right") / ordered.size
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return Wilson's interval of a probability, of 95 %; every trial counts as independent.
-
-    Examples
-    --------
-    >>> [round(end, 3) for end in wilson(0, 10)]
-    [0.0, 0.278]
-    """
-    ends = binomtest(successes, trials).proportion_ci(LEVEL, method="wilson")
-    return float(ends.low), float(ends.high)
-
-
-def median_time(times: Sequence[float | None]) -> float | None:
-    """Return the median of times, None standing for never; None where half or more are never.
-
-    Examples
-    --------
-    >>> median_time([1.0, None, 2.0]), median_time([1.0, None])
-    (2.0, None)
-    """
-    found = float(np.median([np.inf if time is None else time for time in times]))
-    return found if np.isfinite(found) else None
-
-
 def redrawn(id: str, scores: Scores) -> Array:
     """Return bootstrap samples of the policies' means, shape (RESAMPLES, policies).
 
@@ -248,33 +172,10 @@ def redrawn(id: str, scores: Scores) -> Array:
     rng = np.random.default_rng(int.from_bytes(hashlib.sha256(id.encode()).digest()[:16], "big"))
     table = scores.table
     sample = table.mean(axis=1) if len(table) > 1 else table[0]
-    drawn = sample[rng.integers(sample.size, size=(RESAMPLES, sample.size))]
+    drawn = redraw(rng, sample)
     drawn = drawn if len(table) > 1 else drawn.mean(axis=1, keepdims=True)
     # In every row's k-th sample the reference's mean is off by the same.
     return drawn + scores.error * np.random.default_rng(0).normal(size=(RESAMPLES, 1))
-
-
-def ends(samples: ArrayLike) -> tuple[float, float]:
-    """Return the ends of the interval that bootstrap samples of a number give."""
-    low, high = np.quantile(np.asarray(samples), [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
-    return float(low), float(high)
-
-
-def improvement(x: ArrayLike, y: ArrayLike) -> Any:
-    """Return the probability that one of the elements of x is above one of y; equal ones count half.
-
-    Parameters
-    ----------
-    x, y : array_like, shapes (..., n) and (..., m)
-        Means of policies.
-
-    Examples
-    --------
-    >>> float(improvement([1.0, 3.0], [0.0, 1.0]))
-    0.875
-    """
-    a, b = np.asarray(x)[..., :, None], np.asarray(y)[..., None, :]
-    return 0.5 * ((a > b).mean(axis=(-2, -1)) + (a >= b).mean(axis=(-2, -1)))
 
 
 def compare(x: Scores, y: Scores, x_drawn: Array, y_drawn: Array) -> Chance:
@@ -355,7 +256,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
     robustness = {name: _score(scale, each, moved) for name, each in (result.get("robustness") or {}).items()}
     # Where there are kicks, they are others when acting often.
-    often = 0.0 * moved if env_id in TASKS and make_task(env_id).draws else moved
+    often = 0.0 * moved if env_id in TASKS and TASKS[env_id]().draws else moved
     return {
         "score": float(iqm(means)),
         "return": scale.random + float(means.mean()) * (scale.best - scale.random),

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import itertools
 import json
-import math
 import platform
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,6 +18,9 @@ from numpy.typing import NDArray
 
 from lag_envs import __version__
 from lag_envs.errors import UserError
+from lag_envs.evaluation.conditions import OFTEN, Condition, disturbances, often
+from lag_envs.evaluation.rollout import Meter, Outcome, PolicyError, Rollout, play, record
+from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import plain
 from lag_envs.leaderboard.files import read_plain
@@ -31,8 +32,6 @@ from lag_envs.tasks import TASKS
 Array = NDArray[np.float64]
 #: Libraries on which the bits of a trajectory depend.
 PACKAGES = ("gymnasium", "numpy", "numba", "llvmlite", "scipy", "safetensors")
-#: Given at each step: controls, actions, rewards, terminations, truncations, and which episodes still run.
-Watch = Callable[[Any, Array, Array, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]], Any]
 
 
 def verify(
@@ -75,60 +74,47 @@ def verify(
         raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
     started, busy = time.perf_counter(), time.process_time()
     env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
-    conditions = protocol.disturbances(env)
-    faster = protocol.often(env)
-    limit = int(protocol.make_task(env).limit)
     # Kicks are others when acting often, and it takes as many episodes again until they make no difference.
-    more = episodes if protocol.make_task(env).draws else few
-    runs = [limit * episodes, *[limit * few] * len(conditions), 10 * limit * more]
-    work = sum(runs) * len(submission.policies)
-    done, through = 0, 0
+    runs = [(condition, few) for condition in disturbances(env)]
+    runs.append((often(env), episodes if TASKS[env]().draws else few))
+    nominal, *sizes = (condition.steps(env) * count for condition, count in [(Condition(), episodes), *runs])
 
-    def tick(n: int) -> None:
-        nonlocal done
-        done += n
+    def show(done: int, work: int) -> None:
         if time.process_time() - busy > protocol.CPU_SECONDS:
             raise Refused(f"verifying it takes more than {protocol.CPU_SECONDS:g} s of CPU time")
         if progress is not None:
             progress(done, work)
 
-    def skip() -> None:
-        """Count a run that ended early, or was left out, as run to its end."""
-        nonlocal through
-        through += runs[next(order)]
-        tick(through - done)
-
+    meter = Meter((nominal + sum(sizes)) * len(submission.policies), show)
     policies: list[dict[str, Any]] = []
-    robustness: dict[str, list[float]] = {name: [] for name in conditions}
-    often: list[float | None] = []
+    means: dict[str, list[float | None]] = {condition.name: [] for condition, _ in runs}
     for number, (seed, policy) in enumerate(submission.policies):
-        order = itertools.count()
         first = protocol.first_seed(submission.digest, nonce, number)
         seeds = range(first, first + episodes)
-        record = _Record(env, episodes)
         try:
-            returns = play(env, policy.agent(), seeds, watch=record, tick=tick)
-            skip()
+            rollout = Rollout(env, policy.agent(), seeds)
+            outcome = Outcome(rollout)
+            returns = rollout.run(outcome, meter)
+            meter.close(nominal)
             reference = _reference(env, seeds)
-            for name, options in conditions.items():
-                mean = float(play(env, policy.agent(), seeds[:few], tick=tick, **options).mean())
-                robustness[name].append(mean)
-                skip()
-            agent = policy.agent()
-            able = hasattr(agent, "pace") or not policy.architecture.plans
-            often.append(float(play(env, agent, seeds[:more], tick=tick, **faster).mean()) if able else None)
-            skip()
-        except Refused as error:
+            for size, (condition, count) in zip(sizes, runs, strict=True):
+                agent, mean = policy.agent(), None
+                if condition.suits(agent, policy.architecture.plans):
+                    mean = float(Rollout(env, agent, seeds[:count], **condition.options).run(meter).mean())
+                means[condition.name].append(mean)
+                meter.close(size)
+        except (PolicyError, Refused) as error:
             raise Refused(f"policy of seed {seed}: {error}") from error
-        policies.append({"seed": seed, "returns": returns.tolist(), **reference, **record.result()})
+        policies.append({"seed": seed, "returns": returns.tolist(), **reference, **outcome.result()})
+    faster = means.pop(OFTEN)
     return {
         "env": env,
         "digest": submission.digest,
         "nonce": nonce,
         "episodes": episodes,
         "policies": policies,
-        "robustness": robustness,
-        "often": often,
+        "robustness": means,
+        "often": faster,
         "seconds": round(time.perf_counter() - started, 2),
         "machine": _machine(),
         "versions": {"python": platform.python_version(), "lag-envs": __version__}
@@ -147,42 +133,6 @@ def _machine() -> dict[str, Any]:
     return machine() | {"target": f"{get_host_cpu_name()} {features}"}
 
 
-def play(
-    env_id: str,
-    agent: Any,
-    seeds: Sequence[int],
-    *,
-    watch: Watch | None = None,
-    tick: Callable[[int], Any] = lambda n: None,
-    **options: Any,
-) -> Array:
-    """Return an agent's returns in episodes with these reset seeds, stepped together."""
-    import gymnasium as gym
-
-    # An environment keeps its last state for one step before it begins anew; what follows is not looked at.
-    episodes = len(seeds)
-    envs = gym.make_vec(env_id, episodes, autoreset_mode="NextStep", **options)
-    bare: Any = envs.unwrapped
-    if hasattr(agent, "pace"):
-        agent.pace = bare.task.dt / bare.task.interval
-    observation, _ = envs.reset(seed=list(seeds))  # type: ignore[arg-type]
-    state, returns, running = None, np.zeros(episodes), np.ones(episodes, np.bool_)
-    if watch is not None:
-        watch(bare, returns[:0], returns[:0], running[:0], running[:0], running[:0])
-    start = running.copy()
-    while running.any():
-        action, state = act(agent, observation, state, start, envs.action_space.shape)
-        observation, reward, terminated, truncated, _ = envs.step(action)
-        returns += np.where(running, reward, 0.0)
-        if watch is not None:
-            watch(bare, action, reward, terminated, truncated, running)
-        running &= ~(terminated | truncated)
-        start = np.zeros(episodes, np.bool_)
-        tick(episodes)
-    envs.close()
-    return returns
-
-
 def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
     """Return the returns of the environment's reference in the same episodes; nothing where there is none."""
     reference = protocol.reference(env_id)
@@ -190,74 +140,8 @@ def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
         return {}
     from lag_envs.controllers import build
 
-    agent = build(protocol.make_task(env_id), reference.controller)
+    agent = build(TASKS[env_id](), reference.controller)
     return {"reference": play(env_id, agent, seeds).tolist()}
-
-
-def act(
-    agent: Any, observation: Any, state: Any, start: NDArray[np.bool_], shape: tuple[int, ...] | None = None
-) -> tuple[Any, Any]:
-    """Return actions and what the agent remembers; raise Refused where it fails, or acts out of bounds."""
-    try:
-        with np.errstate(all="ignore"):
-            action, state = agent.predict(observation, state, start, deterministic=True)
-    except Exception as error:  # whatever nonsensical numbers cause
-        raise Refused(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
-    if action.shape != (shape or (len(observation), 1)) or not np.isfinite(action).all():
-        raise Refused("it returned an action that is not a finite number")
-    return action, state
-
-
-class _Record:
-    """Watches episodes: when the goal is reached, the effort, and a hash of all that happens."""
-
-    def __init__(self, env_id: str, episodes: int) -> None:
-        goal = TASKS[env_id].goal
-        assert goal is not None
-        self.goal = goal
-        self.hash = hashlib.sha256()
-        self.effort, self.steps = np.zeros(episodes), np.zeros(episodes)
-        #: Step after which the goal holds for the first time, and without a break; 0 and inf: never.
-        self.first, self.last = np.full(episodes, math.inf), np.zeros(episodes)
-        self.ended = np.zeros(episodes, np.bool_)
-
-    def __call__(
-        self, bare: Any, action: Array, reward: Array, terminated: Any, truncated: Any, running: Any
-    ) -> None:
-        self.task = bare.task
-        inside = self.task.goal_holds(bare.state, bare.target)
-        if len(running) == 0:  # the start
-            self.first[inside] = 0.0
-            self.last[~inside] = 1.0
-            return
-        self.steps += running
-        self.effort += np.where(running, self.task.effort(bare.control), 0.0)
-        self.first = np.where(running & inside, np.minimum(self.first, self.steps), self.first)
-        self.last = np.where(running & ~inside, self.steps + 1.0, self.last)
-        self.ended |= running & terminated
-        for array in (np.asarray(action, "<f4"), np.asarray(reward, "<f8"), terminated, truncated):
-            # One row for each environment.
-            rows = running.reshape(-1, *(1 for _ in array.shape[1:]))
-            self.hash.update(np.where(rows, array, array.dtype.type(0)).tobytes())
-
-    def result(self) -> dict[str, Any]:
-        """Return success, time, effort and the hash."""
-        goal, dt = self.goal, self.task.dt
-        if goal.hold is None:
-            reached = np.where(np.isfinite(self.first), self.first * dt, math.nan)
-        else:
-            holds = (self.last + goal.hold / dt <= self.steps + 1e-6) & (self.ended == bool(goal.terminated))
-            reached = np.where(holds, self.last * dt, math.nan)
-        if goal.terminated is None:
-            success = ~self.ended
-        else:
-            success = np.isfinite(reached) & (self.ended == goal.terminated)
-        return {
-            "success": success.tolist(),
-            "settle": [None if math.isnan(t) else round(t, 9) for t in reached],
-            "effort": (self.effort / self.steps).tolist(),
-            "trajectory": self.hash.hexdigest(),
-        }
 
 
 def replay(
@@ -295,42 +179,31 @@ def replay(
     # What draws actions draws them for all episodes together, so all have to be played.
     rows = list(chosen) if hasattr(agent, "rng") else list(range(len(chosen)))
     seeds = range(first, first + result["episodes"]) if hasattr(agent, "rng") else [first + i for i in chosen]
-    record = _Record(env, len(seeds))
-    tracks: list[dict[str, Any]] = [{"states": [], "actions": [], "rewards": []} for _ in rows]
-    dt, targets = 0.0, None
-
-    def watch(bare: Any, action: Array, reward: Array, *ends: Any) -> None:
-        nonlocal dt, targets
-        record(bare, action, reward, *ends)
-        running = ends[-1]
-        dt, states = bare.task.dt, bare.state
-        if len(action) == 0 and bare.target is not None:
-            targets = bare.target.copy()
-        for row, track in zip(rows, tracks, strict=True):
-            if len(action) == 0 or running[row]:
-                track["states"].append([_rounded(x) for x in states[row]])
-            if len(action) and running[row]:
-                track["actions"].append(_rounded(action[row]))
-                track["rewards"].append(_rounded(reward[row]))
-
-    returns = play(env, agent, seeds, watch=watch)
-    reference = _reference(env, [first + i for i in chosen])
-    told = {"seed": training_seed, "returns": returns[rows].tolist(), **reference}
-    for name, values in record.result().items():
+    rollout = Rollout(env, agent, seeds)
+    outcome = Outcome(rollout)
+    played = record(rollout, outcome)
+    told = {"seed": training_seed, "returns": rollout.returns[rows].tolist()}
+    told |= _reference(env, [first + i for i in chosen])
+    for name, values in outcome.result().items():
         told[name] = [values[row] for row in rows] if isinstance(values, list) else values
-    return told, [
-        {
-            "seed": training_seed, "reset_seed": first + i, "return": float(returns[row]), "dt": dt, **track,
-            "target": None if targets is None else _rounded(targets[row]),
-        }
-        for i, row, track in zip(chosen, rows, tracks, strict=True)
-    ]  # fmt: skip
+
+    def episode(i: int, row: int) -> dict[str, Any]:
+        steps = int(played.steps[row])
+        return {
+            "seed": training_seed, "reset_seed": first + i, "return": float(rollout.returns[row]),
+            "dt": played.task.dt,
+            "states": rounded(played.states[: steps + 1, row].tolist()),
+            "actions": _plain(played.actions[:steps, row]),
+            "rewards": rounded(played.rewards[:steps, row].tolist()),
+            "target": None if played.targets is None else _plain(played.targets[None, row])[0],
+        }  # fmt: skip
+
+    return told, [episode(i, row) for i, row in zip(chosen, rows, strict=True)]
 
 
-def _rounded(x: Any) -> Any:
-    if np.ndim(x):
-        return _rounded(x[0]) if len(x) == 1 else [_rounded(each) for each in x]
-    return float(f"{x:.6g}")
+def _plain(values: Array) -> list[Any]:
+    """Return rows as JSON has them: of a single number as that number."""
+    return rounded((values[:, 0] if values.shape[1:] == (1,) else values).tolist())
 
 
 # --- the command --------------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ from lag_envs.report import page
 from lag_envs.report.content import Picture, Table
 from lag_envs.report.report import FILE, content_of
 from lag_envs.store import write
+from lag_envs.tables import markdown_table
 
 FIGURES = "images/accuracy"
 #: Sections whose summaries README shows.
@@ -122,12 +123,13 @@ def markdown(accuracy: dict[str, Any]) -> str:
         for paragraph in section["text"]:
             lines += ["", paragraph]
         if section["claims"]:
-            lines += ["", "| claim | verdict | measured |", "| --- | --- | --- |"]
-            for claim in section["claims"]:
-                cells = claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"]
-                lines += [_row(cells)]
+            rows = [
+                (claim["text"], f"**{page.VERDICTS[claim['holds']]}**", claim["evidence"])
+                for claim in section["claims"]
+            ]
+            lines += ["", markdown_table(["claim", "verdict", "measured"], rows)]
         for table in section["tables"]:
-            lines += ["", f"*{table['caption']}*", "", *_table(table)]
+            lines += ["", f"*{table['caption']}*", "", _table(table)]
         for picture in section["pictures"]:
             alt = picture["caption"].partition(". ")[0]
             lines += ["", f"![{alt}]({FIGURES}/{picture['file']})", "", f"*{picture['caption']}*"]
@@ -141,7 +143,7 @@ def summary(accuracy: dict[str, Any]) -> str:
     lines: list[str] = []
     for section in accuracy["sections"]:
         if section["summary"] and section["name"] in SHOWN:
-            lines += [f"{section['summary']['caption']}", "", *_table(section["summary"]), ""]
+            lines += [f"{section['summary']['caption']}", "", _table(section["summary"]), ""]
     claims = [claim for section in accuracy["sections"] for claim in section["claims"]]
     broken = [claim for claim in claims if claim["holds"] is False]
     lines += [
@@ -153,14 +155,9 @@ def summary(accuracy: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _table(table: dict[str, Any] | Table) -> list[str]:
+def _table(table: dict[str, Any] | Table) -> str:
     parts = vars(table) if isinstance(table, Table) else table
-    head = parts["columns"]
-    return [_row(head), _row(["---"] * len(head)), *(_row(map(page.cell, row)) for row in parts["rows"])]
-
-
-def _row(cells: Any) -> str:
-    return "| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |"
+    return markdown_table(parts["columns"], [[page.cell(value) for value in row] for row in parts["rows"]])
 
 
 if __name__ == "__main__":

@@ -215,7 +215,7 @@ class Task:
         return False
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return what docs/agents.md tells of episodes (`agents.behaviour.Played`), besides the arrival."""
+        """Return what docs/agents.md says of `evaluation.rollout.Episodes`, besides the arrival."""
         return {}
 
     def check(self) -> None:

@@ -510,7 +510,7 @@ little sooner and too fast, and what that costs is more than the time it saves.
         """Return when and how fast the line is crossed."""
         last, each = played.steps - 1, np.arange(len(played.steps))
         before = self.formulas._state(played.states[last, each].T)
-        control = self.limit_control * (0.5 + 0.5 * played.actions[last, each])
+        control = self.limit_control * (0.5 + 0.5 * np.clip(played.actions[last, each, 0], -1.0, 1.0))
         with np.errstate(divide="ignore", invalid="ignore"):  # without a brake, in branches not taken
             time, speed = self.crossing(before, [control], self.dt, np)
         low, middle, high = np.quantile(speed, [0.05, 0.5, 0.95])

@@ -1,0 +1,93 @@
+"""Agents that count steps, and the greedy policy of a value function, which looks one step ahead."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.controllers.basic import ObservationDecoder, as_actions
+from lag_envs.envs.model import Model
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+
+
+class Clocked(ABC):
+    """Base of the agents that act by state, target and time; a subclass defines `act`.
+
+    Their memory is the number of steps taken in each episode.
+
+    Parameters
+    ----------
+    task : Task
+        The task, with at most one target.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.read = ObservationDecoder(task)
+        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
+        self.pace = 1.0
+
+    @abstractmethod
+    def act(self, states: Array, targets: Array, taken: Array) -> Array:
+        """Return actions (n,), not clipped yet, for states (n, n_state), targets and steps taken (n,)."""
+
+    def predict(
+        self,
+        observation: ArrayLike,
+        state: ArrayLike | None = None,
+        episode_start: ArrayLike | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Array]:
+        """Return the action for each observation, and the steps taken then."""
+        values = np.asarray(observation, np.float64)
+        batch = np.atleast_2d(values)
+        taken = np.broadcast_to(np.asarray(0.0 if state is None else state, np.float64), len(batch))
+        if episode_start is not None:
+            taken = np.where(np.broadcast_to(episode_start, len(batch)), 0.0, taken)
+        with np.errstate(all="ignore"):
+            actions = as_actions(self.act(*self.read(batch), taken))
+        return actions.reshape(*values.shape[:-1], 1), taken + self.pace
+
+
+class LookAhead(Clocked):
+    """Takes the action with the largest reward + value after one step of the exact, undisturbed model.
+
+    It tries a set of actions, and then finer ones around the best.
+
+    Parameters
+    ----------
+    task : Task
+        The task, with one control.
+    value : callable
+        Given where steps end (n, n_state), targets (n,) and the steps taken before them (n,), it returns the
+        mean return that is still to be had (n,).
+    actions : ndarray
+        The first actions to try, evenly spaced.
+    """
+
+    def __init__(self, task: Task, value: Callable[[Array, Array, Array], Array], actions: Array) -> None:
+        super().__init__(task)
+        self.model, self.value, self.actions = Model(task), value, actions
+        self._aims = task.target_range is not None
+
+    def act(self, states: Array, targets: Array, taken: Array) -> Array:
+        """Return the best actions."""
+        best = self._best(states, targets, taken, np.tile(self.actions, (len(states), 1)))
+        around = best[:, None] + (self.actions[1] - self.actions[0]) * np.linspace(-1.0, 1.0, 17)
+        return self._best(states, targets, taken, np.clip(around, -1.0, 1.0))
+
+    def _best(self, states: Array, targets: Array, taken: Array, actions: Array) -> Array:
+        """Return the best of each row's actions."""
+        n, m = actions.shape
+        goals, before = np.repeat(targets, m), np.repeat(taken, m)
+        ends, rewards, ended = self.model(
+            np.repeat(states, m, axis=0), actions.ravel(), goals if self._aims else None
+        )
+        later: Any = np.where(ended, 0.0, self.value(ends, goals, before))
+        gains = (rewards + later).reshape(n, m)
+        return np.take_along_axis(actions, gains.argmax(axis=1)[:, None], axis=1)[:, 0]

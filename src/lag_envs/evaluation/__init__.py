@@ -1,0 +1,1 @@
+"""One evaluation behind the agents' results and the leaderboard: roll-out, conditions, statistics."""

@@ -1,0 +1,105 @@
+"""The conditions of an evaluation: other parameters, another control interval, noise, delay."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.tasks import TASKS
+
+#: Names of the environment as it is, and of acting ten times as often.
+NOMINAL, OFTEN = "nominal", "ten times as often"
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What differs from the environment as it is.
+
+    Parameters
+    ----------
+    name : str
+        As tables call it.
+    options : mapping
+        The environment's arguments.
+    noise : float
+        Standard deviation of the observation's noise, relative to its own under random actions.
+    late : bool
+        Whether the agent sees the observation before.
+    """
+
+    name: str = NOMINAL
+    options: Mapping[str, Any] = field(default_factory=dict)
+    noise: float = 0.0
+    late: bool = False
+
+    def steps(self, env_id: str) -> int:
+        """Return the steps of an environment's episode at most."""
+        return int(TASKS[env_id](**self.options).limit)
+
+    def suits(self, agent: Any, plans: bool) -> bool:
+        """Tell whether an agent can act under it: one that plans does so for one control interval.
+
+        Parameters
+        ----------
+        agent : object
+            The agent; with a `pace` it counts steps, and can be told how long they are.
+        plans : bool
+            Whether it plans.
+        """
+        return "dt" not in self.options or hasattr(agent, "pace") or not plans
+
+
+def often(env_id: str) -> Condition:
+    """Return the condition of acting ten times as often; a second is worth the same."""
+    return Condition(OFTEN, {"dt": TASKS[env_id]().interval / 10.0})
+
+
+def disturbances(env_id: str) -> list[Condition]:
+    """Return a condition for each of the environment's numbers off by 20 %; policies don't know of it."""
+    scene, found = TASKS[env_id]().scene, []
+    for parameter in dataclasses.fields(scene):
+        value = getattr(scene, parameter.name)
+        if isinstance(value, float) and 0.0 < value < math.inf:
+            for share, sign in ((0.8, "-"), (1.2, "+")):
+                found.append(Condition(f"{parameter.name} {sign}20 %", {parameter.name: share * value}))
+    return found
+
+
+def conditions(env_id: str) -> list[Condition]:
+    """Return all conditions: the board takes the first few kinds, the agents' results noise and delay too."""
+    noise = [Condition(f"noise {level} %", noise=0.01 * level) for level in (1, 5)]
+    return [Condition(), often(env_id), *disturbances(env_id), *noise, Condition("late", late=True)]
+
+
+class Sensor:
+    """What an agent gets to see of a batch of episodes: with noise, or late.
+
+    Parameters
+    ----------
+    noise : array_like, shape (n_observation,)
+        Standard deviation of Gaussian noise, drawn anew for each entry at each step.
+    late : bool
+        Whether the agent sees the observation before; at the start there is only the first.
+    seed : int
+        Seed of the noise.
+    """
+
+    def __init__(self, noise: ArrayLike = 0.0, late: bool = False, seed: int = 0) -> None:
+        self.noise, self.late = np.asarray(noise, np.float64), late
+        self.rng = np.random.default_rng(seed)
+        self.before: NDArray | None = None
+
+    def __call__(self, observation: NDArray) -> NDArray:
+        """Return what is seen of observations (episodes, n)."""
+        seen = observation if self.before is None else self.before
+        if self.late:
+            self.before = observation.copy()
+        if self.noise.any():
+            seen = seen + self.noise * self.rng.standard_normal(seen.shape)
+        return seen.astype(observation.dtype)

@@ -1,0 +1,203 @@
+"""What is done to pending submissions: verified, recorded, and compared with those that are there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.board import Board, closed, current
+from lag_envs.leaderboard.log import REMEDY, Alike, BoardError, Entry
+from lag_envs.leaderboard.results import check
+
+if TYPE_CHECKING:
+    from lag_envs.leaderboard.submission import About, Submission
+
+
+@dataclass(frozen=True)
+class Check:
+    """What is done to a pending submission, here or on another machine.
+
+    Parameters
+    ----------
+    entries : dict of str to (digest, nonce)
+        By the name of the submission's folder.
+    """
+
+    entries: Mapping[str, tuple[str, str]]
+
+    def __call__(self, folder: Path, progress: Callable[[int, int], Any] | None = None) -> dict[str, Any]:
+        """Return the result, with some recorded episodes; raise `Refused` for what is not acceptable."""
+        from lag_envs.leaderboard.alike import check_twins
+        from lag_envs.leaderboard.submission import Refused, load
+        from lag_envs.leaderboard.verify import verify
+
+        digest, nonce = self.entries[folder.name]
+        submission = load(folder)
+        if submission.digest != digest:
+            raise Refused("its files are not those that were added")
+        check_twins(submission, nonce)
+        result = verify(submission, nonce, protocol.EPISODES, progress)
+        # What the board cannot keep fails here, and costs nobody else.
+        return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
+
+
+def claimed(submission: About) -> dict[str, Any]:
+    """Return what a submission says of itself, which nobody verified."""
+    training = submission.training
+    return {
+        "code": submission.code or None,
+        "license": submission.license,
+        "description": submission.description,
+        "env_steps": training.get("env_steps"),
+        "seconds": training.get("seconds"),
+        "hardware": training.get("hardware"),
+        "curves": [
+            {"seed": c["seed"], "steps": list(c["steps"]), "returns": list(c["returns"])}
+            for c in training.get("curves", ())
+        ],
+    }
+
+
+def replays(submission: Submission, result: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the median, the best and the worst episode of the policy in the middle, recorded."""
+    from lag_envs.leaderboard.verify import replay
+
+    policy, chosen = shown_episodes(result)
+    _, found = replay(submission, result, policy, list(chosen.values()))
+    return [{"label": label} | episode for label, episode in zip(chosen, found, strict=True)]
+
+
+def shown_episodes(result: Mapping[str, Any]) -> tuple[int, dict[str, int]]:
+    """Return the number of the policy in the middle, and those of its median, best and worst episode."""
+    import numpy as np
+
+    returns = np.array([policy["returns"] for policy in result["policies"]])
+    policy = int(np.argsort(returns.mean(axis=1), kind="stable")[(len(returns) - 1) // 2])
+    order = np.argsort(returns[policy], kind="stable")
+    chosen = {"median": order[(len(order) - 1) // 2], "best": order[-1], "worst": order[0]}
+    return policy, {label: int(i) for label, i in chosen.items()}
+
+
+def finish(
+    board: Board,
+    only: Sequence[str] | None = None,
+    parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
+    tell: Callable[[Entry, str], Any] = lambda entry, what: None,
+) -> int:
+    """Verify what is pending and has a nonce.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    only : sequence of str, optional
+        The ids that may be verified; by default all.
+    parallel_map : callable, optional
+        Like `map_submissions`, with all but its first two arguments given; by default one after the other.
+    tell : callable
+        Told each entry and what became of it.
+
+    Returns
+    -------
+    int
+        How many could not be verified for a reason that is not their own; they stay pending.
+    """
+    from lag_envs.leaderboard.parallel import map_submissions
+    from lag_envs.leaderboard.submission import Refused
+
+    failed = 0
+    state = board.read()
+    if state.waiting():
+        current(state, "verify submissions of")
+    with ExitStack() as claims:
+        claimed_here: dict[str, tuple[Entry, str]] = {}
+        for entry in state.waiting():
+            if only is not None and entry.id not in only:
+                continue
+            if reason := closed(entry.env, entry.protocol, state.number):
+                board.rejected(entry.id, f"its board closed before it was verified: {reason}")
+            elif not claims.enter_context(board.claimed(entry.id)):
+                tell(entry, "another process is at it")
+                continue
+            else:
+                state = board.read()  # another process may just have finished it
+                nonce = state.nonce(entry)
+                if state.entry(entry.id).state == "pending" and nonce is not None:
+                    claimed_here[entry.id] = entry, nonce
+                    continue
+            tell(entry, _outcome(board, entry))
+        work = Check({id: (entry.digest, nonce) for id, (entry, nonce) in claimed_here.items()})
+        folders = [board.submission(id) for id in claimed_here]
+        neighbours = Neighbours(board)
+        for folder, result in (parallel_map or partial(map_submissions, jobs=1))(work, folders):
+            entry = claimed_here[folder.name][0]
+            if isinstance(result, Refused):
+                board.rejected(entry.id, str(result))
+            elif isinstance(result, BaseException):
+                failed += 1
+                tell(entry, f"could not be verified ({type(result).__name__}: {result}); it stays pending")
+                continue
+            else:
+                found: dict[str, Alike | None] = {}
+                while left := board.verified(entry.id, result, found):
+                    found |= {other.id: neighbours.alike(entry, result, other) for other in left}
+            tell(entry, _outcome(board, entry))
+    return failed
+
+
+class Neighbours:
+    """Compares submissions of a board, see `lag_envs.leaderboard.alike`.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    """
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self._protocols = board.read().protocols
+        self._loaded: dict[str, Submission] = {}
+        self._likeness: dict[tuple[str, str], Any] = {}
+
+    def alike(self, entry: Entry, result: Mapping[str, Any], other: Entry) -> Alike | None:
+        """Return how near another submission is to one that was just verified; None where they are apart."""
+        from lag_envs.leaderboard.alike import Likeness
+        from lag_envs.leaderboard.ranking import policy_error
+
+        reference = self._protocols[entry.protocol].references.get(entry.env)
+        results = (result, self.board.result(other))
+        error = max(policy_error(reference, each["policies"]) for each in results)
+        likeness = self._likeness.setdefault(
+            (entry.env, result["nonce"]), Likeness(entry.env, result["nonce"])
+        )
+        older, newer = sorted((entry, other), key=lambda each: each.line)
+        found = likeness(self._load(newer), self._load(older), error)
+        if found.closeness >= 1.0:
+            return None
+        return Alike(id=other.id, actions=found.actions, returns=found.returns)
+
+    def _load(self, entry: Entry) -> Submission:
+        from lag_envs.leaderboard.submission import Refused, load
+
+        if entry.id not in self._loaded:
+            try:
+                submission = load(self.board.submission(entry.id))
+            except Refused as error:
+                raise BoardError(f"{self.board.submission(entry.id)}: {error}; {REMEDY}") from None
+            if submission.digest != entry.digest:
+                raise BoardError(f"{self.board.submission(entry.id)} is not what was added; {REMEDY}")
+            self._loaded[entry.id] = submission
+        return self._loaded[entry.id]
+
+
+def _outcome(board: Board, entry: Entry) -> str:
+    now = board.read().entry(entry.id)
+    if now.state == "pending":
+        return "pending, until a nonce is published: `lag-envs leaderboard nonce`"
+    return f"{now.state}: {now.reason}" if now.reason else now.state

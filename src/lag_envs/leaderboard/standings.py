@@ -1,0 +1,153 @@
+"""What page and tables show of a board: its rows with scores and ranks, and what is known beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from lag_envs.leaderboard.board import Board, closed
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.log import REMEDY, BoardError, Entry, State
+from lag_envs.leaderboard.pending import shown_episodes
+from lag_envs.leaderboard.results import PACKED, checked_value
+from lag_envs.scores import KnownReturns, known_returns, normalised
+from lag_envs.tasks import TASKS
+
+
+def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
+    """Return all that page and tables show.
+
+    Parameters
+    ----------
+    board : Board
+        The board.
+    made : str, optional
+        The date to note; by default today's.
+
+    Returns
+    -------
+    dict
+        JSON types. ``environments`` has every environment, with its ``rows`` in order, and after them the
+        frozen boards.
+
+    Raises
+    ------
+    BoardError
+        Where something on the board is not as it was noted, see `audit.sound`.
+    """
+    from lag_envs.leaderboard.audit import sound
+
+    state, results = sound(board)
+    current = state.number or 1
+    keys = {(env_id, current): None for env_id in TASKS if not closed(env_id, current, current)}
+    frozen = sorted({(e.env, e.protocol) for e in state.all} - set(keys))
+    return {
+        "protocol": current,
+        "made": made or datetime.now(UTC).date().isoformat(),
+        "environments": [_environment(board, state, results, *key) for key in (*keys, *frozen)],
+    }
+
+
+def _environment(
+    board: Board, state: State, results: Mapping[tuple[int, str], dict[str, Any]], env_id: str, number: int
+) -> dict[str, Any]:
+    from lag_envs.evaluation.statistics import ends, iqm, rounded
+    from lag_envs.leaderboard import ranking
+    from lag_envs.leaderboard.site.scenery import describe
+
+    entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
+    told = state.protocols.get(number)
+    scale = told.scales.get(env_id) if told else None
+    reference = told.references.get(env_id) if told else None
+    rows = []
+    if told is not None and scale is not None:
+        found = {id: results[number, id] for id, e in entries.items() if e.state == "verified"}
+        scores = {id: ranking.scored(scale, reference, r["policies"]) for id, r in found.items()}
+        drawn = {id: ranking.redrawn(id, each) for id, each in scores.items()}
+        first = {id: state.first(entries[id]) for id in found}
+        # Who acts like an earlier one is shown, but neither ranked nor anybody's neighbour.
+        places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
+        ranks = {place.id: place for place in places}
+        for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):
+            entry, result, place = entries[id], found[id], ranks.get(id)
+            like = first[id]
+            row: dict[str, Any] = {
+                "id": id,
+                "rank": place and place.rank,
+                "above": place and place.above and list(place.above),
+                "alike": like and {"id": like.id, "name": like.name, "state": like.state},
+                "reference": scores[id].own,
+                "looks_like": _looks_like(entry, entries.values()),
+                "name": entry.name,
+                "kind": entry.kind,
+                "authors": list(entry.authors),
+                "state": entry.state,
+                "added": entry.added[:10],
+            }
+            row |= result["claimed"]
+            row["curves"] = [
+                {
+                    "seed": c["seed"], "steps": c["steps"],
+                    "scores": normalised(scale, c["returns"]).tolist(),
+                }
+                for c in result["claimed"]["curves"]
+            ]  # fmt: skip
+            row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
+            row["interval"] = list(ends(iqm(drawn[id])))
+            middle, chosen = shown_episodes(result)
+            verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
+            row["replays"] = [
+                replay | {"t0": 0.0, "score": float(normalised(scale, replay["return"]))}
+                for replay in result["replays"]
+                # Under protocol 1 those of random actions were other ones.
+                if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
+            ]
+            rows.append(rounded(row))
+    return {
+        "id": env_id,
+        "protocol": number,
+        "frozen": bool(closed(env_id, number, state.number or 1)),
+        "known": _known(env_id, scale),
+        "goal": told.rules.success.get(env_id) if told else None,
+        "value": _value(board.folder / "values" / f"{env_id}.json"),
+        "rows": rows,
+        "other": [
+            {"id": e.id, "name": e.name, "state": e.state, "reason": e.reason}
+            for e in entries.values()
+            if e.state != "verified"
+        ],
+    } | describe(env_id)
+
+
+def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
+    """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
+    found = known_returns(env_id)
+    known = found and found._asdict()
+    if scale is None:
+        return known
+    return (known or dict.fromkeys(KnownReturns._fields)) | scale.model_dump()
+
+
+def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
+    """Return the earlier author or name, of others, that an entry's can be taken for; empty for none."""
+    from lag_envs.leaderboard.names import lookalike
+
+    earlier = [e for e in entries if e.line < entry.line and set(e.authors).isdisjoint(entry.authors)]
+    authors = list(dict.fromkeys(author for e in earlier for author in e.authors))
+    for author in entry.authors:
+        if found := lookalike(author, authors):
+            return found
+    return lookalike(entry.name, dict.fromkeys([*authors, *(e.name for e in earlier)]))
+
+
+def _value(path: Path) -> dict[str, Any] | None:
+    """Return a value function for the page; None where there is none."""
+    try:
+        return checked_value(read_plain(path, PACKED))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        told = error.strerror if isinstance(error, OSError) else error
+        raise BoardError(f"{path} cannot be read: {told}; {REMEDY}, or remove it") from None
