@@ -64,9 +64,7 @@ class SeriesStepper:
 
     def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
-        return _evaluated(self._whole.constants, parameters) | {
-            f"p_{name}": float(parameters[name]) for name in self._parameters
-        }
+        return _evaluated(self.expressions(), parameters)
 
     # --- from the state and back ----------------------------------------------------------------------------
 
@@ -170,9 +168,17 @@ class SeriesStepper:
         Unfused, it gives the bits of plain + - * / √ and comparisons on any machine, see `Plain`.
         """
         if (absent, fused) not in self._codes:
-            record = self._lowering.without(*self._parts, absent, fused)
-            self._codes[absent, fused] = StepCode(self, record, absent, fused)
+            self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)
         return self._codes[absent, fused]
+
+    def record(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesRecord:
+        """Return what is stepped, without the terms of constants that are zero."""
+        return self._lowering.without(*self._parts, absent, fused)
+
+    def expressions(self) -> dict[str, Expr]:
+        """Return the numbers that a step needs, as expressions in the parameters."""
+        own = {f"p_{name}": Expr.of(parameter(name)) for name in self._parameters}
+        return dict(self._whole.constants) | own
 
 
 def _evaluated(constants: Mapping[str, Expr], parameters: Mapping[str, float]) -> dict[str, float]:
