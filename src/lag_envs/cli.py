@@ -574,9 +574,9 @@ examples:
     Command(
         "replay",
         "recompute a drive from its link",
-        """Recompute a drive, which the leaderboard's page made a link of, from its seed and keys, by arithmetic
-that has the same bits on every machine, and say whether the return that the link claims is true. The status is
-0 where it is, 1 where it is not, 2 for a link that is damaged.
+        """Recompute a drive, which the leaderboard's page made a link of, from its seed and keys, by
+arithmetic that has the same bits on every machine, and say whether the return that the link claims is true.
+The status is 0 where it is, 1 where it is not, 2 for a link that is damaged.
 
 examples:
   lag-envs replay 'https://example.org/board/PivotedBar-v0.html#drive=1~...'

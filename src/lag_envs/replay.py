@@ -166,8 +166,8 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     env = Unfused(task)
     if env.program.digest != drive.step:
         raise LinkError(
-            f"the drive was made with another step ({drive.step}, here {env.program.digest}): another version "
-            "of lag_envs or of the environment. Its bits cannot be recomputed here; install that version"
+            f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "
+            "version of lag_envs or of the environment; its bits can only be recomputed with that"
         )
     keys = keys_of(drive, task)
     env.reset(drive.seed)

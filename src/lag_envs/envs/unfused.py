@@ -82,7 +82,8 @@ class UnfusedProgram:
     rows : Rows
         Where the numbers lie.
     given : dict of str to float
-        The first constants, in order, which the script takes as they are.
+        The first constants, in order, which the script takes as they are. One, ``strength``, is 1 in the
+        environment: what actions in [-1, 1] are multiplied by.
     derived : list of str
         Names of the constants behind them.
     frames : list of str
@@ -95,6 +96,7 @@ class UnfusedProgram:
         own = formulas.constants()
         scenes = scene._constants()
         self.given = {name: value for name, value in own.items() if name not in scenes and name != "x"}
+        self.given["strength"] = 1.0
         fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
         #: Parameters that follow from others, and how.
         self.made = {
@@ -230,7 +232,7 @@ class UnfusedProgram:
 
         def control(xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
             if formulas.clipped:
-                a = [xp.where(x < -1.0, -1.0, xp.where(x > 1.0, 1.0, x)) for x in a]
+                a = [xp.where(x < -1.0, -1.0, xp.where(x > 1.0, 1.0, x)) * k.strength for x in a]
             return formulas.control(xp, a, y, g, k)
 
         u = self._run(t, control, actions, y, g)
@@ -332,6 +334,8 @@ class Unfused:
     ----------
     task : Task
         The task, ``env.unwrapped.task``.
+    program : UnfusedProgram, optional
+        Its program, where there is one already.
 
     Attributes
     ----------
@@ -349,9 +353,9 @@ class Unfused:
     '-0x1.47ae13112c92dp-8'
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, program: UnfusedProgram | None = None) -> None:
         self.task = task
-        self.program = program = UnfusedProgram(task)
+        self.program = program = program or UnfusedProgram(task)
         self._functions = run_python(program.python)
         self.numbers = [0.0] * program.size
         self.constants = [*program.given.values(), *[0.0] * len(program.derived)]
@@ -370,6 +374,11 @@ class Unfused:
             self.numbers, self._draws(self.program.states + self.task.formulas.targets), self.constants
         )
         return self.observe()
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Change a parameter of the scene, and what follows from it."""
+        self.constants[list(self.program.given).index(f"self_{name}")] = float(value)
+        self._functions["derive"](self.constants)
 
     def _draws(self, count: int) -> list[float]:
         from lag_envs.stepping.primitives import uniform

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish
+from lag_envs.leaderboard.board import Board, BoardError, Check, Entry, State, board_data, finish, page_data
 from lag_envs.leaderboard.log import COMMIT
 from lag_envs.tables import columns
 
@@ -365,7 +365,7 @@ def _pin(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.site.build import build
 
-    build(board_data(Board(args.board)), args.out, args.url)
+    build(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 
@@ -382,7 +382,7 @@ def _serve(args: argparse.Namespace) -> int:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        build(board_data(Board(args.board)), Path(folder))
+        build(page_data(Board(args.board)), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except (OSError, OverflowError) as error:
