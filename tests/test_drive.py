@@ -4,8 +4,10 @@ import struct
 
 import numpy as np
 import pytest
+from browsers import until
 from own_tasks import TASKS as OWN
 
+from lag_envs import cli, replay
 from lag_envs.controllers import build as make
 from lag_envs.controllers import controllers
 from lag_envs.envs.actions import Actions
@@ -141,3 +143,269 @@ def test_all_bits_in_a_hundred_episodes(browsing, bare, id):
         id,
         [(2**40 + i, at_random(task, i) if i % 2 else by_agent(task)) for i in range(100)],
     )
+
+
+# --- a person at the page -----------------------------------------------------------------------------------
+
+
+def message(page):
+    return page.evaluate("document.querySelector('.message').textContent")
+
+
+def verdict(page):
+    return page.evaluate("document.querySelector('.verdict').textContent")
+
+
+def reading(page, name):
+    return page.evaluate(
+        "(name) => [...document.querySelectorAll('.driver .readout dt')]"
+        ".find((e) => e.textContent === name)?.nextSibling.textContent",
+        name,
+    )
+
+
+@pytest.fixture
+def drive(browsing, bare):
+    """Open an environment's page, and its driver."""
+
+    def open_it(id="PivotedBarBalance-v0", hash="", folder=bare, **options):
+        page = browsing.open(f"{folder.as_uri()}/{id}.html{hash}", folder.as_uri(), **options)
+        if not hash:
+            page.click(".begin")
+        until(
+            page, "document.querySelector('.driver .stage') && document.querySelector('.message').textContent"
+        )
+        return page
+
+    return open_it
+
+
+def link_of(page):
+    until(page, "!document.querySelector('.share').hidden")
+    return page.evaluate("document.querySelector('.share input').value")
+
+
+def test_by_keys_alone(drive, capsys):
+    """Tab, arrows, Space, R and N; what was driven is true for the command."""
+    page = drive("InclineTilt-v0", hash="#seed=12")
+    assert "Space starts" in message(page)
+    page.focus("main")
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.className") == "stage":
+            break
+    assert page.evaluate("document.activeElement.getAttribute('role')") == "application"
+    page.keyboard.down("ArrowRight")
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
+    page.wait_for_timeout(300)
+    page.keyboard.up("ArrowRight")
+    page.keyboard.press("Space")
+    assert message(page).startswith("Paused at 0.")
+    held = link_of(page)
+    assert replay.read_link(held).seed == 12
+    assert cli.main(["replay", held]) == 0
+    assert "stopped before its end" in capsys.readouterr().out
+    page.keyboard.press("Space")
+    page.keyboard.down("ArrowRight")
+    until(page, "/The episode has ended|Time is up/.test(document.querySelector('.message').textContent)")
+    page.keyboard.up("ArrowRight")
+    whole = link_of(page)
+    assert cli.main(["replay", whole]) == 0
+    said = capsys.readouterr().out
+    assert "terminated" in said and "true: every bit" in said
+    score = float(said.split("score ")[1].split()[0])
+    assert float(reading(page, "Score so far").replace("−", "-")) == pytest.approx(score, abs=1e-3)
+    page.keyboard.press("r")
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
+    assert page.evaluate("location.hash") == "#seed=12"
+    page.keyboard.press("n")
+    until(page, "location.hash !== '#seed=12'")
+
+
+def test_a_link_is_recomputed_in_the_page(drive, bare):
+    task = TASKS["InclineTilt-v0"]()
+    env = Unfused(task)
+    env.reset(77)
+    keys, total, over = [], 0.0, False
+    while not over:
+        keys.append(((-64, 33, 64)[len(keys) // 9 % 3],))
+        _, reward, *ended = env.step(replay.action_of(keys[-1], task))
+        total, over = total + reward, any(ended)
+    made = replay.Drive(task.id, 77, replay.pack(keys), total, env.program.digest)
+    page = drive(task.id, replay.write_link(made))
+    until(page, "document.querySelector('.verdict').textContent.startsWith('The link is true')")
+    assert page.evaluate("document.querySelector('.drive-controls select option:checked') !== null")
+    # Watching it leads to the same return; it is the ghost of whoever drives.
+    assert page.evaluate("[...document.querySelectorAll('.drive-controls select')][1].value") == "link:0"
+    page.select_option(".drive-controls select >> nth=0", "1")
+    page.click(".rerun")
+    until(page, "document.querySelector('.message').textContent.includes('R: again')")
+    assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(total, abs=6e-3)
+    # Its last bit changed, it is false; so it is with one key more.
+    forged = np.nextafter(total, np.inf)
+    for false in (made._replace(claimed=forged), made._replace(keys=replay.pack([*keys, (0,)]))):
+        page = drive(task.id, replay.write_link(false))
+        until(page, "document.querySelector('.verdict').dataset.true === 'false'")
+        assert verdict(page).startswith("The link is false")
+    for hash, told in (
+        (replay.write_link(made)[:-1], "damaged"),
+        ("#drive=1~x", "damaged"),
+        ("#drive=%E0%A4%A", "no link"),
+        ("#drive=2~a~b~c~d~e~f", "version"),
+        (replay.write_link(made._replace(id="PivotedBar-v0")), "another environment"),
+        (replay.write_link(made._replace(step="00000000")), "another version"),
+        (replay.write_link(made._replace(seed=2**64)), "forged"),
+        (replay.write_link(made._replace(keys=replay.pack([(65,)]))), "between -64 and 64"),
+        (replay.write_link(made._replace(keys="gA")), "damaged"),
+        ("#seed=99999999999999999999", "below 2"),
+    ):  # fmt: skip
+        page = drive(task.id, hash)
+        until(page, f"document.querySelector('.verdict').textContent.includes({told!r})")
+
+
+def test_by_pointer_and_by_touch(drive, browsing):
+    page = drive("InclineTilt-v0", hash="#seed=3")
+    page.evaluate("document.querySelector('.stage').scrollIntoView()")
+    box = page.evaluate(
+        "(() => { const b = document.querySelector('.driver .scene').getBoundingClientRect();"
+        "return [b.left, b.top, b.width, b.height]; })()"
+    )
+    middle = box[1] + box[3] / 2
+    page.mouse.move(box[0] + 0.98 * box[2], middle)
+    page.mouse.down()
+    until(
+        page,
+        "document.querySelector('.driver .readout') && document.querySelector('.go').textContent === 'Pause'",
+    )
+    page.wait_for_timeout(250)
+    assert reading(page, "φ\u0307") == "1.00"
+    page.mouse.move(box[0] + 0.29 * box[2], middle)
+    page.wait_for_timeout(250)
+    assert reading(page, "φ\u0307") == "−0.50"
+    page.mouse.up()
+    page.wait_for_timeout(250)
+    assert reading(page, "φ\u0307") == "0.00"
+    page.keyboard.press("Space")
+    assert cli.main(["replay", link_of(page)]) == 0
+
+
+GAMEPAD = """() => {
+    const pad = {connected: true, index: 0, axes: [0.5, 0, 0, 0], buttons: []};
+    window.pad = pad;
+    Object.defineProperty(navigator, 'getGamepads', {value: () => [pad.connected ? pad : null]});
+    const event = new Event('gamepadconnected');
+    event.gamepad = pad;
+    window.dispatchEvent(event);
+}"""
+
+
+def test_a_gamepad_drives_and_may_leave(drive):
+    page = drive("InclineTilt-v0", hash="#seed=3")
+    page.evaluate(GAMEPAD)
+    assert "gamepad is there" in message(page)
+    page.click(".go")
+    page.wait_for_timeout(300)
+    assert reading(page, "φ\u0307") == "0.50"
+    page.evaluate("window.pad.connected = false")
+    until(page, "document.querySelector('.message').textContent.startsWith('The gamepad has left')")
+    assert page.evaluate("document.querySelector('.go').textContent") == "Go on"
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    until(page, "document.querySelector('.go').textContent === 'Pause'")
+
+
+def test_a_changed_machine_is_not_scored(drive):
+    page = drive("PivotedBar-v0")
+    page.click(".sliders summary")
+    names = page.evaluate("[...document.querySelectorAll('.sliders label span')].map((e) => e.textContent)")
+    assert names == ["mass", "com distance", "damping", "gravity", "control limit"]
+    before = page.evaluate("document.querySelector('.driver .scene').toDataURL()")
+    page.evaluate(
+        "(() => { const i = document.querySelectorAll('.sliders input')[1]; i.value = '1';"
+        "i.dispatchEvent(new Event('input')); })()"
+    )
+    assert "not scored" in message(page)
+    assert page.evaluate("document.querySelector('.driver .scene').toDataURL()") != before
+    page.focus(".stage")
+    page.keyboard.press("Space")
+    page.wait_for_timeout(200)
+    page.keyboard.press("Space")
+    assert reading(page, "Score so far") == "not scored"
+    assert page.evaluate("document.querySelector('.share').hidden")
+    page.click(".reset")
+    assert "scored again" in message(page)
+
+
+@pytest.fixture(scope="module")
+def owned(tmp_path_factory):
+    """Pages of users' tasks, of records that nobody knows."""
+    folder = tmp_path_factory.mktemp("owned")
+    with pytest.MonkeyPatch.context() as patch:
+        for task in OWN:
+            patch.setitem(TASKS, task.id, task)
+        boards = [{"id": task.id, "rows": []} for task in OWN]
+        build({"protocol": 1, "made": "today", "environments": boards}, folder)
+    return folder
+
+
+def test_two_controls_without_a_picture(drive, owned):
+    page = drive("OwnCrane-v0", folder=owned)
+    assert "← → push, ↓ ↑ pull" in message(page) and "nothing to draw" in message(page)
+    for key in ("ArrowRight", "ArrowUp"):
+        page.keyboard.down(key)
+    page.wait_for_timeout(400)
+    assert (reading(page, "push"), reading(page, "pull")) == ("1.00", "1.00")
+    assert reading(page, "Score so far") == "–"
+    page.keyboard.up("ArrowUp")
+    page.wait_for_timeout(300)
+    if not message(page):
+        assert reading(page, "pull") == "−1.00"  # nothing is pulled there
+
+
+def test_choices(drive, owned):
+    page = drive("OwnSwitched-v0", folder=owned)
+    page.keyboard.down("ArrowLeft")
+    page.wait_for_timeout(300)
+    assert reading(page, "s\u0308") == "−5.00 m/s²"
+    page.keyboard.up("ArrowLeft")
+    page.keyboard.down("3")
+    page.wait_for_timeout(300)
+    assert reading(page, "s\u0308") == "5.00 m/s²"
+    page.keyboard.up("3")
+    page.wait_for_timeout(300)
+    assert reading(page, "s\u0308") == "0.00 m/s²"
+
+
+def test_nothing_acts(drive, owned):
+    page = drive("OwnDrift-v0", folder=owned)
+    assert "Nothing acts here" in message(page)
+    page.keyboard.press("Space")
+    until(page, "document.querySelector('.message').textContent.startsWith('Time is up')")
+
+
+def test_what_the_browser_lacks_is_told(browsing, bare):
+    page = browsing.open(f"{bare.as_uri()}/PivotedBar-v0.html", bare.as_uri())
+    page.evaluate("delete window.CanvasRenderingContext2D")
+    page.click(".begin")
+    until(
+        page,
+        "document.querySelector('#drive .status').textContent.includes('lacks what driving needs: drawing')",
+    )
+    assert not page.evaluate("document.querySelector('.begin').disabled")
+
+
+def test_names_for_those_who_do_not_see(drive):
+    page = drive()
+    tree = page.context.new_cdp_session(page)
+    nodes = [n for n in tree.send("Accessibility.getFullAXTree")["nodes"] if not n["ignored"]]
+    for node in nodes:
+        if node["role"]["value"] in {"button", "combobox", "slider", "application", "textbox"}:
+            assert node["name"]["value"].strip(), node
+    assert "Drive PivotedBarBalance-v0" in str(nodes)
+
+
+@pytest.mark.parametrize("width", [320, 1920])
+def test_nothing_overflows(drive, width):
+    page = drive(viewport={"width": width, "height": 700})
+    page.click(".sliders summary")
+    assert page.evaluate("document.documentElement.scrollWidth") == width

@@ -350,7 +350,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     build({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
     assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
-    assert sum(name.startswith("assets/") for name in left) == 2 + len(board_pages.AGENTS)
+    assert sum(name.startswith("assets/") for name in left) == 4 + len(board_pages.AGENTS)
 
 
 def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):

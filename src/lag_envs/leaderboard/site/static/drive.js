@@ -563,7 +563,6 @@
       left = 0;
       share.hidden = true;
       startGhost();
-      if (untouched()) history.replaceState(null, "", rerunning || linked?.seed === seed ? location.href : `#seed=${seed}`);
       show(1);
     }
 
@@ -619,6 +618,7 @@
       if (running) return;
       if (me.over || (rerunning && !rerunning.keys[me.steps])) restart();
       running = true;
+      if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
       message.textContent = "";
       said.textContent = "Driving";
       share.hidden = true;
@@ -788,7 +788,13 @@
     }
 
     function followHash() {
-      const hash = decodeURIComponent(location.hash);
+      let { hash } = location;
+      try {
+        hash = decodeURIComponent(hash);
+      } catch {
+        // As it is, it is damaged, and will be told so.
+      }
+      verdict.textContent = "";
       if (hash.includes(MARK)) {
         judge(hash);
         return;
