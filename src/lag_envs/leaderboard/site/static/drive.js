@@ -556,6 +556,11 @@
 
     const mixedPoses = (a, b, part) => b.map((frame, i) => frame.map((x, j) => (j < 3 ? a[i][j] + (x - a[i][j]) * part : x)));
 
+    /** Keep the seed in the address, where it is not that of the link there. */
+    function note() {
+      if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
+    }
+
     function restart() {
       me = new Episode(code, seed, given);
       mine = [];
@@ -563,6 +568,8 @@
       left = 0;
       share.hidden = true;
       startGhost();
+      if (running) note();
+      label();
       show(1);
     }
 
@@ -618,7 +625,7 @@
       if (running) return;
       if (me.over || (rerunning && !rerunning.keys[me.steps])) restart();
       running = true;
-      if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
+      note();
       message.textContent = "";
       said.textContent = "Driving";
       share.hidden = true;
@@ -901,12 +908,10 @@
       running = false;
       rerunning = null;
       chooseGhost();
-      label();
     });
     episodeSelect.addEventListener("change", () => {
       running = false;
       chooseEpisode();
-      label();
     });
     link.addEventListener("focus", () => link.select());
     copy.addEventListener("click", async () => {
@@ -923,7 +928,6 @@
 
     listGhosts();
     restart();
-    label();
     const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers tell how it moves.";
     tell(`${how ? `${how}; or the pointer, or a gamepad.` : "Nothing acts here: look on."} Space starts.${nothing}`);
     if (calm.matches) speed.value = "0.5";
