@@ -6,12 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import until
+from driven import at_random, by_agent
 from own_tasks import TASKS as OWN
 
 from lag_envs import cli, replay
-from lag_envs.controllers import build as make
-from lag_envs.controllers import controllers
-from lag_envs.envs.actions import Actions
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.site.build import build
@@ -62,33 +60,6 @@ def rollout(task, seed, actions, env=None):
         poses = ",".join(hex_of(x) for pose in env.poses() for x in pose)
         told.append(f"{everything()} {hex_of(total)} {how} {poses}")
     return told, used
-
-
-def at_random(task, seed):
-    rng, formulas = np.random.default_rng(seed), task.formulas
-    if formulas.choices:
-        space = Actions(formulas.actions, formulas.choices).space
-        space.seed(seed)
-        return lambda env, i: space.sample()
-    return lambda env, i: rng.uniform(-1.2, 1.2, formulas.actions).astype(np.float32)
-
-
-def by_agent(task):
-    """Return a controller of the task's own that plans nothing, by unfused observations."""
-    names = [n for n, found in controllers(task).items() if not found.plans and n not in ("zero", "random")]
-    if not names:
-        return at_random(task, 99)
-    made = make(task, names[-1])
-    memory = {}
-
-    def act(env, i):
-        start = np.array([i == 0])
-        action, memory["state"] = made.predict(
-            np.array([env.observe()], np.float32), None if i == 0 else memory["state"], start
-        )
-        return action[0]
-
-    return act
 
 
 @pytest.fixture(scope="module")

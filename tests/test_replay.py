@@ -8,6 +8,8 @@ from own_tasks import Deliver, Switched
 
 from lag_envs import cli, replay
 from lag_envs.envs.unfused import Unfused
+from lag_envs.leaderboard.drives import best_drives
+from lag_envs.leaderboard.log import BoardError
 from lag_envs.tasks import TASKS
 
 ID = "PivotedBarBalance-v0"
@@ -129,3 +131,44 @@ def test_the_command_on_an_environment_of_ones_own(tmp_path, capsys):
     drive = driven(own_files.one(str(file))())
     assert cli.main(["replay", replay.write_link(drive), "--file", str(file)]) == 0
     assert "Push-v0, seed 5, 50 steps" in capsys.readouterr().out
+
+
+# --- the board's best drives --------------------------------------------------------------------------------
+
+
+def test_best_drives_are_recomputed_and_sorted(tmp_path):
+    assert best_drives(tmp_path) == {}
+    made = [driven(TASKS[ID](), seed=seed) for seed in (1, 2, 3)]
+    other = driven(TASKS["InclineTilt-v0"](), most=10_000)
+    links = [replay.write_link(drive, "https://example.org/x.html") for drive in (*made, other)]
+    text = "# by hand\n\n" + "".join(f"{link} Ada {i}\n" for i, link in enumerate(links))
+    (tmp_path / "drives.txt").write_text(text)
+    found = best_drives(tmp_path)
+    assert sorted(found) == sorted([ID, other.id])
+    returns = [drive["return"] for drive in found[ID]]
+    assert returns == sorted((drive.claimed for drive in made), reverse=True)
+    assert all(drive["link"].startswith("#drive=1~") and drive["name"][:3] == "Ada" for drive in found[ID])
+
+
+@pytest.mark.parametrize(
+    "line, told",
+    [
+        ("{link}", "a link, a blank and a name"),
+        ("{link} " + "x" * 61, "at most 60"),
+        ("{link} Ada\u202e", "a link, a blank and a name"),
+        ("nonsense Ada", "line 1: 'nonsense' is no link"),
+        ("{false} Ada", "line 1: the claim is false"),
+        ("{short} Ada", "stops before its episode's end"),
+        ("{link} Ada\n{link} Eve", "line 2: this drive is there already"),
+    ],
+)
+def test_what_is_wrong_with_a_line_is_told(tmp_path, line, told):
+    drive = driven(TASKS[ID]())
+    links = {
+        "link": replay.write_link(drive),
+        "false": replay.write_link(drive._replace(claimed=0.25)),
+        "short": replay.write_link(driven(TASKS[ID](), most=10)),
+    }
+    (tmp_path / "drives.txt").write_text(line.format(**links))
+    with pytest.raises(BoardError, match=told):
+        best_drives(tmp_path)

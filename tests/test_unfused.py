@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from driven import at_random, by_agent
 from own_tasks import TASKS as OWN
 
 import lag_envs
@@ -20,15 +21,6 @@ def made(task):
     return gym.make(task.id).unwrapped
 
 
-def actions(space, steps, seed):
-    rng = np.random.default_rng(seed)
-    if isinstance(space, gym.spaces.Discrete):
-        return rng.integers(space.n, size=steps)
-    # Slowly changing ones come further than random ones.
-    walk = np.cumsum(rng.normal(0.0, 0.3, (steps, *space.shape)), axis=0)
-    return np.clip(np.sin(walk) * 1.3, -1.5, 1.5).astype(np.float32)
-
-
 @pytest.mark.parametrize("id", REGISTERED)
 def test_unfused_is_the_environments_step_to_rounding(id):
     """Synchronised before each step, at most 1e-15 times size times condition."""
@@ -40,6 +32,12 @@ def test_users_tasks_too(task):
     check_against_fused(made(task), range(2))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("id", REGISTERED)
+def test_so_it_is_in_a_hundred_episodes(id):
+    check_against_fused(gym.make(id).unwrapped, range(100))
+
+
 def check_against_fused(env, seeds):
     unfused, task = Unfused(env.task), env.task
     for seed in seeds:
@@ -48,9 +46,14 @@ def check_against_fused(env, seeds):
         assert np.allclose(unfused.state, env.state, rtol=1e-15, atol=1e-16)
         assert np.allclose(observation, first, rtol=1e-6, atol=1e-7)
         steps, over = [], False
-        for action in actions(env.action_space, int(task.limit), seed):
+        act = by_agent(env.task) if seed % 2 else at_random(env.task, seed)
+        for i in range(int(task.limit)):
+            action = act(unfused, i)
             before, target = env.state, env.target
             unfused.state = before
+            # The fused step carries the angle's cosine and sine along; they are of this very angle now.
+            lifted = slice(len(before), len(env._program.y))
+            env._rows[lifted] = unfused.numbers[lifted]
             unfused.target = [] if target is None else np.atleast_1d(target)
             observation, reward, *over, _ = env.step(action)
             seen, own, *ended = unfused.step(action)
@@ -86,9 +89,10 @@ def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     order = float(env.program._order)
     env.reset(3)
     task = env.task
-    for action in actions(outer.action_space, 30, 4):
+    act = at_random(task, 4)
+    for i in range(30):
         before = env.state
-        env.step(action)
+        env.step(act(env, i))
         if task.draws:
             continue  # the state is the one after the kick
         *after, status = advance(np.zeros(code.scratch), *before, *env.control, task.dt, order, *numbers)

@@ -9,7 +9,7 @@ A script has seven functions. All work on arrays of numbers: ``k``, the constant
 environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 
 =================  ==========================================================================================
-``derive(k)``      fills in the constants that follow from the first ones
+``derive(k)``      fills in the constants that follow from the first ones, where one of these was changed
 ``start(f, d, k)`` fills in where an episode starts, from one draw for each entry of state and target
 ``lift(f, k)``     fills in what the formulas need besides the state: call it where the state was set by hand
 ``move(f, a, k)``  takes a step: control, motion, reward, ending
@@ -38,6 +38,7 @@ from lag_envs.mechanics.recording import parameter
 from lag_envs.scenes import picture
 from lag_envs.scenes.base import ORDER
 from lag_envs.scenes.shapes import Frame
+from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Language, Script, motion, run_python
@@ -84,8 +85,8 @@ class UnfusedProgram:
     given : dict of str to float
         The first constants, in order, which the script takes as they are. One, ``strength``, is 1 in the
         environment: what actions in [-1, 1] are multiplied by.
-    derived : list of str
-        Names of the constants behind them.
+    derived : dict of str to float
+        Those behind them, which follow: each rounded once.
     frames : list of str
         The picture's frames; empty where there is no picture.
     """
@@ -106,16 +107,16 @@ class UnfusedProgram:
         }
         expressions = self._stepper.expressions()
         self._motion = {f"motion_{name}": e for name, e in expressions.items()}
-        self.derived = [*(self._form.expressions if self._form else ()), *self._motion]
-        self._place = {name: f"k[{i}]" for i, name in enumerate([*self.given, *self.derived])}
-        zero = {name for name, value in self.given.items() if value == 0.0}
-        numbers = self._stepper.constants({n: getattr(scene, n) for n in scene._numbers()})
-        gone = frozenset(name for name, value in numbers.items() if value == 0.0)
-        zero |= {f"motion_{name}" for name in gone}
-        if self._form:
-            zero |= {name for name, value in scenes.items() if value == 0.0}
+        # Functions of parameters too have the same bits everywhere.
+        parameters, functions = {n: getattr(scene, n) for n in scene._numbers()}, ElementaryTrace()
+        motion = self._stepper.constants(parameters, functions)
+        gone = frozenset(name for name, value in motion.items() if value == 0.0)
+        self.derived = self._form.constants(parameters, functions) if self._form else {}
+        self.derived |= {f"motion_{name}": value for name, value in motion.items()}
+        numbers = self.given | self.derived
+        self._place = {name: f"k[{i}]" for i, name in enumerate(numbers)}
         #: Constants for formulas; what is zero leaves no code.
-        self._k = {name: 0.0 if name in zero else place for name, place in self._place.items()}
+        self._k = {name: 0.0 if numbers[name] == 0.0 else place for name, place in self._place.items()}
         self._record = self._stepper.record(gone, fused=False)
         self._order = vars(scene).get(ORDER) or usual_order(task.dt)
         self.states = len(formulas.state)
@@ -130,6 +131,11 @@ class UnfusedProgram:
 
     # --- scripts --------------------------------------------------------------------------------------------
 
+    @property
+    def constants(self) -> list[float]:
+        """All constants."""
+        return [*self.given.values(), *self.derived.values()]
+
     @cached_property
     def python(self) -> str:
         """The script in Python."""
@@ -143,7 +149,7 @@ class UnfusedProgram:
     @cached_property
     def digest(self) -> str:
         """All that decides the bits of an episode, in short."""
-        numbers = repr(list(self.given.values()))
+        numbers = repr(self.constants)
         return hashlib.sha256(f"{self.python.partition('def poses(')[0]}{numbers}".encode()).hexdigest()[:8]
 
     def script(self, language: Language) -> str:
@@ -358,8 +364,7 @@ class Unfused:
         self.program = program = program or UnfusedProgram(task)
         self._functions = run_python(program.python)
         self.numbers = [0.0] * program.size
-        self.constants = [*program.given.values(), *[0.0] * len(program.derived)]
-        self._functions["derive"](self.constants)
+        self.constants = program.constants
         self._actions = Actions(task.formulas.actions, task.formulas.choices)
         self._key: Any = None
         self.steps = 0

@@ -62,9 +62,12 @@ class SeriesStepper:
 
     # --- constants ------------------------------------------------------------------------------------------
 
-    def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
-        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
-        return _evaluated(self.expressions(), parameters)
+    def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
+        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code.
+
+        `functions` has sine, cosine and the like.
+        """
+        return _evaluated(self.expressions(), parameters, functions)
 
     # --- from the state and back ----------------------------------------------------------------------------
 
@@ -181,9 +184,11 @@ class SeriesStepper:
         return dict(self._whole.constants) | own
 
 
-def _evaluated(constants: Mapping[str, Expr], parameters: Mapping[str, float]) -> dict[str, float]:
+def _evaluated(
+    constants: Mapping[str, Expr], parameters: Mapping[str, float], functions: Any = math
+) -> dict[str, float]:
     """Return the values of a record's constants, each rounded once."""
-    numbers = evaluate(list(constants.values()), exactly(parameters), math)
+    numbers = evaluate(list(constants.values()), exactly(parameters), functions)
     return {name: float(value) for name, value in zip(constants, numbers, strict=True)}
 
 

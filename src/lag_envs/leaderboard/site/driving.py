@@ -48,12 +48,12 @@ def script_of(kind: type[Task]) -> str:
     task = kind()
     env = Unfused(task)
     program, names = env.program, ", ".join(FUNCTIONS)
-    given = ", ".join(_number(x) for x in program.given.values())
+    constants = ", ".join(map(_number, program.constants))
     about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
     about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return (
         f'"use strict";\n(() => {{\n{program.javascript}'
-        f"lagEnvs.put({{ functions: {{ {names} }}, given: [{given}], about: {about} }});\n}})();\n"
+        f"lagEnvs.put({{ functions: {{ {names} }}, constants: [{constants}], about: {about} }});\n}})();\n"
     )
 
 
@@ -81,7 +81,6 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
         },
         "size": program.size,
         "states": program.states,
-        "derived": len(program.derived),
         "starts": program.states + formulas.targets,
         "draws": task.draws,
         "controls": [
@@ -143,7 +142,7 @@ def _steps_as(env: Unfused, name: str, other: Task) -> bool:
         return False
     changed, own = Unfused(env.task, env.program), Unfused(other)
     changed.set_parameter(name, getattr(other.scene, name))
-    if changed.constants != own.constants:
+    if not np.allclose(changed.constants, own.constants, rtol=1e-13, atol=0.0):
         return False
     formulas = other.formulas
     for one in (changed, own):
@@ -155,7 +154,8 @@ def _steps_as(env: Unfused, name: str, other: Task) -> bool:
                 )
         except StepRefused:
             return False
-    return changed.numbers == own.numbers and np.allclose(changed.poses(), own.poses(), atol=1e-9)
+    numbers = np.allclose(changed.numbers, own.numbers, rtol=1e-9, atol=1e-12)
+    return numbers and np.allclose(changed.poses(), own.poses(), atol=1e-9)
 
 
 # --- agents -------------------------------------------------------------------------------------------------

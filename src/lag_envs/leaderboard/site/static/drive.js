@@ -33,14 +33,12 @@
 
   // --- episodes --------------------------------------------------------------------------------------------
 
-  /** An environment, stepped by the printed functions. `given` are the first constants. */
+  /** An environment, stepped by the printed functions. */
   class Episode {
-    constructor(code, seed, given = code.given) {
+    constructor(code, seed, constants = code.constants) {
       const { about } = code;
       this.code = code;
-      this.k = new Float64Array(given.length + about.derived);
-      this.k.set(given);
-      code.functions.derive(this.k);
+      this.k = Float64Array.from(constants);
       this.f = new Float64Array(about.size);
       this.kept = new Float64Array(about.size);
       this.restart(seed);
@@ -450,9 +448,9 @@
     const how = hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${about.controls[i].name}`).join(", ");
     stage.setAttribute("aria-label", `Drive ${board.id}. ${how || "Nothing acts here"}. Space pauses, R restarts, N is another start.`);
 
-    let given = [...code.given];
+    let { constants } = code;
     let seed = big(Math.floor(Math.random() * 2 ** 32));
-    let me = new Episode(code, seed, given);
+    let me = new Episode(code, seed, constants);
     let mine = [];
     let ghost = null;
     let linked = null;
@@ -461,7 +459,7 @@
     let [before, left, shownAt] = [0, 0, 0];
     let [past, now] = [me.poses(), me.poses()];
     let picture = board.picture;
-    const untouched = () => given.every((x, i) => Object.is(x, code.given[i]));
+    const untouched = () => constants === code.constants;
 
     const tell = (words) => {
       message.textContent = words;
@@ -529,7 +527,7 @@
     function startGhost() {
       if (!ghost) return;
       if (ghost.act) {
-        ghost.episode = new Episode(code, seed, given);
+        ghost.episode = new Episode(code, seed, constants);
         ghost.past = ghost.now = ghost.episode.poses();
       }
     }
@@ -562,7 +560,7 @@
     }
 
     function restart() {
-      me = new Episode(code, seed, given);
+      me = new Episode(code, seed, constants);
       mine = [];
       past = now = me.poses();
       left = 0;
@@ -699,7 +697,7 @@
     function look() {
       if (!board.picture) return null;
       const others = about.sliders.filter((slider) => slider.looks).map(({ looks, at }) => {
-        const place = clamp(2 * Math.log2(given[at] / code.given[at]) + 2, 0, looks.length - 1);
+        const place = clamp(2 * Math.log2(constants[at] / code.constants[at]) + 2, 0, looks.length - 1);
         const first = Math.min(Math.floor(place), looks.length - 2);
         return scaled([looks[first].shapes, looks[first].window], [looks[first + 1].shapes, looks[first + 1].window], place - first);
       });
@@ -720,23 +718,29 @@
       };
       say();
       input.addEventListener("input", () => {
-        given[slider.at] = Number(input.value) === 0 ? code.given[slider.at] : say();
-        say();
+        change();
         picture = look();
         rerunning = null;
         restart();
         tell(untouched() ? "As it was: scored again." : "The machine was changed: this drive is not scored.");
       });
       panel.append(make("label", {}, make("span", {}, name), input, output));
-      return { input, say };
+      return { slider, input, say };
     });
+
+    /** Take the sliders' values, and what follows from them. */
+    function change() {
+      const values = inputs.map(({ say }) => say());
+      constants = code.constants;
+      if (inputs.every(({ input }) => Number(input.value) === 0)) return;
+      constants = Float64Array.from(code.constants);
+      inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
+      code.functions.derive(constants);
+    }
     const reset = button("reset", "As it was");
     reset.addEventListener("click", () => {
-      given = [...code.given];
-      for (const { input, say } of inputs) {
-        input.value = "0";
-        say();
-      }
+      for (const { input } of inputs) input.value = "0";
+      change();
       picture = look();
       restart();
       tell("As it was: scored again.");
