@@ -445,8 +445,9 @@
       if (running) pause();
       tell("The gamepad has left. Drive by keys, or connect it again; Space goes on.");
     });
-    const how = hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${about.controls[i].name}`).join(", ");
-    stage.setAttribute("aria-label", `Drive ${board.id}. ${how || "Nothing acts here"}. Space pauses, R restarts, N is another start.`);
+    const named = (name) => hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${name(about.controls[i].name)}`).join(", ");
+    const how = named(symbol);
+    stage.setAttribute("aria-label", `Drive ${board.id}. ${named((name) => name.replace(/_/g, " ")) || "Nothing acts here"}. Space pauses, R restarts, N is another start.`);
 
     let { constants } = code;
     let seed = big(Math.floor(Math.random() * 2 ** 32));
@@ -650,14 +651,13 @@
         const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
         const poses = mixedPoses(past, now, part);
         const seenFrom = windowOf(picture, poses);
+        paint(pen, box, seenFrom, placed(picture, poses, seenFrom));
         const beside = ghostAt(part);
         if (beside) {
-          pen.globalAlpha = 0.32;
-          const shapes = placed(picture, beside.poses, seenFrom).filter(([what]) => what !== "magnifier");
-          paint(pen, box, seenFrom, shapes, ["body", "mark", "hole", "frame"]);
+          pen.globalAlpha = 0.35;
+          paint(pen, box, seenFrom, placed(picture, beside.poses, seenFrom), ["body", "mark"]);
           pen.globalAlpha = 1;
         }
-        paint(pen, box, seenFrom, placed(picture, poses, seenFrom));
       }
       // Numbers that change sixty times a second cannot be read, and cost more than the step.
       const moment = performance.now();
