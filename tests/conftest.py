@@ -1,6 +1,7 @@
 """Options of the test command."""
 
 import pytest
+from browsers import browser, browsing  # noqa: F401 (fixtures)
 
 
 def pytest_addoption(parser):

@@ -56,7 +56,7 @@ def about(files):
 
 def load(folder):
     told = about(read_files(folder))
-    policies = tuple((seed, None) for seed in told.seeds)
+    policies = tuple((seed, SimpleNamespace(architecture=None, arrays={})) for seed in told.seeds)
     return Submission(**vars(told), policies=policies, folder=Path(folder))
 
 

@@ -7,10 +7,7 @@ import math
 import os
 import re
 import runpy
-import shutil
 import threading
-import time
-import warnings
 import xml.etree.ElementTree as ElementTree
 from functools import partial
 from pathlib import Path
@@ -19,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import sync_playwright
+from browsers import until
 from toy_pendulum import Swing
 
 from lag_envs.leaderboard.board import Board
@@ -42,11 +39,6 @@ HOSTILE = (
     "javascript:window.hacked=1",
     "Ω" * 300,
     "constructor",
-)
-CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium"))
-MISSING = (
-    "THERE IS NO CHROMIUM, SO NO TEST OF THE LEADERBOARD'S PAGE IN A BROWSER WAS RUN: install chromium, or "
-    "name one in the variable CHROMIUM"
 )
 #: Roles of what must have a name for those who do not see it.
 NAMED = {"button", "combobox", "slider", "searchbox", "radio", "checkbox", "link", "image", "img", "region"}
@@ -97,50 +89,18 @@ def served(folder):
         server.shutdown()
 
 
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        warnings.warn(MISSING, stacklevel=1)
-        pytest.skip(MISSING)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM)
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
-def open_page(browser, folder):
-    """Open a page; in the end it must have met no error and asked nobody else for anything."""
-    opened = []
+def open_page(browsing, folder):
+    """Open a page of the site."""
 
     def open_it(name="PivotedBar-v0", root=None, **options):
         root = root or folder.as_uri()
-        page = browser.new_page(**{"viewport": {"width": 1280, "height": 900}} | options)
-        wrong = []
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on(
-            "console", lambda said: said.type in ("error", "warning", "assert") and wrong.append(said.text)
-        )
-        page.on("request", lambda asked: asked.url.startswith((root, "data:")) or wrong.append(asked.url))
-        opened.append((page, wrong))
-        page.goto(f"{root}/{name}.html")
+        page = browsing.open(f"{root}/{name}.html", root, **options)
         if options.get("java_script_enabled", True) and name != "index":
             until(page, "document.querySelectorAll('.episode option').length >= 2")
         return page
 
-    yield open_it
-    for page, wrong in opened:
-        page.close()
-        assert not wrong
-
-
-def until(page, expression, wait=60.0):
-    """Wait until an expression is true; Playwright's own way is to eval, which the page's rules forbid."""
-    end = time.monotonic() + wait
-    while not (value := page.evaluate(expression)):
-        assert time.monotonic() < end, expression
-        page.wait_for_timeout(20)
-    return value
+    return open_it
 
 
 def clean(text):
@@ -391,7 +351,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     build({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
     assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
-    assert sum(name.startswith("assets/") for name in left) == 2 + len(board_pages.AGENTS)
+    assert sum(name.startswith("assets/") for name in left) == 4 + len(board_pages.AGENTS)
 
 
 def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):

@@ -560,6 +560,10 @@ def run_hyperparams(args: argparse.Namespace) -> int:
 # --- leaderboard, verify, export ---
 
 
+def _replay(function: str) -> Callable[..., Any]:
+    return lambda *arguments: getattr(import_module("lag_envs.replay"), function)(*arguments)
+
+
 def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
     """Return a function of the leaderboard, imported when it is called; its errors become UserErrors."""
 
@@ -786,6 +790,19 @@ examples:
   lag-envs verify leaderboard/inbox/* --ray auto     on the machines of a Ray cluster""",
         _leaderboard("verify", "declare_verify"),
         _leaderboard("verify", "run_verify"),
+    ),
+    Command(
+        "replay",
+        "recompute a drive from its link",
+        """Recompute a drive, which the leaderboard's page made a link of, from its seed and keys, by
+arithmetic that has the same bits on every machine, and say whether the return that the link claims is true.
+The status is 0 where it is, 1 where it is not, 2 for a link that is damaged.
+
+examples:
+  lag-envs replay 'https://example.org/board/PivotedBar-v0.html#drive=1~...'
+  lag-envs replay '#drive=1~...' --file mine.py      of an environment of your own""",
+        _replay("declare"),
+        _replay("run"),
     ),
     Command(
         "cache",

@@ -14,7 +14,7 @@ from typing import Any
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.log import COMMIT, BoardError, Entry, State
 from lag_envs.leaderboard.pending import Check, finish
-from lag_envs.leaderboard.standings import board_data
+from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.tables import columns
 
 #: How each action is called; the first line of each is its plainest use.
@@ -393,7 +393,7 @@ def _pin(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from lag_envs.leaderboard.site.build import build
 
-    build(board_data(Board(args.board)), args.out, args.url)
+    build(page_data(Board(args.board)), args.out, args.url)
     print(f"{args.out / 'index.html'}")
     return 0
 
@@ -410,7 +410,7 @@ def _serve(args: argparse.Namespace) -> int:
             pass
 
     with tempfile.TemporaryDirectory() as folder:
-        build(board_data(Board(args.board)), Path(folder))
+        build(page_data(Board(args.board)), Path(folder))
         try:
             server = ThreadingHTTPServer(("127.0.0.1", args.port), partial(Quiet, directory=folder))
         except (OSError, OverflowError) as error:

@@ -16,6 +16,24 @@ from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
 
 
+def page_data(board: Board) -> dict[str, Any]:
+    """Return what `board_data` does, with what only the page needs: agents that run there, drives by hand."""
+    from lag_envs.leaderboard.drives import best_drives
+    from lag_envs.leaderboard.site.driving import agent
+    from lag_envs.leaderboard.submission import load
+
+    data, state, drives = board_data(board), board.read(), best_drives(board.folder)
+    results = {entry.id: entry for entry in state.boards.get(data["protocol"], {}).values()}
+    for env in data["environments"]:
+        if env["frozen"]:
+            continue
+        env["drives"] = drives.get(env["id"], [])
+        for row in env["rows"]:
+            middle, _ = shown_episodes(board.result(results[row["id"]]))
+            row["agent"] = agent(load(board.submission(row["id"])).policies[middle][1])
+    return data
+
+
 def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     """Return all that page and tables show.
 

@@ -35,8 +35,12 @@ class Exact:
 
     Rational, mpf, pi = Fraction, None, Fraction(math.pi)
 
+    def __init__(self, functions: Any = math) -> None:
+        self._functions = functions
+
     def __getattr__(self, name: str) -> Any:
-        return lambda x: Fraction(getattr(math, "atan" if name == "arctan" else name)(float(x)))
+        found = getattr(self._functions, "atan" if name == "arctan" else name)
+        return lambda x: Fraction(found(float(x)))
 
 
 def exactly(parameters: Mapping[str, float]) -> dict[Atom, Any]:

@@ -79,7 +79,6 @@ class Picture:
 
     def __init__(self, of: Any) -> None:
         self._of, self._scene = of, getattr(of, "scene", of)
-        self._targets = [t.name for t in of.formulas.target_boxes] if of is not self._scene else []
         bodies, window = of.bodies(), of.window()
         found = self._poses(Frame([0.0] * len(self._scene.state_names)))
         self.frames = list(found)
@@ -134,18 +133,34 @@ class Picture:
         view = self.window(poses)
         return [part for frame, shape in self.shapes for part in placed(shape, poses[frame], view)]
 
-    def _poses(self, now: Frame) -> dict[str, tuple]:
-        scene = self._scene
-        q = places(scene, now)
-        found = {GROUND: (0.0, 0.0)} | dict(scene.poses(Values("coordinate", q), Numeric))
-        seen = Now(
-            Values("coordinate", q),
-            Values("entry of the state", dict(zip(scene.state_names, now.state, strict=True))),
-            Values("control", _filled(scene.control_names, now.share)),
-            Values("target", _filled(self._targets, 0.0 if now.target is None else now.target)),
-        )
-        found |= indicated(self._of, seen)
-        return {frame: Pose(*pose) for frame, pose in found.items()}
+    def _poses(self, now: Frame) -> dict[str, Pose]:
+        return poses_of(self._of, now)
+
+
+def poses_of(of: Any, now: Frame, xp: Any = None) -> dict[str, Pose]:
+    """Return where the frames of a scene or a task are.
+
+    Parameters
+    ----------
+    of : Scene or Task
+        Whose frames.
+    now : Frame
+        The moment, or many of them.
+    xp : namespace, optional
+        Functions for other numbers than floats and arrays.
+    """
+    scene = getattr(of, "scene", of)
+    targets = [t.name for t in of.formulas.target_boxes] if of is not scene else []
+    q = places(scene, now)
+    found = {GROUND: (0.0, 0.0)} | dict(scene.poses(Values("coordinate", q), xp or Numeric))
+    seen = Now(
+        Values("coordinate", q),
+        Values("entry of the state", dict(zip(scene.state_names, now.state, strict=True))),
+        Values("control", _filled(scene.control_names, now.share)),
+        Values("target", _filled(targets, 0.0 if now.target is None else now.target)),
+    )
+    found |= indicated(of, seen, xp or Seen)
+    return {frame: Pose(*pose) for frame, pose in found.items()}
 
 
 def no_place(of: Any, where: str, frame: str, known: Sequence[str]) -> FormulaError:
@@ -167,10 +182,10 @@ def check_shapes(of: Any, frame: str, shapes: Any) -> None:
             )
 
 
-def indicated(of: Any, now: Now) -> dict[str, tuple]:
+def indicated(of: Any, now: Now, xp: Any = Seen) -> dict[str, tuple]:
     """Return the poses of a scene's or a task's indicators, or raise a FormulaError."""
     with formula(of, "indicators"):
-        found = of.indicators(now, Seen)
+        found = of.indicators(now, xp)
         if not isinstance(found, Mapping):
             raise FormulaError(f"it must return places by frame, got {found!r:.60}")
         for frame, pose in found.items():

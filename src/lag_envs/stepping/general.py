@@ -62,11 +62,12 @@ class SeriesStepper:
 
     # --- constants ------------------------------------------------------------------------------------------
 
-    def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
-        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code."""
-        return _evaluated(self._whole.constants, parameters) | {
-            f"p_{name}": float(parameters[name]) for name in self._parameters
-        }
+    def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
+        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code.
+
+        `functions` has sine, cosine and the like.
+        """
+        return _evaluated(self.expressions(), parameters, functions)
 
     # --- from the state and back ----------------------------------------------------------------------------
 
@@ -170,14 +171,24 @@ class SeriesStepper:
         Unfused, it gives the bits of plain + - * / √ and comparisons on any machine, see `Plain`.
         """
         if (absent, fused) not in self._codes:
-            record = self._lowering.without(*self._parts, absent, fused)
-            self._codes[absent, fused] = StepCode(self, record, absent, fused)
+            self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)
         return self._codes[absent, fused]
 
+    def record(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesRecord:
+        """Return what is stepped, without the terms of constants that are zero."""
+        return self._lowering.without(*self._parts, absent, fused)
 
-def _evaluated(constants: Mapping[str, Expr], parameters: Mapping[str, float]) -> dict[str, float]:
+    def expressions(self) -> dict[str, Expr]:
+        """Return the numbers that a step needs, as expressions in the parameters."""
+        own = {f"p_{name}": Expr.of(parameter(name)) for name in self._parameters}
+        return dict(self._whole.constants) | own
+
+
+def _evaluated(
+    constants: Mapping[str, Expr], parameters: Mapping[str, float], functions: Any = math
+) -> dict[str, float]:
     """Return the values of a record's constants, each rounded once."""
-    numbers = evaluate(list(constants.values()), exactly(parameters), math)
+    numbers = evaluate(list(constants.values()), exactly(parameters), functions)
     return {name: float(value) for name, value in zip(constants, numbers, strict=True)}
 
 

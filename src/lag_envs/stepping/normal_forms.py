@@ -105,9 +105,9 @@ class NormalForm:
         """Return the exact flow for control steps of this length."""
         return self.stepper(dt).flow
 
-    def constants(self, parameters: Mapping[str, float]) -> dict[str, float]:
-        """Return the constants, each rounded once."""
-        numbers = evaluate([self.inertia, *self.expressions.values()], exactly(parameters), Exact())
+    def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
+        """Return the constants, each rounded once; `functions` has sine, cosine and the like."""
+        numbers = evaluate([self.inertia, *self.expressions.values()], exactly(parameters), Exact(functions))
         return {name: _float(x, numbers[0]) for name, x in zip(self.expressions, numbers[1:], strict=True)}
 
     # --- one control step ----------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ def _fma(a: Any, b: Any, c: Any) -> Any:
 
 
 #: Every operation on Python's floats, with the bits of machine code (but for the functions of its own).
-_IEEE: dict[str, Callable] = _FLOAT | {
+IEEE: dict[str, Callable] = _FLOAT | {
     "/": _divide,
     "sqrt": lambda a: math.nan if a < 0.0 else math.sqrt(a),
     "floor": lambda a: math.copysign(math.floor(a), a) if math.isfinite(a) else a,
@@ -378,7 +378,7 @@ def evaluate(
     >>> evaluate(operations, {"a": 1.0, "b": -0.0})[results[0]]
     -inf
     """
-    table = _IEEE | dict(functions or {})
+    table = IEEE | dict(functions or {})
     known = dict(values)
     for name, op, args in operations:
         known[name] = table[op](*(known[a] if isinstance(a, str) else a for a in args))

@@ -324,6 +324,8 @@ class Task:
         """Return a step's chance of what has a chance per interval: a second has as many for any `dt`."""
         if self._recording is not None:
             return self._recording.chance(per_interval)
+        if self.dt == self.interval:
+            return per_interval
         return -math.expm1(self.dt / self.interval * math.log1p(-per_interval))
 
     @property

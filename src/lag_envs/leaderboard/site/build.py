@@ -20,6 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from lag_envs import store
+from lag_envs.leaderboard.site import driving
 from lag_envs.leaderboard.site.scenery import Scenery, describe
 
 #: Names the files that the last build wrote; only these are ever removed.
@@ -123,16 +124,24 @@ def render(data: Mapping[str, Any], url: str = "") -> tuple[dict[str, str], dict
 
     style = keep("site", "css", (STATIC / "site.css").read_text("utf-8"))
     script = keep("site", "js", (STATIC / "site.js").read_text("utf-8"))
+    drive = keep("drive", "js", (STATIC / "drive.js").read_text("utf-8"))
     boards, taken = [], {"index"}
     for given in data["environments"]:
         scenery = Scenery(str(given["id"]))
         board = _board(_clean(given), data["protocol"], scenery)
         board["page"] = _unused(board["page"], taken)
+        code = None if board["frozen"] else driving.script(str(given["id"]))
+        board["code"] = code and keep(f"{board['page']}-drive", "js", code)
         for i, row in enumerate(board["rows"]):
             own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")
             row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
-            replays = row.pop("replays")
+            replays, live = row.pop("replays"), row.pop("agent")
             row["file"] = None
+            row["live"] = (
+                keep(f"{board['page']}-{i}-live", "js", f"lagEnvs.put({_json(live)});\n")
+                if live and code
+                else None
+            )
             if replays:
                 # The script that fetches the file knows it by this key.
                 episodes = _json([scenery.episode(replay) for replay in replays])
@@ -150,8 +159,9 @@ def render(data: Mapping[str, Any], url: str = "") -> tuple[dict[str, str], dict
     templates.filters |= filters | {"about": _about}
     templates.globals |= {
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
-        "script": script, "protocol": data["protocol"], "value_of": value_of, "embed": _embedded,
-        "url": url and url.rstrip("/") + "/", "preview": next((b["preview"] for b in boards), None),
+        "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
+        "embed": _embedded, "url": url and url.rstrip("/") + "/",
+        "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]
@@ -210,6 +220,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "title": given["id"],
         "about": [],
         "difficulty": "",
+        "drives": [],
     }
     board |= {"protocol": protocol} | given | describe(given["id"])
     board["rows"] = [_row(dict(row)) for row in given["rows"]]
@@ -233,7 +244,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
     empty: dict[str, Any] = dict.fromkeys(
         [c.key for c in COLUMNS]
-        + ["interval", "license", "description", "hardware", "id", "above", "alike", "added"]
+        + ["interval", "license", "description", "hardware", "id", "above", "alike", "added", "agent"]
     )
     empty |= {"looks_like": "", "reference": False}
     row = empty | {"authors": [], "curves": [], "profile": [], "kind": "learned", "state": "verified"} | row

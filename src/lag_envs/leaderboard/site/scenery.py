@@ -129,6 +129,8 @@ class Scenery:
             "returns": column(np.concatenate([[0.0], np.cumsum(rewards)]), UNIT),
         }
         kept = {key: value for key, value in replay.items() if key not in ("states", "actions", "rewards")}
+        if "reset_seed" in kept:  # JavaScript's numbers would round it
+            kept["reset_seed"] = str(kept["reset_seed"])
         dt = replay.get("dt") or (self._task.dt if self._task else 1.0)
         poses = self._poses(states, actions, replay.get("target"), dt)
         return {**kept, "unit": UNIT, "steps": steps, **columns, "poses": poses}

@@ -3,7 +3,8 @@
  *
  * What comes from submissions is untrusted: it becomes text (textContent) or numbers, never markup.
  *
- * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, start.
+ * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, start.
+ * Driving itself is drive.js, which is loaded when somebody wants to.
  */
 (() => {
   const TURN = 2 * Math.PI;
@@ -335,9 +336,9 @@
   const fetched = new Map();
   const waiting = new Map();
 
-  /** Called by the files in assets/, each of which holds the episodes of one agent. */
-  function put(replays) {
-    waiting.get(document.currentScript?.getAttribute("src"))?.(replays);
+  /** Called by the files in assets/, each of which holds the episodes of one agent, an agent, or a program. */
+  function put(what) {
+    waiting.get(document.currentScript?.getAttribute("src"))?.(what);
   }
 
   /** Load a file as a script, which works from file: where fetch does not. */
@@ -350,12 +351,17 @@
           fetched.delete(file);
           reject(new Error(`${file} cannot be loaded`));
         });
+        // What was put is there already; else the script could not be run.
+        script.addEventListener("load", () => reject(new Error(`This browser cannot run ${file}`)));
         document.head.append(script);
       });
-      fetched.set(file, promise.then((replays) => replays.map(prepare)));
+      fetched.set(file, promise);
     }
     return fetched.get(file);
   }
+
+  /** The episodes in a file. */
+  const episodes = (file) => load(file).then((replays) => replays.map(prepare));
 
   /** An episode with numbers for its columns. */
   function prepare(replay) {
@@ -558,7 +564,7 @@
       } else {
         let replays = [];
         try {
-          replays = await load(board.rows[row].file);
+          replays = await episodes(board.rows[row].file);
         } catch (error) {
           said.textContent = String(error.message);
           return;
@@ -1184,6 +1190,46 @@
     place.replaceChildren(svg);
   }
 
+  // --- drive -----------------------------------------------------------------------------------------------
+
+  /** Let people drive: the program comes when somebody asks for it, or follows a link of a drive. */
+  function startDrive() {
+    const root = find("#drive");
+    if (!root) return null;
+    const [begin, said] = [find(".begin", root), find(".status", root)];
+    const tools = { make, find, text, symbol, fit, paint, placed, windowOf, posesAt, load, episodes, calm };
+    let driver = null;
+
+    async function open(wanted) {
+      if (driver) return;
+      begin.disabled = true;
+      said.textContent = "Loading …";
+      try {
+        const drive = await load(root.dataset.program);
+        const lacking = drive.lacking();
+        if (lacking.length) throw new Error(`This browser lacks what driving needs: ${lacking.join(", ")}.`);
+        const code = await load(root.dataset.code);
+        if (driver) return;
+        said.textContent = "";
+        driver = drive.open(find(".driver", root), board, code, tools);
+        begin.hidden = true;
+        if (wanted) find(".stage", root).focus();
+        else root.scrollIntoView();
+      } catch (error) {
+        said.textContent = String(error.message);
+        begin.disabled = false;
+      }
+    }
+
+    const linked = () => {
+      if (/^#(drive=|seed=)/.test(location.hash)) open(false);
+    };
+    begin.addEventListener("click", () => open(true));
+    window.addEventListener("hashchange", linked);
+    linked();
+    return () => driver?.show();
+  }
+
   // --- overview --------------------------------------------------------------------------------------------
 
   function strip(place, { rows, optimum }) {
@@ -1204,7 +1250,7 @@
 
   // --- start -----------------------------------------------------------------------------------------------
 
-  window.lagEnvs = { put, placed, windowOf };
+  window.lagEnvs = { put, load, placed, windowOf };
   const data = JSON.parse(find("#data").textContent);
   document.documentElement.classList.add("js");
   readColours();
@@ -1217,7 +1263,7 @@
   } else {
     board = data;
     startRanking();
-    redraw.push(startPlayer(), startCharts(), () => {
+    redraw.push(startPlayer(), startCharts(), startDrive(), () => {
       for (const canvas of all("[data-poster]")) poster(canvas, board);
     });
     startFilm();

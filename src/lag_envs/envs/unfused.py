@@ -1,0 +1,463 @@
+"""The environment's step without fused operations: the same bits on any machine, in Python and JavaScript.
+
+The formulas of task and scene and the general series are recorded as for the compiled step and printed as a
+script (`lag_envs.stepping.script`). All scenes are stepped by the general series here, those with an exact
+flow of their own too: its code has one form, loops included, whereas the flows call fused operations and the
+C library.
+
+A script has seven functions. All work on arrays of numbers: ``k``, the constants; ``f``, the rows of one
+environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
+
+=================  ==========================================================================================
+``derive(k)``      fills in the constants that follow from the first ones, where one of these was changed
+``start(f, d, k)`` fills in where an episode starts, from one draw for each entry of state and target
+``lift(f, k)``     fills in what the formulas need besides the state: call it where the state was set by hand
+``move(f, a, k)``  takes a step: control, motion, reward, ending
+``kick(f, d, k)``  the random disturbance after it
+``observe(f, k)``  fills in the observation
+``poses(f, p, k)`` fills in where the picture's frames are, x, y, angle and part of each
+=================  ==========================================================================================
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.envs.actions import Actions
+from lag_envs.envs.single import key_of
+from lag_envs.mechanics.algebra import FormulaError, evaluate
+from lag_envs.mechanics.recording import parameter
+from lag_envs.scenes import picture
+from lag_envs.scenes.base import ORDER
+from lag_envs.scenes.shapes import Frame
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.flows import split
+from lag_envs.stepping.general import usual_order
+from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Language, Script, motion, run_python
+from lag_envs.tasks.base import Task
+
+
+class Rows(NamedTuple):
+    """Where the numbers of an environment lie in ``f``.
+
+    Attributes
+    ----------
+    y : slice
+        The state, and cosine and sine of its angle where the scene has a normal form.
+    g, u, o : slice
+        Targets, controls, observation.
+    turned : slice
+        Places that the state leaves out, for the picture.
+    reward, ended, refused : int
+        Of the last step; the latter two are 1.0 or 0.0.
+    """
+
+    y: slice
+    g: slice
+    u: slice
+    o: slice
+    turned: slice
+    reward: int
+    ended: int
+    refused: int
+
+
+class UnfusedProgram:
+    """The step of a task as a script.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+
+    Attributes
+    ----------
+    rows : Rows
+        Where the numbers lie.
+    given : dict of str to float
+        The first constants, in order, which the script takes as they are. One, ``strength``, is 1 in the
+        environment: what actions in [-1, 1] are multiplied by.
+    derived : dict of str to float
+        Those behind them, which follow: each rounded once.
+    frames : list of str
+        The picture's frames; empty where there is no picture.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task, formulas, scene = task, task.formulas, task.scene
+        self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
+        own = formulas.constants()
+        scenes = scene._constants()
+        self.given = {name: value for name, value in own.items() if name not in scenes and name != "x"}
+        self.given["strength"] = 1.0
+        fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
+        #: Parameters that follow from others, and how.
+        self.made = {
+            name: fields[name]
+            for name in scene._numbers()
+            if fields[name] is not None and fields[name](scene) == getattr(scene, name)
+        }
+        expressions = self._stepper.expressions()
+        self._motion = {f"motion_{name}": e for name, e in expressions.items()}
+        # Functions of parameters too have the same bits everywhere.
+        parameters, functions = {n: getattr(scene, n) for n in scene._numbers()}, ElementaryTrace()
+        motion = self._stepper.constants(parameters, functions)
+        gone = frozenset(name for name, value in motion.items() if value == 0.0)
+        self.derived = self._form.constants(parameters, functions) if self._form else {}
+        self.derived |= {f"motion_{name}": value for name, value in motion.items()}
+        numbers = self.given | self.derived
+        self._place = {name: f"k[{i}]" for i, name in enumerate(numbers)}
+        #: Constants for formulas; what is zero leaves no code.
+        self._k = {name: 0.0 if numbers[name] == 0.0 else place for name, place in self._place.items()}
+        self._record = self._stepper.record(gone, fused=False)
+        self._order = vars(scene).get(ORDER) or usual_order(task.dt)
+        self.states = len(formulas.state)
+        self._width = self._form.width if self._form else self.states
+        self._turned = len([n for n in scene._layout.left_out if n in scene._layout.names])
+        sizes = (self._width, formulas.targets, formulas.controls, len(formulas.observation), self._turned)
+        ends = np.cumsum((0, *sizes)).tolist()
+        self.size = ends[-1] + 3
+        y, g, u, o, turned = (slice(a, b) for a, b in pairwise(ends))
+        self.rows = Rows(y, g, u, o, turned, *range(ends[-1], self.size))
+        self.frames: list[str] = []
+
+    # --- scripts --------------------------------------------------------------------------------------------
+
+    @property
+    def constants(self) -> list[float]:
+        """All constants."""
+        return [*self.given.values(), *self.derived.values()]
+
+    @cached_property
+    def python(self) -> str:
+        """The script in Python."""
+        return self.script(PYTHON)
+
+    @cached_property
+    def javascript(self) -> str:
+        """The script in JavaScript."""
+        return self.script(JAVASCRIPT)
+
+    @cached_property
+    def digest(self) -> str:
+        """All that decides the bits of an episode, in short."""
+        numbers = repr(self.constants)
+        return hashlib.sha256(f"{self.python.partition('def poses(')[0]}{numbers}".encode()).hexdigest()[:8]
+
+    def script(self, language: Language) -> str:
+        """Return the functions of the module's docstring in a language."""
+        t = Script(language)
+        t.function("derive", "k", lambda: self._derive(t))
+        t.function("start", "f, d, k", lambda: self._start(t))
+        t.function("lift", "f, k", lambda: self._write_state(t, self._read(t, self.rows.y)[: self.states]))
+        t.function("move", "f, a, k", lambda: self._move(t))
+        t.function("kick", "f, d, k", lambda: self._kick(t))
+        t.function("observe", "f, k", lambda: self._observe(t))
+        t.function("poses", "f, p, k", lambda: self._poses(t))
+        return t.text()
+
+    def _read(self, t: Script, rows: slice, array: str = "f") -> list[str]:
+        return [t.put("read", array, i) for i in range(rows.start, rows.stop)]
+
+    def _write(self, t: Script, rows: slice | int, values: Sequence, array: str = "f") -> None:
+        first = rows if isinstance(rows, int) else rows.start
+        for i, value in enumerate(values):
+            t.say("write", array, first + i, t.literal(value))
+
+    def _write_state(self, t: Script, y: Sequence) -> None:
+        """Write a state, and cosine and sine of its angle."""
+        self._write(t, self.rows.y, self._lifted(t, y))
+
+    def _lifted(self, t: Script, y: Sequence) -> list[Any]:
+        angle = self._form.angle if self._form else None
+        if angle is None:
+            return list(y)
+        return [*y, *t.formula(lambda xp, x: [xp.cos(x), xp.sin(x)], {"x": y[angle]})]
+
+    def _run(self, t: Script, formula: Callable, *given: Sequence) -> list[Any]:
+        """Write a formula of lists of numbers and of the constants."""
+        sizes = [len(values) for values in given]
+        inputs = {f"i{n}": value for n, value in enumerate(value for values in given for value in values)}
+
+        def recorded(xp: Any, *numbers: Any) -> list:
+            *lists, rest = split(numbers, *sizes)
+            return list(formula(xp, *lists, SimpleNamespace(**dict(zip(self._k, rest, strict=True)))))
+
+        return t.formula(recorded, inputs | self._k)
+
+    def _derive(self, t: Script) -> None:
+        names = self.task.scene._numbers()
+        known: dict[str, Any] = {n: self._place[f"self_{n}"] for n in names if n not in self.made}
+        for name, made in self.made.items():
+
+            def follows(xp: Any, *numbers: Any, made: Callable = made, given: tuple = tuple(known)) -> list:
+                return [made(_Numbers(self.task.scene, dict(zip(given, numbers, strict=True))))]
+
+            (known[name],) = t.formula(follows, known)
+        for name in self.made:
+            self._write(t, list(self._place).index(f"self_{name}"), [known[name]], "k")
+
+        def constants(xp: Any, *numbers: Any) -> list:
+            values = {parameter(n): x for n, x in zip(names, numbers, strict=True)}
+            found = evaluate(self._motion.values(), values, xp)
+            if self._form:
+                inertia, *rest = evaluate([self._form.inertia, *self._form.expressions.values()], values, xp)
+                found = [x / inertia for x in rest] + found
+            return found
+
+        results = t.formula(constants, {n: known[n] for n in names})
+        self._write(t, len(self.given), results, "k")
+
+    def _start(self, t: Script) -> None:
+        formulas, n = self._formulas, self.states
+
+        def start(xp: Any, draws: Sequence, k: Any) -> list:
+            numbers = vars(k)
+            state = [numbers[f"centre{i}"] + numbers[f"half{i}"] * (2.0 * draws[i] - 1.0) for i in range(n)]
+            return state + formulas.sample_targets(draws[n:], numbers)
+
+        draws = self._read(t, slice(0, n + formulas.targets), "d")
+        found = self._run(t, start, draws)
+        self._write_state(t, found[:n])
+        self._write(t, self.rows.g, found[n:])
+        for rows in (self.rows.u, self.rows.turned, slice(self.rows.reward, self.size)):
+            self._write(t, rows, [0.0] * (rows.stop - rows.start))
+
+    def _move(self, t: Script) -> None:
+        formulas, scene, rows = self._formulas, self.task.scene, self.rows
+        y, g, turned = (self._read(t, part) for part in (rows.y, rows.g, rows.turned))
+        actions = self._read(t, slice(0, formulas.actions), "a")
+
+        def control(xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
+            if formulas.clipped:
+                a = [xp.where(x < -1.0, -1.0, xp.where(x > 1.0, 1.0, x)) * k.strength for x in a]
+            return formulas.control(xp, a, y, g, k)
+
+        u = self._run(t, control, actions, y, g)
+        z, refused = self._advance(t, y[: self.states], u)
+        z = self._lifted(t, z)
+
+        def judge(xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> list:
+            reward, ended = formulas.judge(xp, y, z, u, g, k)
+            if formulas.has_last:
+                reward = xp.where(ended, formulas.last(xp, y, z, u, g, k), reward)
+            return [reward, xp.where(ended, 1.0, 0.0)]
+
+        judged = self._run(t, judge, y, z, u, g)
+
+        def turn(xp: Any, turned: Sequence, y: Sequence, z: Sequence, k: Any) -> list:
+            rates = [picture.turning(scene, x) for x in (y, z)]
+            return [
+                x + 0.5 * k.dt * (before + after) for x, before, after in zip(turned, *rates, strict=True)
+            ]
+
+        turned = self._run(t, turn, turned, y[: self.states], z[: self.states])
+        self._write(t, rows.y, z)
+        self._write(t, rows.u, u)
+        self._write(t, rows.turned, turned)
+        self._write(t, rows.reward, judged)
+        self._write(t, rows.refused, [t.select(refused, 1.0, 0.0)])
+
+    def _advance(self, t: Script, y: Sequence, u: Sequence) -> tuple[list, str]:
+        """Write the motion; return the state at the step's end, and whether the step was refused."""
+        stepper, record, n, dt = self._stepper, self._record, self._record.size, self._k["dt"]
+        wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
+        moving = [f"{letter}{i}" for letter in "qv" for i in range(n)]
+
+        def named(k: Any) -> dict[str, Any]:
+            return {name.removeprefix("motion_"): x for name, x in vars(k).items()}
+
+        def prepare(xp: Any, y: Sequence, u: Sequence, k: Any) -> list:
+            found = stepper.prepare(xp, y, u, named(k))
+            return [found[name] for name in (*wanted, *moving)]
+
+        def finish(xp: Any, q: Sequence, v: Sequence, y: Sequence, u: Sequence, k: Any) -> list:
+            return stepper.finish(xp, q, v, y, u, k.dt, named(k))
+
+        given = dict(zip((*wanted, *moving), self._run(t, prepare, y, u), strict=True))
+        inputs = {name: given.get(name) or self._k[f"motion_{name}"] for name in record.given}
+        q, v, refused = motion(
+            t, record, inputs, [given[x] for x in moving[:n]], [given[x] for x in moving[n:]], dt, self._order
+        )
+        return self._run(t, finish, q, v, y, u), refused
+
+    def _kick(self, t: Script) -> None:
+        if self._formulas.draws:
+            y, d = self._read(t, self.rows.y), self._read(t, slice(0, self._formulas.draws), "d")
+            self._write(t, self.rows.y, self._run(t, self._formulas.kick, d, y))
+
+    def _observe(self, t: Script) -> None:
+        y, g = self._read(t, self.rows.y), self._read(t, self.rows.g)
+        self._write(t, self.rows.o, self._run(t, self._formulas.observe, y, g))
+
+    def _poses(self, t: Script) -> None:
+        rows, n = self.rows, self.states
+        try:
+            shown = picture.Picture(self.task)
+        except FormulaError:
+            return
+        self.frames = shown.frames if shown.shapes else []
+        if not self.frames:
+            return
+
+        def poses(
+            own: bool, xp: Any, y: Sequence, g: Sequence, u: Sequence, turned: Sequence, k: Any
+        ) -> list:
+            of = self._formulas._self(k) if own else self.task
+            found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
+            return [x for pose in found.values() for x in pose]
+
+        given = [self._read(t, part) for part in (slice(0, n), rows.g, rows.u, rows.turned)]
+        try:
+            found = self._run(t, partial(poses, True), *given)
+        except (TypeError, FormulaError):  # something else than arithmetic is done with the parameters
+            found = self._run(t, partial(poses, False), *given)
+        self._write(t, 0, found, "p")
+
+
+class _Numbers:
+    """A scene some of whose parameters are recorded numbers, for what follows from them."""
+
+    def __init__(self, scene: Any, numbers: dict[str, Any]) -> None:
+        self._scene, self._recorded = scene, numbers
+
+    def __getattr__(self, name: str) -> Any:
+        return self._recorded[name] if name in self._recorded else getattr(self._scene, name)
+
+
+class Unfused:
+    """An environment that is stepped by a task's script: the same bits everywhere, on plain Python.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``.
+    program : UnfusedProgram, optional
+        Its program, where there is one already.
+
+    Attributes
+    ----------
+    steps : int
+        Steps taken in this episode.
+
+    Examples
+    --------
+    >>> import gymnasium as gym, lag_envs
+    >>> from lag_envs.envs.unfused import Unfused
+    >>> env = Unfused(gym.make("PivotedBar-v0").unwrapped.task)
+    >>> observation = env.reset(7)
+    >>> observation, reward, terminated, truncated = env.step([0.5])
+    >>> reward.hex()
+    '-0x1.47ae13112c92dp-8'
+    """
+
+    def __init__(self, task: Task, program: UnfusedProgram | None = None) -> None:
+        self.task = task
+        self.program = program = program or UnfusedProgram(task)
+        self._functions = run_python(program.python)
+        self.numbers = [0.0] * program.size
+        self.constants = program.constants
+        self._actions = Actions(task.formulas.actions, task.formulas.choices)
+        self._key: Any = None
+        self.steps = 0
+
+    def reset(self, seed: int) -> list[float]:
+        """Begin the episode that a fresh environment begins with this seed; return the observation."""
+        from lag_envs.stepping.primitives import episode_key
+
+        self._key = episode_key(np.uint64(key_of(seed)), np.uint64(1))
+        self.steps = 0
+        self._functions["start"](
+            self.numbers, self._draws(self.program.states + self.task.formulas.targets), self.constants
+        )
+        return self.observe()
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Change a parameter of the scene, and what follows from it."""
+        self.constants[list(self.program.given).index(f"self_{name}")] = float(value)
+        self._functions["derive"](self.constants)
+
+    def _draws(self, count: int) -> list[float]:
+        from lag_envs.stepping.primitives import uniform
+
+        step = np.uint64(self.steps)
+        return [float(uniform(np.uint64(self._key), step, np.uint64(i))) for i in range(count)]
+
+    def step(self, action: Any) -> tuple[list[float], float, bool, bool]:
+        """Hold one control for one control interval.
+
+        Parameters
+        ----------
+        action : array_like
+            As the environment takes it.
+
+        Returns
+        -------
+        observation : list of float
+            The observation, before it is rounded to float32.
+        reward : float
+            The reward.
+        terminated, truncated : bool
+            Whether the episode is over.
+
+        Raises
+        ------
+        StepRefused
+            Where the step cannot be taken to full accuracy; nothing is changed then.
+        """
+        found = self._actions.one(action)
+        before = list(self.numbers)
+        f, k, rows = self.numbers, self.constants, self.program.rows
+        self._functions["move"](f, np.atleast_1d(found).tolist(), k)
+        if f[rows.refused]:
+            held = f[rows.u]
+            self.numbers[:] = before
+            raise self.task.formulas.refusal(self.state, held, self.task.dt, None, "the step")
+        self.steps += 1
+        reward, ended = f[rows.reward], f[rows.ended] > 0.0
+        if self.task.draws:
+            self._functions["kick"](f, self._draws(self.task.draws), k)
+        return self.observe(), reward, ended, self.steps >= self.task.limit
+
+    def observe(self) -> list[float]:
+        """Return the observation."""
+        self._functions["observe"](self.numbers, self.constants)
+        return self.numbers[self.program.rows.o]
+
+    @property
+    def state(self) -> list[float]:
+        """The state, in the order of ``scene.state_names``."""
+        return self.numbers[: self.program.states]
+
+    @state.setter
+    def state(self, state: Sequence[float]) -> None:
+        self.numbers[: self.program.states] = map(float, state)
+        self._functions["lift"](self.numbers, self.constants)
+
+    @property
+    def target(self) -> list[float]:
+        """The targets."""
+        return self.numbers[self.program.rows.g]
+
+    @target.setter
+    def target(self, target: Sequence[float]) -> None:
+        self.numbers[self.program.rows.g] = map(float, target)
+
+    @property
+    def control(self) -> list[float]:
+        """The controls applied last."""
+        return self.numbers[self.program.rows.u]
+
+    def poses(self) -> list[list[float]]:
+        """Return x, y, angle and part of each of the picture's frames; nothing where there is no picture."""
+        found = [0.0] * (4 * len(self.program.frames))
+        self._functions["poses"](self.numbers, found, self.constants)
+        return [found[i : i + 4] for i in range(0, len(found), 4)]

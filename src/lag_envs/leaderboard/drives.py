@@ -1,0 +1,68 @@
+"""The best drives by hand: links in the board's ``drives.txt``, each recomputed whenever the page is built.
+
+A line is a link and the name of who drove, with white space between. Empty lines, and those that begin with
+``# ``, count for nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lag_envs.leaderboard.files import read_plain
+from lag_envs.leaderboard.log import BoardError
+from lag_envs.replay import LinkError, read_link, replay
+
+FILE = "drives.txt"
+#: Bytes of the file, characters of a name, and drives of one environment that are shown.
+MOST, NAME, SHOWN = 2**22, 60, 10
+
+
+def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return for each environment its best drives, the best first.
+
+    Parameters
+    ----------
+    folder : Path
+        The board's folder.
+
+    Raises
+    ------
+    BoardError
+        For the first line that is no link and name, or whose claim is not true.
+    """
+    path = folder / FILE
+    try:
+        text = read_plain(path, MOST).decode()
+    except FileNotFoundError:
+        return {}
+    except (OSError, UnicodeDecodeError) as error:
+        raise BoardError(f"{path} cannot be read: {error}") from None
+    found: dict[str, list[dict[str, Any]]] = {}
+    seen: set[str] = set()
+    for i, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.startswith("# "):
+            continue
+        where = f"{path}, line {i}"
+        link, _, name = line.strip().partition(" ")
+        name = name.strip()
+        if not name or len(name) > NAME or not name.isprintable():
+            raise BoardError(f"{where}: write a link, a blank and a name of at most {NAME} characters")
+        try:
+            drive = read_link(link)
+            played = replay(drive)
+        except LinkError as error:
+            raise BoardError(f"{where}: {error}; remove the line") from error
+        if not played.true:
+            raise BoardError(
+                f"{where}: the claim is false: {drive.claimed!r} is claimed, {played.total!r} is true"
+            )
+        if not played.finished:
+            raise BoardError(f"{where}: the drive stops before its episode's end; remove the line")
+        anchor = f"#{link.rpartition('#')[2]}"
+        if anchor in seen:
+            raise BoardError(f"{where}: this drive is there already; remove the line")
+        seen.add(anchor)
+        entry = {"name": name, "link": anchor, "return": played.total, "score": played.score}
+        found.setdefault(drive.id, []).append(entry)
+    return {id: sorted(drives, key=lambda drive: -drive["return"])[:SHOWN] for id, drives in found.items()}

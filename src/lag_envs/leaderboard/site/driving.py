@@ -1,0 +1,213 @@
+"""What a browser needs to drive an environment: its step as a script, sliders, and agents that run live."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from lag_envs.envs.unfused import Unfused
+from lag_envs.leaderboard.policies import MLP, Linear, Policy, Table
+from lag_envs.leaderboard.site.scenery import picture
+from lag_envs.mechanics.algebra import FormulaError
+from lag_envs.replay import LEVELS, VERSION
+from lag_envs.scenes import StepRefused
+from lag_envs.scenes.picture import Picture
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
+
+FUNCTIONS = ("derive", "start", "lift", "move", "kick", "observe", "poses")
+#: Where sliders have their marks, as multiples of a parameter's value.
+MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
+
+
+def script(env_id: str) -> str | None:
+    """Return the file with which a page drives an environment of the package; None for an unknown id."""
+    kind: Any = TASKS.get(env_id)
+    return script_of(kind) if kind else None
+
+
+@cache
+def script_of(kind: type[Task]) -> str:
+    """Return the file with which a page drives a task.
+
+    Parameters
+    ----------
+    kind : type
+        The task's class.
+
+    Returns
+    -------
+    str
+        JavaScript: a call of ``lagEnvs.put`` with the step's functions and what there is to know of them.
+    """
+    task = kind()
+    env = Unfused(task)
+    program, names = env.program, ", ".join(FUNCTIONS)
+    constants = ", ".join(map(_number, program.constants))
+    about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
+    about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return (
+        f'"use strict";\n(() => {{\n{program.javascript}'
+        f"lagEnvs.put({{ functions: {{ {names} }}, constants: [{constants}], about: {about} }});\n}})();\n"
+    )
+
+
+def _number(x: float) -> str:
+    return repr(x) if math.isfinite(x) else "NaN" if x != x else "Infinity" if x > 0.0 else "-Infinity"
+
+
+def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
+    """Return what the page knows of a step, in JSON types."""
+    task, program = env.task, env.program
+    formulas, rows = task.formulas, env.program.rows
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    resting = formulas.rest_action
+    form = task.scene._form
+    return {
+        "id": kind.id,
+        "version": VERSION,
+        "levels": LEVELS,
+        "digest": program.digest,
+        "dt": task.dt,
+        "limit": task.limit if math.isfinite(task.limit) else None,
+        "rows": {
+            name: [row.start, row.stop] if isinstance(row, slice) else row
+            for name, row in rows._asdict().items()
+        },
+        "size": program.size,
+        "states": program.states,
+        "starts": program.states + formulas.targets,
+        "draws": task.draws,
+        "controls": [
+            {"name": a.control, "unit": units[a.control], "low": a.low, "high": a.high, "values": a.values}
+            for a in formulas.acting
+        ],
+        "rest": resting if isinstance(resting, list) else [resting] * formulas.actions,
+        "frames": len(program.frames),
+        "targets": [{"name": t.name, "unit": t.unit} for t in formulas.target_boxes],
+        "angle": form.angle if form else None,
+        "sliders": sliders(kind, env),
+    }
+
+
+# --- sliders ------------------------------------------------------------------------------------------------
+
+
+def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
+    """Return the parameters that may be changed while driving.
+
+    Only such are offered whose other values the script steps as an environment made with them would be; what
+    the formulas do beyond arithmetic, in Python, does not reach the script. How each changes the picture is
+    told at `MARKS`.
+    """
+    task, program = env.task, env.program
+    names = list(program.given)
+    found = []
+    for name, unit in zip(task.scene._numbers(), _units(task), strict=True):
+        value = getattr(task.scene, name)
+        if name in program.made or not 0.0 < value < math.inf:
+            continue
+        try:
+            others = [kind(**{name: value * mark}) for mark in MARKS]
+        except (ValueError, TypeError, FormulaError):
+            continue
+        if all(_steps_as(env, name, other) for other in (others[0], others[-1])):
+            slider = {"name": name, "unit": unit, "at": names.index(f"self_{name}"), "value": value}
+            looks = [_look(other) for other in others]
+            found.append(slider | ({"looks": looks} if looks[0] != looks[-1] else {}))
+    acting = task.formulas.acting
+    if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
+        found.append({"name": "control limit", "unit": "", "at": names.index("strength"), "value": 1.0})
+    return found
+
+
+def _units(task: Task) -> list[str]:
+    fields = type(task.scene).__dataclass_fields__
+    return [fields[name].metadata["unit"] for name in task.scene._numbers()]
+
+
+def _look(task: Task) -> dict[str, Any]:
+    found = picture(Picture(task)) or {}
+    return {key: found.get(key) for key in ("shapes", "window")}
+
+
+def _steps_as(env: Unfused, name: str, other: Task) -> bool:
+    """Tell whether a script with another value of a parameter does what another task's does."""
+    if other.formulas.key != env.task.formulas.key or other.limit != env.task.limit:
+        return False
+    changed, own = Unfused(env.task, env.program), Unfused(other)
+    changed.set_parameter(name, getattr(other.scene, name))
+    if not np.allclose(changed.constants, own.constants, rtol=1e-13, atol=0.0):
+        return False
+    formulas = other.formulas
+    for one in (changed, own):
+        one.reset(1)
+        try:
+            for i in range(3):
+                one.step(
+                    formulas.rest_action if formulas.choices else [(0.7, -0.4, 0.1)[i]] * formulas.actions
+                )
+        except StepRefused:
+            return False
+    numbers = np.allclose(changed.numbers, own.numbers, rtol=1e-9, atol=1e-12)
+    return numbers and np.allclose(changed.poses(), own.poses(), atol=1e-9)
+
+
+# --- agents -------------------------------------------------------------------------------------------------
+
+
+def agent(policy: Policy) -> dict[str, Any] | None:
+    """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
+
+    Parameters
+    ----------
+    policy : Policy
+        The policy.
+    """
+    made = policy.architecture
+    about: dict[str, Any]
+    if isinstance(made, MLP):
+        about = {
+            "kind": "mlp",
+            "layers": made.layers,
+            "activation": made.activation,
+            "bins": made.bins,
+            "controls": made.controls,
+            "squash": made.squash,
+            "mean_limit": made.mean_limit,
+            "normalise": made.normalise and made.normalise.model_dump(),
+        }
+    elif isinstance(made, Linear):
+        about = {"kind": "linear"}
+    elif isinstance(made, Table):
+        agent: Any = policy.agent()
+        about = {
+            "kind": f"{made.kind} table",
+            "sums": made.sums.tolist(),
+            "axes": list(made.axes),
+            "mirror": made.mirror,
+            "sign": agent.sign,
+            "actions": made.actions,
+            "wrapped": agent.read.wrapped,
+            "interval": made.task.interval,
+        }
+    else:
+        return None
+    return about | {"arrays": {name: _array(x) for name, x in policy.arrays.items()}}
+
+
+def _array(array: Any) -> dict[str, Any]:
+    """Return an array as base64 of its bytes; of 32 bits each where that is all there is to them."""
+    short = array.astype("<f4")
+    exact = bool((short.astype(np.float64) == array).all())
+    data = np.ascontiguousarray(short if exact else array.astype("<f8"))
+    return {
+        "shape": list(array.shape),
+        "bits": 32 if exact else 64,
+        "data": base64.b64encode(data.tobytes()).decode(),
+    }

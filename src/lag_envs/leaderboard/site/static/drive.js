@@ -1,0 +1,945 @@
+"use strict";
+/* Driving an environment in the page. Loaded when somebody wants to.
+ *
+ * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
+ * Arrays as there: k constants, f the rows of one environment, a an action, d draws in [0, 1), p poses.
+ *
+ * In this order: random numbers, episodes, links, agents, the person's hands, the stage.
+ */
+(() => {
+  const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+
+  // --- random numbers --------------------------------------------------------------------------------------
+  // Those of lag_envs/stepping/primitives.py: SplitMix64's mix of key, step and index, in 64 bits.
+
+  const big = (x) => BigInt(x);
+  const BITS = 64;
+  const word = (x) => BigInt.asUintN(BITS, x);
+  const [GOLDEN, FIRST, SECOND] = ["0x9E3779B97F4A7C15", "0xBF58476D1CE4E5B9", "0x94D049BB133111EB"].map(big);
+  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, 16, 1].map(big);
+
+  function mixed(z) {
+    z = word((z ^ (z >> S30)) * FIRST);
+    z = word((z ^ (z >> S27)) * SECOND);
+    return z ^ (z >> S31);
+  }
+
+  const episodeKey = (key, episode) => mixed(word(mixed(key) + episode * GOLDEN));
+
+  /** Draw `index` of step `step`, in [0, 1). */
+  function uniform(key, step, index) {
+    return Number(mixed(word(key + (big(step) * DRAWS + big(index) + ONE) * GOLDEN)) >> S11) * 2 ** -53;
+  }
+
+  // --- episodes --------------------------------------------------------------------------------------------
+
+  /** An environment, stepped by the printed functions. */
+  class Episode {
+    constructor(code, seed, constants = code.constants) {
+      const { about } = code;
+      this.code = code;
+      this.k = Float64Array.from(constants);
+      this.f = new Float64Array(about.size);
+      this.kept = new Float64Array(about.size);
+      this.restart(seed);
+    }
+
+    restart(seed) {
+      const { functions, about } = this.code;
+      this.key = episodeKey(big(seed), ONE);
+      [this.steps, this.total, this.over] = [0, 0, ""];
+      functions.start(this.f, this.draws(about.starts), this.k);
+      functions.observe(this.f, this.k);
+    }
+
+    draws(count) {
+      return Float64Array.from({ length: count }, (_, i) => uniform(this.key, this.steps, i));
+    }
+
+    /** Hold an action for one interval; returns the reward. Afterwards `over` says how it ended, if it did. */
+    step(action) {
+      const { functions, about } = this.code;
+      const { rows } = about;
+      this.kept.set(this.f);
+      functions.move(this.f, action, this.k);
+      if (this.f[rows.refused] > 0) {
+        this.f.set(this.kept);
+        this.over = "refused";
+        return 0;
+      }
+      this.steps += 1;
+      const reward = this.f[rows.reward];
+      this.total += reward;
+      const ended = this.f[rows.ended] > 0;
+      if (about.draws) functions.kick(this.f, this.draws(about.draws), this.k);
+      functions.observe(this.f, this.k);
+      this.over = ended ? "terminated" : about.limit !== null && this.steps >= about.limit ? "truncated" : "";
+      return reward;
+    }
+
+    part(name) {
+      return this.f.subarray(...this.code.about.rows[name]);
+    }
+
+    get state() {
+      return this.f.subarray(0, this.code.about.states);
+    }
+
+    /** Where the frames are, [x, y, angle, part] each. */
+    poses() {
+      const { functions, about } = this.code;
+      const p = new Float64Array(4 * about.frames);
+      functions.poses(this.f, p, this.k);
+      return Array.from({ length: about.frames }, (_, i) => [...p.subarray(4 * i, 4 * i + 4)]);
+    }
+  }
+
+  /** The action that a step's numbers mean. */
+  const actionOf = (key, { controls, levels }) => key.map((n, i) => (controls[i].values.length ? n : n / levels));
+
+  // --- links -----------------------------------------------------------------------------------------------
+  // As lag_envs/replay.py has them.
+
+  const MARK = "drive=";
+  const view = new DataView(new ArrayBuffer(8));
+
+  /** The 16 hexadecimal digits of a double. */
+  function hexOf(x) {
+    view.setFloat64(0, x);
+    return view.getBigUint64(0).toString(16).padStart(16, "0");
+  }
+
+  function doubleOf(hex) {
+    view.setBigUint64(0, big(`0x${hex}`));
+    return view.getFloat64(0);
+  }
+
+  function crc32(text) {
+    let crc = -1;
+    for (const byte of new TextEncoder().encode(text)) {
+      crc ^= byte;
+      for (let i = 0; i < 8; i++) crc = (crc >>> 1) ^ (crc & 1 ? 0xedb88320 : 0);
+    }
+    return ((crc ^ -1) >>> 0).toString(16).padStart(8, "0");
+  }
+
+  function pack(keys) {
+    const runs = [];
+    for (const key of keys) {
+      const last = runs[runs.length - 1];
+      if (last && last.key.every((n, i) => n === key[i])) last.count += 1;
+      else runs.push({ key, count: 1 });
+    }
+    let bytes = "";
+    for (let m of runs.flatMap(({ key, count }) => [...key.map((n) => (n >= 0 ? 2 * n : -2 * n - 1)), count])) {
+      for (; m >= 128; m = Math.floor(m / 128)) bytes += String.fromCharCode((m % 128) + 128);
+      bytes += String.fromCharCode(m);
+    }
+    return btoa(bytes).replace(/\+/g, "-").replace(/\//g, "_").replace(/=+$/, "");
+  }
+
+  function unpack(text, { controls, levels }) {
+    const bytes = atob(text.replace(/-/g, "+").replace(/_/g, "/"));
+    const numbers = [];
+    let [value, scale] = [0, 1];
+    for (const letter of bytes) {
+      const byte = letter.charCodeAt(0);
+      value += (byte % 128) * scale;
+      scale *= 128;
+      if (scale > 2 ** 35) throw new Error("The link's keys are damaged: a number is too long.");
+      if (byte < 128) {
+        numbers.push(value);
+        [value, scale] = [0, 1];
+      }
+    }
+    const wide = controls.length + 1;
+    if (scale > 1 || numbers.length % wide) throw new Error("The link's keys are damaged: they end in the middle of a key.");
+    const keys = [];
+    for (let i = 0; i < numbers.length; i += wide) {
+      const key = numbers.slice(i, i + wide - 1).map((m) => (m % 2 ? -(m - 1) / 2 - 1 : m / 2));
+      const count = numbers[i + wide - 1];
+      if (!count || keys.length + count > 100000) throw new Error("The link has too many steps, or a run of none.");
+      key.forEach((n, j) => {
+        const many = controls[j].values.length;
+        const [low, high] = many ? [0, many - 1] : [-levels, levels];
+        if (n < low || n > high) throw new Error(`A key of the link is ${n}; it must lie between ${low} and ${high}.`);
+      });
+      for (let j = 0; j < count; j++) keys.push(key);
+    }
+    return keys;
+  }
+
+  function writeLink(about, seed, keys, total, page = "") {
+    const fields = [about.version, about.id, String(seed), pack(keys), hexOf(total), about.digest].join("~");
+    return `${page}#${MARK}${fields}~${crc32(fields)}`;
+  }
+
+  /** What a link says; throws an error whose text is for people. */
+  function readLink(link, about) {
+    const fields = link.slice(link.lastIndexOf(MARK) + MARK.length).trim().split("~");
+    if (!link.includes(MARK) || fields.length < 2) throw new Error("This is no link of a drive.");
+    if (fields[0] !== String(about.version)) throw new Error("The link's version is not one that this page reads.");
+    const [, id, seed, packed, claimed, digest, check] = fields;
+    if (fields.length !== 7 || check !== crc32(fields.slice(0, 6).join("~"))) {
+      throw new Error("The link is damaged; copy it once more, whole.");
+    }
+    if (id !== about.id) throw new Error(`The link is of another environment, ${id}.`);
+    if (!/^\d{1,20}$/.test(seed) || big(seed) >> big(BITS) || !/^[0-9a-f]{16}$/.test(claimed) || !/^[\w-]*$/.test(packed)) {
+      throw new Error("The link is forged: a field is not what it must be.");
+    }
+    if (digest !== about.digest) throw new Error("The drive was made with another version of this environment.");
+    return { seed: big(seed), keys: unpack(packed, about), claimed };
+  }
+
+  // --- agents ----------------------------------------------------------------------------------------------
+
+  /** Numbers of an array that came as base64. */
+  function numbersOf({ data, bits }) {
+    const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+    return bits === 32 ? new Float32Array(bytes.buffer) : new Float64Array(bytes.buffer);
+  }
+
+  const sigmoid = (x) => 0.5 + 0.5 * Math.tanh(0.5 * x);
+  const ACTIVATIONS = {
+    tanh: Math.tanh,
+    relu: (x) => Math.max(x, 0),
+    elu: (x) => (x > 0 ? x : Math.expm1(x)),
+    leaky_relu: (x) => (x > 0 ? x : 0.01 * x),
+    silu: (x) => x * sigmoid(x),
+    sigmoid,
+  };
+
+  /** A function from an episode to its next action, as lag_envs/leaderboard/policies.py acts. */
+  function agentOf(about) {
+    const arrays = Object.fromEntries(
+      Object.entries(about.arrays).map(([name, array]) => [name, { n: numbersOf(array), shape: array.shape }]),
+    );
+    const found = { mlp: network, linear: feedback, "action table": table, "value table": table }[about.kind](about, arrays);
+    return (episode) => found(episode).map((x) => Math.fround(clamp(x, -1, 1)));
+  }
+
+  /** What an agent sees, in float32. */
+  const seen = (episode) => Float64Array.from(episode.part("o"), Math.fround);
+
+  function network(about, arrays) {
+    const f = ACTIVATIONS[about.activation];
+    return (episode) => {
+      let x = seen(episode);
+      if (about.normalise) {
+        const { epsilon, clip } = about.normalise;
+        x = x.map((v, i) => clamp((v - arrays.obs_mean.n[i]) / Math.sqrt(arrays.obs_var.n[i] + epsilon), -clip, clip));
+      }
+      for (let layer = 0; layer < about.layers; layer++) {
+        const [weight, bias] = [arrays[`weight_${layer}`].n, arrays[`bias_${layer}`].n];
+        const out = Float64Array.from(bias);
+        for (let row = 0; row < out.length; row++) {
+          for (let i = 0; i < x.length; i++) out[row] += x[i] * weight[row * x.length + i];
+        }
+        x = layer + 1 < about.layers ? out.map(f) : out;
+      }
+      if (about.bins) {
+        return Array.from({ length: about.controls }, (_, i) => {
+          const worth = x.subarray(i * about.bins, (i + 1) * about.bins);
+          return (2 * worth.indexOf(Math.max(...worth)) + 1) / about.bins - 1;
+        });
+      }
+      if (about.mean_limit) x = x.map((v) => clamp(v, -about.mean_limit, about.mean_limit));
+      return [...(about.squash === "tanh" ? x.map(Math.tanh) : x)];
+    };
+  }
+
+  function feedback(about, { gain, offset }) {
+    return (episode) => {
+      const x = seen(episode);
+      return Array.from(offset.n, (start, j) => x.reduce((sum, v, i) => sum + v * gain.n[i * offset.n.length + j], start));
+    };
+  }
+
+  function table(about, arrays) {
+    const axes = about.axes.map((_, j) => arrays[`axis_${j}`].n);
+    const values = arrays.table.n;
+    const strides = axes.map((_, j) => axes.slice(j + 1).reduce((product, axis) => product * axis.length, 1));
+
+    /** The table's number at a moment, and whether it is that of the mirror image. */
+    function lookUp(state, target, steps) {
+      const given = [...state, target, steps * about.interval];
+      const { wrapped } = about;
+      if (wrapped !== null) given[wrapped] -= 2 * Math.PI * Math.round(given[wrapped] / (2 * Math.PI));
+      const points = about.sums.map((row) => row.reduce((sum, s, i) => sum + (s ? s * given[i] : 0), 0));
+      const mirrored = about.mirror !== null && points[about.mirror] < 0;
+      const cells = points.map((x, j) => {
+        const [axis, at] = [axes[j], mirrored && about.axes[j] !== "time" ? -x : x];
+        let cell = 0;
+        for (let high = axis.length - 1; high - cell > 1;) {
+          const middle = (cell + high) >> 1;
+          if (axis[middle] <= at) cell = middle;
+          else high = middle;
+        }
+        return [cell, clamp((at - axis[cell]) / (axis[cell + 1] - axis[cell]), 0, 1)];
+      });
+      let total = 0;
+      for (let corner = 0; corner < 1 << cells.length; corner++) {
+        let [weight, index] = [1, 0];
+        cells.forEach(([cell, place], j) => {
+          const upper = (corner >> j) & 1;
+          weight *= upper ? place : 1 - place;
+          index += (cell + upper) * strides[j];
+        });
+        if (weight) total += weight * values[index];
+      }
+      return [total, mirrored];
+    }
+
+    if (about.kind === "action table") {
+      return (episode) => {
+        const [found, mirrored] = lookUp(episode.state, episode.part("g")[0] ?? 0, episode.steps);
+        return [mirrored ? about.sign * found : found];
+      };
+    }
+
+    /** The best of some actions, one step ahead. */
+    function best(episode, actions) {
+      const { functions, about: code } = episode.code;
+      const after = new Float64Array(episode.f.length);
+      let [chosen, most] = [actions[0], -Infinity];
+      for (const action of actions) {
+        after.set(episode.f);
+        functions.move(after, [action], episode.k);
+        const later = after[code.rows.ended] > 0 ? 0 :
+          lookUp(after.subarray(0, code.states), episode.part("g")[0] ?? 0, episode.steps + 1)[0];
+        const gain = after[code.rows.reward] + later;
+        if (gain > most) [chosen, most] = [action, gain];
+      }
+      return chosen;
+    }
+
+    const spaced = (n) => Array.from({ length: n }, (_, i) => -1 + (2 * i) / (n - 1));
+    return (episode) => {
+      const coarse = best(episode, spaced(about.actions));
+      const width = 2 / (about.actions - 1);
+      return [best(episode, spaced(17).map((x) => clamp(coarse + width * x, -1, 1)))];
+    };
+  }
+
+  // --- the person's hands ----------------------------------------------------------------------------------
+
+  const PAIRS = [["ArrowLeft", "ArrowRight"], ["ArrowDown", "ArrowUp"], ["a", "d"], ["s", "w"]];
+  const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowDown: "↓", ArrowUp: "↑" };
+  const nameOf = (key) => NAMES[key] ?? key.toUpperCase();
+
+  /** Keys, pointer and gamepad as numbers per control. */
+  class Hands {
+    constructor(about, lost) {
+      [this.about, this.lost] = [about, lost];
+      this.pressed = new Set();
+      this.pointer = null;
+      this.pad = null;
+    }
+
+    get pairs() {
+      return PAIRS.slice(0, this.about.controls.length);
+    }
+
+    release() {
+      this.pressed.clear();
+      this.pointer = null;
+    }
+
+    /** What the gamepad says, [-1, 1] per axis; null without one, or where it is left alone. */
+    readPad() {
+      if (this.pad === null) return null;
+      const pad = navigator.getGamepads?.()[this.pad];
+      if (!pad?.connected) {
+        this.pad = null;
+        this.lost();
+        return null;
+      }
+      const button = (i) => (pad.buttons[i]?.pressed ? 1 : 0);
+      const axes = [0, 1, 2, 3].map((i) => (Math.abs(pad.axes[i] ?? 0) > 0.12 ? pad.axes[i] : 0) * (i % 2 ? -1 : 1));
+      axes[0] += button(15) - button(14);
+      axes[1] += button(12) - button(13);
+      return axes.some(Boolean) ? axes.map((x) => clamp(x, -1, 1)) : null;
+    }
+
+    /** A number for each control. Keys count before the pointer, the pointer before the gamepad. */
+    numbers() {
+      const pad = this.readPad();
+      const { controls, levels, rest } = this.about;
+      return controls.map(({ values }, i) => {
+        const many = values.length;
+        const [down, up] = (PAIRS[i] ?? []).map((key) => this.pressed.has(key));
+        const digit = many ? values.findIndex((_, j) => this.pressed.has(String(j + 1))) : -1;
+        if (digit >= 0) return digit;
+        let share = null;
+        if (down || up) share = up - down;
+        else if (this.pointer && i < 2) share = this.pointer[i];
+        else if (pad) share = pad[i] ?? null;
+        if (share === null || (share === 0 && many)) return many ? rest[i] : Math.round(rest[i] * levels);
+        return many ? Math.round((0.5 + 0.5 * share) * (many - 1)) : Math.round(share * levels);
+      });
+    }
+  }
+
+  // --- the stage -------------------------------------------------------------------------------------------
+
+  const LACKING = [
+    ["numbers of 64 bits (BigInt)", typeof BigInt === "function"],
+    ["drawing (canvas)", typeof CanvasRenderingContext2D === "function"],
+    ["animation (requestAnimationFrame)", typeof requestAnimationFrame === "function"],
+  ];
+  const lacking = () => LACKING.filter(([, there]) => !there).map(([what]) => what);
+
+  /** Two values of the same shape, of which numbers are changed by those of others: a + Σ (b - a). */
+  function changed(base, others) {
+    if (typeof base === "number") return others.reduce((sum, other) => sum + other - base, base);
+    if (!Array.isArray(base)) return base;
+    if (others.some((other) => other.length !== base.length)) return others[others.length - 1];
+    return base.map((part, i) => changed(part, others.map((other) => other[i])));
+  }
+
+  /** Numbers of the same shape on the way from one to the other. */
+  const between = (a, b, share) => changed(a, [scaled(a, b, share)]);
+
+  function scaled(a, b, share) {
+    if (typeof a === "number") return a + (b - a) * share;
+    if (!Array.isArray(a)) return a;
+    return a.length === b.length ? a.map((part, i) => scaled(part, b[i], share)) : share < 0.5 ? a : b;
+  }
+
+  /** Build the driver into an element and return it. */
+  function open(root, board, code, tools) {
+    const { make, find, text, symbol, fit, paint, placed, windowOf, posesAt, load, calm } = tools;
+    const { about } = code;
+    const known = board.known && board.known.best !== board.known.random ? board.known : null;
+    const scoreOf = (total) => (total - known.random) / (known.best - known.random);
+
+    const option = (value, words) => make("option", { value }, words);
+    const button = (name, words) => make("button", { type: "button", class: name }, words);
+    const list = (label, options) => {
+      const select = make("select", {}, ...options);
+      return [make("label", {}, make("span", { class: "hear" }, label), select), select];
+    };
+
+    const canvas = make("canvas", { class: "scene", "aria-hidden": "true" });
+    const message = make("p", { class: "message" });
+    const stage = make("div", { class: "stage", tabindex: "0", role: "application" }, canvas, message);
+    const readout = make("dl", { class: "readout" });
+    const said = make("p", { class: "hear", role: "status" });
+    const go = button("go", "Start");
+    const again = button("again", "Restart");
+    const fresh = button("fresh", "New start");
+    const watch = button("rerun", "Watch it");
+    const [speedLabel, speed] = list("Speed", [["1", "Real time"], ["0.5", "Half speed"], ["0.25", "Quarter speed"], ["0.1", "A tenth"]].map(([v, w]) => option(v, w)));
+    const [ghostLabel, ghostSelect] = list("Ghost", [option("", "No ghost")]);
+    const [episodeLabel, episodeSelect] = list("The ghost's episode", []);
+    const bar = make("div", { class: "drive-controls", role: "group", "aria-label": "Driving" }, go, again, fresh, watch, speedLabel, ghostLabel, episodeLabel);
+    const verdict = make("p", { class: "verdict", role: "status" });
+    const link = make("input", { type: "text", readonly: "", "aria-label": "Link of this drive" });
+    const copy = button("copy", "Copy link");
+    const share = make("div", { class: "share" }, link, copy);
+    const panel = make("details", { class: "sliders" }, make("summary", {}, "Change the machine (not scored)"));
+    root.replaceChildren(stage, bar, readout, verdict, share, panel, said);
+    share.hidden = watch.hidden = episodeLabel.hidden = true;
+
+    const hands = new Hands(about, () => {
+      if (running) pause();
+      tell("The gamepad has left. Drive by keys, or connect it again; Space goes on.");
+    });
+    const named = (name) => hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${name(about.controls[i].name)}`).join(", ");
+    const how = named(symbol);
+    stage.setAttribute("aria-label", `Drive ${board.id}. ${named((name) => name.replace(/_/g, " ")) || "Nothing acts here"}. Space pauses, R restarts, N is another start.`);
+
+    let { constants } = code;
+    let seed = big(Math.floor(Math.random() * 2 ** 32));
+    let me = new Episode(code, seed, constants);
+    let mine = [];
+    let ghost = null;
+    let linked = null;
+    let rerunning = null;
+    let running = false;
+    let [before, left, shownAt] = [0, 0, 0];
+    let [past, now] = [me.poses(), me.poses()];
+    let picture = board.picture;
+    const untouched = () => constants === code.constants;
+
+    const tell = (words) => {
+      message.textContent = words;
+      said.textContent = words;
+    };
+
+    // --- ghosts
+
+    /** Who runs beside: an agent, stored episodes, or the keys of a link. */
+    const GHOSTS = {
+      live: (row) => load(board.rows[row].live).then((data) => {
+        const act = agentOf(data);
+        return { name: board.rows[row].name, act: (episode) => act(episode) };
+      }),
+      stored: (row) => tools.episodes(board.rows[row].file).then((replays) => ({ name: board.rows[row].name, replays })),
+      link: () => Promise.resolve({ name: "the link's driver", seed: linked.seed, act: (episode) => actionOf(linked.keys[episode.steps] ?? linked.keys[linked.keys.length - 1], about) }),
+    };
+
+    function listGhosts() {
+      const rows = [...board.rows.entries()];
+      const group = (label, options) => (options.length ? [make("optgroup", { label }, ...options)] : []);
+      const chosen = ghostSelect.value;
+      ghostSelect.replaceChildren(
+        option("", "No ghost"),
+        ...(linked ? [option("link:0", "The link's drive")] : []),
+        ...group("Agents, live", rows.filter(([, row]) => row.live).map(([i, row]) => option(`live:${i}`, String(row.name)))),
+        ...group("Recorded episodes", rows.filter(([, row]) => row.file).map(([i, row]) => option(`stored:${i}`, String(row.name)))),
+      );
+      ghostSelect.value = chosen;
+    }
+
+    async function chooseGhost() {
+      const [kind, row] = ghostSelect.value.split(":");
+      const asked = ghostSelect.value;
+      episodeLabel.hidden = true;
+      ghost = null;
+      if (kind) {
+        let found;
+        try {
+          found = await GHOSTS[kind](Number(row));
+        } catch (error) {
+          tell(String(error.message));
+          return;
+        }
+        if (ghostSelect.value !== asked) return;
+        ghost = found;
+        if (ghost.replays) {
+          episodeSelect.replaceChildren(...ghost.replays.map((replay, i) => option(String(i), `${replay.label ?? "episode"}, return ${text(replay.return, 2)}`)));
+          episodeLabel.hidden = false;
+          chooseEpisode();
+          return;
+        }
+        if (ghost.seed !== undefined) seed = ghost.seed;
+      }
+      restart();
+    }
+
+    function chooseEpisode() {
+      ghost.replay = ghost.replays[Number(episodeSelect.value)] ?? ghost.replays[0];
+      if (ghost.replay.reset_seed !== undefined) seed = big(ghost.replay.reset_seed);
+      else tell("The seed of this episode is not known: the ghost has a start of its own.");
+      restart();
+    }
+
+    function startGhost() {
+      if (!ghost) return;
+      if (ghost.act) {
+        ghost.episode = new Episode(code, seed, constants);
+        ghost.past = ghost.now = ghost.episode.poses();
+      }
+    }
+
+    function stepGhost() {
+      if (!ghost?.act || ghost.episode.over) return;
+      ghost.past = ghost.now;
+      ghost.episode.step(ghost.act(ghost.episode));
+      ghost.now = ghost.episode.poses();
+    }
+
+    /** The ghost's poses and return at a share of the present step. */
+    function ghostAt(part) {
+      if (!ghost) return null;
+      if (ghost.act) return { poses: mixedPoses(ghost.past, ghost.now, ghost.episode.over ? 1 : part), total: ghost.episode.total };
+      const { replay } = ghost;
+      if (!replay?.poses) return null;
+      const exact = clamp(me.steps - 1 + part, 0, replay.end);
+      const moment = Math.floor(exact);
+      return { poses: posesAt(replay.poses, board.picture.units, moment, exact - moment), total: replay.sums[moment] };
+    }
+
+    // --- time
+
+    const mixedPoses = (a, b, part) => b.map((frame, i) => frame.map((x, j) => (j < 3 ? a[i][j] + (x - a[i][j]) * part : x)));
+
+    /** Keep the seed in the address, where it is not that of the link there. */
+    function note() {
+      if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
+    }
+
+    function restart() {
+      me = new Episode(code, seed, constants);
+      mine = [];
+      past = now = me.poses();
+      left = 0;
+      share.hidden = true;
+      startGhost();
+      if (running) note();
+      label();
+      show(1);
+    }
+
+    function tick() {
+      const key = rerunning ? rerunning.keys[me.steps] : hands.numbers();
+      if (!key) {
+        finish("The link's keys end here.");
+        return;
+      }
+      past = now;
+      me.step(actionOf(key, about));
+      if (me.over !== "refused") mine.push(key);
+      now = me.poses();
+      stepGhost();
+      if (me.over) finish();
+    }
+
+    function finish(words = "") {
+      running = false;
+      label();
+      const ending = words || { terminated: "The episode has ended.", truncated: "Time is up.", refused: "The step was refused: it cannot be taken to full accuracy." }[me.over];
+      const result = known && untouched() ? `Score ${text(scoreOf(me.total))}` : `Return ${text(me.total, 2)}, not scored`;
+      const beside = ghost && ghostAt(1) ? `; ${ghost.name}: ${known ? text(scoreOf(ghostAt(1).total)) : text(ghostAt(1).total, 2)}` : "";
+      tell(`${ending} ${result}${beside}. R: again, N: another start.`);
+      offer();
+    }
+
+    /** Offer the link of what was driven. */
+    function offer() {
+      if (!untouched() || !mine.length || rerunning) return;
+      link.value = writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, ""));
+      share.hidden = false;
+    }
+
+    function frame(time) {
+      if (!running) return;
+      left += Math.min(Math.max(time - before, 0), 100) / 1000 * Number(speed.value);
+      before = time;
+      for (let n = 0; running && left >= about.dt && n < 6; n++) {
+        left -= about.dt;
+        tick();
+      }
+      if (left > about.dt) left = about.dt;
+      show(running ? left / about.dt : 1);
+      if (running) requestAnimationFrame(frame);
+    }
+
+    function label() {
+      go.textContent = running ? "Pause" : me.steps && !me.over ? "Go on" : "Start";
+    }
+
+    function run() {
+      if (running) return;
+      if (me.over || (rerunning && !rerunning.keys[me.steps])) restart();
+      running = true;
+      note();
+      message.textContent = "";
+      said.textContent = "Driving";
+      share.hidden = true;
+      before = performance.now();
+      label();
+      requestAnimationFrame(frame);
+    }
+
+    function pause() {
+      running = false;
+      hands.release();
+      label();
+      tell(`Paused at ${text(me.steps * about.dt, 2)} seconds.`);
+      offer();
+      show(1);
+    }
+
+    // --- what is to be seen
+
+    function show(part) {
+      const { pen, width, height } = fit(canvas);
+      pen.clearRect(0, 0, width, height);
+      if (width && picture && about.frames) {
+        const box = { x: 8, y: 8, width: width - 16, height: height - 16 };
+        const poses = mixedPoses(past, now, part);
+        const seenFrom = windowOf(picture, poses);
+        paint(pen, box, seenFrom, placed(picture, poses, seenFrom));
+        const beside = ghostAt(part);
+        if (beside) {
+          pen.globalAlpha = 0.35;
+          paint(pen, box, seenFrom, placed(picture, beside.poses, seenFrom), ["body", "mark"]);
+          pen.globalAlpha = 1;
+        }
+      }
+      // Numbers that change sixty times a second cannot be read, and cost more than the step.
+      const moment = performance.now();
+      if (running && moment - shownAt < 120) return;
+      shownAt = moment;
+      readOut(ghostAt(part));
+    }
+
+    const cells = new Map();
+
+    function readOut(beside) {
+      const score = (total) => (known ? text(scoreOf(total)) : "–");
+      const keys = rerunning ? rerunning.keys[Math.max(0, me.steps - 1)] ?? [] : mine[mine.length - 1] ?? [];
+      const entries = [
+        ["Time", `${text(me.steps * about.dt, 2)} s`],
+        ["Score so far", untouched() ? score(me.total) : "not scored"],
+        ["Return", text(me.total, 2)],
+        ...(ghost ? [["Ghost", beside ? score(beside.total) : "–"]] : []),
+        ...about.controls.map(({ name, values, unit }, i) => {
+          const n = keys[i];
+          return [symbol(name), n === undefined ? "–" : values.length ? `${text(values[n], 2)} ${unit}` : text(n / about.levels, 2)];
+        }),
+        ...board.state_names.map((name, i) => [symbol(name), `${text(me.f[i], 2)} ${board.state_units[i] ?? ""}`]),
+      ];
+      if ([...cells.keys()].join() !== entries.map(([name]) => name).join()) {
+        cells.clear();
+        readout.replaceChildren(...entries.map(([name]) => {
+          cells.set(name, make("dd"));
+          return make("div", {}, make("dt", {}, name), cells.get(name));
+        }));
+      }
+      for (const [name, value] of entries) if (cells.get(name).textContent !== value) cells.get(name).textContent = value;
+    }
+
+    // --- sliders
+
+    function look() {
+      if (!board.picture) return null;
+      const others = about.sliders.filter((slider) => slider.looks).map(({ looks, at }) => {
+        const place = clamp(2 * Math.log2(constants[at] / code.constants[at]) + 2, 0, looks.length - 1);
+        const first = Math.min(Math.floor(place), looks.length - 2);
+        return scaled([looks[first].shapes, looks[first].window], [looks[first + 1].shapes, looks[first + 1].window], place - first);
+      });
+      const { shapes, window: box } = board.picture;
+      const [all, wide] = others.length && !untouched() ? changed([shapes, box], others) : [shapes, box];
+      return { ...board.picture, shapes: all, window: wide };
+    }
+
+    const inputs = about.sliders.map((slider) => {
+      const input = make("input", { type: "range", min: "-1", max: "1", step: "0.01", value: "0" });
+      const output = make("output");
+      const name = slider.name.replace(/_/g, " ");
+      const say = () => {
+        const value = slider.value * 2 ** Number(input.value);
+        output.textContent = `${+value.toPrecision(3)} ${slider.unit}`;
+        input.setAttribute("aria-valuetext", output.textContent);
+        return value;
+      };
+      say();
+      input.addEventListener("input", () => {
+        change();
+        picture = look();
+        rerunning = null;
+        restart();
+        tell(untouched() ? "As it was: scored again." : "The machine was changed: this drive is not scored.");
+      });
+      panel.append(make("label", {}, make("span", {}, name), input, output));
+      return { slider, input, say };
+    });
+
+    /** Take the sliders' values, and what follows from them. */
+    function change() {
+      const values = inputs.map(({ say }) => say());
+      constants = code.constants;
+      if (inputs.every(({ input }) => Number(input.value) === 0)) return;
+      constants = Float64Array.from(code.constants);
+      inputs.forEach(({ slider }, i) => (constants[slider.at] = values[i]));
+      code.functions.derive(constants);
+    }
+    const reset = button("reset", "As it was");
+    reset.addEventListener("click", () => {
+      for (const { input } of inputs) input.value = "0";
+      change();
+      picture = look();
+      restart();
+      tell("As it was: scored again.");
+    });
+    panel.append(reset);
+    panel.hidden = !inputs.length;
+
+    // --- links
+
+    /** Recompute a link's drive, a little in each frame, and say whether its claim is true. */
+    function judge(hash) {
+      linked = rerunning = null;
+      watch.hidden = true;
+      let told;
+      try {
+        told = readLink(hash, about);
+      } catch (error) {
+        verdict.textContent = String(error.message);
+        verdict.dataset.true = "false";
+        return;
+      }
+      const episode = new Episode(code, told.seed);
+      verdict.textContent = "The link is being recomputed …";
+      delete verdict.dataset.true;
+      const go = () => {
+        const until = performance.now() + 4;
+        while (episode.steps < told.keys.length && performance.now() < until) {
+          if (episode.over) break;
+          episode.step(actionOf(told.keys[episode.steps], about));
+        }
+        if (episode.steps < told.keys.length && !episode.over) {
+          requestAnimationFrame(go);
+          return;
+        }
+        const whole = episode.steps === told.keys.length && episode.over !== "refused";
+        const fair = whole && hexOf(episode.total) === told.claimed;
+        verdict.dataset.true = String(fair);
+        const claim = doubleOf(told.claimed);
+        const words = known ? `score ${text(scoreOf(episode.total))}` : `return ${text(episode.total, 2)}`;
+        const ending = episode.over ? "" : ", stopped before its end";
+        verdict.textContent = fair
+          ? `The link is true, recomputed to the last bit: ${words}${ending}.`
+          : `The link is false: it claims a return of ${text(claim, 4)}${known ? `, score ${text(scoreOf(claim))}` : ""}; ` +
+            (whole ? `its keys give ${text(episode.total, 4)}.` : "its episode ends before its keys do.");
+        if (!whole) return;
+        linked = told;
+        seed = told.seed;
+        watch.hidden = false;
+        listGhosts();
+        if (fair) {
+          ghostSelect.value = "link:0";
+          chooseGhost();
+        }
+      };
+      go();
+    }
+
+    function followHash() {
+      let { hash } = location;
+      try {
+        hash = decodeURIComponent(hash);
+      } catch {
+        // As it is, it is damaged, and will be told so.
+      }
+      verdict.textContent = "";
+      if (hash.includes(MARK)) {
+        judge(hash);
+        return;
+      }
+      const match = /^#seed=(\d{1,20})$/.exec(hash);
+      if (!match) return;
+      if (big(match[1]) >> big(BITS)) {
+        verdict.textContent = "The seed must be below 2 to the power of 64.";
+        verdict.dataset.true = "false";
+        return;
+      }
+      seed = big(match[1]);
+      restart();
+    }
+
+    // --- what people do
+
+    const still = (event) => event.ctrlKey || event.altKey || event.metaKey;
+
+    stage.addEventListener("keydown", (event) => {
+      if (still(event) || event.target !== stage) return;
+      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      const drives = hands.pairs.flat().includes(key) || (/^[1-9]$/.test(key) && about.controls.some((c) => c.values.length));
+      if (drives) {
+        hands.pressed.add(key);
+        if (!running && !me.over) run();
+      } else if (key === " ") running ? pause() : run();
+      else if (key === "r") restart(), run();
+      else if (key === "n") another();
+      else return;
+      event.preventDefault();
+    });
+    stage.addEventListener("keyup", (event) => hands.pressed.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key));
+    stage.addEventListener("blur", () => hands.release());
+
+    function another() {
+      rerunning = null;
+      if (ghost?.replays || ghost?.seed !== undefined) {
+        ghostSelect.value = "";
+        ghost = null;
+        episodeLabel.hidden = true;
+      }
+      seed = big(Math.floor(Math.random() * 2 ** 32));
+      restart();
+      run();
+    }
+
+    function point(event) {
+      const box = canvas.getBoundingClientRect();
+      const across = (event.clientX - box.left - box.width / 2) / (0.42 * box.width);
+      const up = (box.top + box.height / 2 - event.clientY) / (0.42 * box.height);
+      hands.pointer = [clamp(across, -1, 1), clamp(up, -1, 1)];
+    }
+
+    canvas.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
+      canvas.setPointerCapture?.(event.pointerId);
+      stage.focus({ preventScroll: true });
+      point(event);
+      if (!running) run();
+      event.preventDefault();
+    });
+    canvas.addEventListener("pointermove", (event) => hands.pointer && point(event));
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      canvas.addEventListener(name, () => (hands.pointer = null));
+    }
+    window.addEventListener("gamepadconnected", (event) => {
+      hands.pad = event.gamepad.index;
+      tell("A gamepad is there: its stick drives.");
+    });
+    window.addEventListener("gamepaddisconnected", () => hands.readPad());
+    document.addEventListener("visibilitychange", () => document.hidden && running && pause());
+
+    go.addEventListener("click", () => {
+      if (running) pause();
+      else {
+        rerunning = me.steps && !me.over ? rerunning : null;
+        run();
+        stage.focus({ preventScroll: true });
+      }
+    });
+    again.addEventListener("click", () => {
+      rerunning = null;
+      restart();
+      run();
+      stage.focus({ preventScroll: true });
+    });
+    fresh.addEventListener("click", () => {
+      another();
+      stage.focus({ preventScroll: true });
+    });
+    watch.addEventListener("click", () => {
+      running = false;
+      ghostSelect.value = "";
+      ghost = null;
+      reset.click();
+      seed = linked.seed;
+      rerunning = linked;
+      restart();
+      run();
+    });
+    speed.addEventListener("change", () => (before = performance.now()));
+    ghostSelect.addEventListener("change", () => {
+      running = false;
+      rerunning = null;
+      chooseGhost();
+    });
+    episodeSelect.addEventListener("change", () => {
+      running = false;
+      chooseEpisode();
+    });
+    link.addEventListener("focus", () => link.select());
+    copy.addEventListener("click", async () => {
+      link.select();
+      try {
+        await navigator.clipboard.writeText(link.value);
+        said.textContent = "The link was copied.";
+      } catch {
+        // Pages from a disk may not write there; what is selected can be copied by hand.
+        tell("Copy the link that is selected.");
+      }
+    });
+    window.addEventListener("hashchange", followHash);
+
+    listGhosts();
+    restart();
+    const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers tell how it moves.";
+    tell(`${how ? `${how}; or the pointer, or a gamepad.` : "Nothing acts here: look on."} Space starts.${nothing}`);
+    if (calm.matches) speed.value = "0.5";
+    followHash();
+    return { show: () => show(1), get episode() { return me; } };
+  }
+
+  const api = { Episode, agentOf, readLink, writeLink, hexOf, actionOf, lacking, open };
+  if (typeof module === "object") module.exports = api;
+  else window.lagEnvs.put(api);
+})();

@@ -1,0 +1,67 @@
+"""A real browser for tests of the page: the system's Chromium, by Playwright."""
+
+import os
+import shutil
+import time
+import warnings
+
+import pytest
+
+CHROMIUM = shutil.which(os.environ.get("CHROMIUM", "chromium"))
+MISSING = (
+    "THERE IS NO CHROMIUM, SO NO TEST OF THE LEADERBOARD'S PAGE IN A BROWSER WAS RUN: install chromium, or "
+    "name one in the variable CHROMIUM"
+)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        warnings.warn(MISSING, stacklevel=1)
+        pytest.skip(MISSING)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM)
+        yield browser
+        browser.close()
+
+
+class Pages:
+    """Opens pages; in the end they must have met no error and asked nobody else for anything."""
+
+    def __init__(self, browser):
+        self._browser, self._opened = browser, []
+
+    def open(self, url, root, **options):
+        page = self._browser.new_page(**{"viewport": {"width": 1280, "height": 900}} | options)
+        wrong = []
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on(
+            "console", lambda said: said.type in ("error", "warning", "assert") and wrong.append(said.text)
+        )
+        page.on("request", lambda asked: asked.url.startswith((root, "data:")) or wrong.append(asked.url))
+        self._opened.append((page, wrong))
+        page.goto(url)
+        return page
+
+    def close(self):
+        for page, wrong in self._opened:
+            page.close()
+            assert not wrong, wrong
+
+
+@pytest.fixture
+def browsing(browser):
+    found = Pages(browser)
+    yield found
+    found.close()
+
+
+def until(page, expression, wait=60.0):
+    """Wait until an expression is true; Playwright's own way is to eval, which the page's rules forbid."""
+    end = time.monotonic() + wait
+    while not (value := page.evaluate(expression)):
+        assert time.monotonic() < end, expression
+        page.wait_for_timeout(20)
+    return value

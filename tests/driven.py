@@ -1,0 +1,35 @@
+"""Actions for episodes of the unfused step."""
+
+import numpy as np
+
+from lag_envs.controllers import build as make
+from lag_envs.controllers import controllers
+from lag_envs.envs.actions import Actions
+
+
+def at_random(task, seed):
+    """Return actions without sense, those beyond their limits too."""
+    rng, formulas = np.random.default_rng(seed), task.formulas
+    if formulas.choices:
+        space = Actions(formulas.actions, formulas.choices).space
+        space.seed(seed)
+        return lambda env, i: space.sample()
+    return lambda env, i: rng.uniform(-1.2, 1.2, formulas.actions).astype(np.float32)
+
+
+def by_agent(task):
+    """Return what a controller of the task's own does that plans nothing; without one, random actions."""
+    names = [n for n, found in controllers(task).items() if not found.plans and n not in ("zero", "random")]
+    if not names:
+        return at_random(task, 99)
+    made = make(task, names[-1])
+    memory = {}
+
+    def act(env, i):
+        start = np.array([i == 0])
+        action, memory["state"] = made.predict(
+            np.array([env.observe()], np.float32), None if i == 0 else memory["state"], start
+        )
+        return action[0]
+
+    return act

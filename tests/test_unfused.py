@@ -1,0 +1,127 @@
+"""The unfused step: against the fused one, and against the other ways to carry it out."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from driven import at_random, by_agent
+from own_tasks import TASKS as OWN
+
+import lag_envs
+from lag_envs.envs.unfused import Unfused
+from lag_envs.scenes import StepRefused
+from lag_envs.stepping.general import stepper_of
+from lag_envs.tasks import TASKS
+
+REGISTERED = sorted(TASKS)
+
+
+def made(task):
+    if task.id not in gym.registry:
+        lag_envs.register(task)
+    return gym.make(task.id).unwrapped
+
+
+@pytest.mark.parametrize("id", REGISTERED)
+def test_unfused_is_the_environments_step_to_rounding(id):
+    """Synchronised before each step, at most 1e-15 times size times condition."""
+    check_against_fused(gym.make(id).unwrapped, range(2))
+
+
+@pytest.mark.parametrize("task", OWN, ids=lambda task: task.__name__)
+def test_users_tasks_too(task):
+    check_against_fused(made(task), range(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("id", REGISTERED)
+def test_so_it_is_in_a_hundred_episodes(id):
+    check_against_fused(gym.make(id).unwrapped, range(100))
+
+
+def check_against_fused(env, seeds):
+    unfused, task = Unfused(env.task), env.task
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        first = unfused.reset(seed)
+        assert np.allclose(unfused.state, env.state, rtol=1e-15, atol=1e-16)
+        assert np.allclose(observation, first, rtol=1e-6, atol=1e-7)
+        steps, over = [], False
+        act = by_agent(env.task) if seed % 2 else at_random(env.task, seed)
+        for i in range(int(task.limit)):
+            action = act(unfused, i)
+            before, target = env.state, env.target
+            unfused.state = before
+            # The fused step carries the angle's cosine and sine along; they are of this very angle now.
+            lifted = slice(len(before), len(env._program.y))
+            env._rows[lifted] = unfused.numbers[lifted]
+            unfused.target = [] if target is None else np.atleast_1d(target)
+            observation, reward, *over, _ = env.step(action)
+            seen, own, *ended = unfused.step(action)
+            assert over == ended
+            assert own == pytest.approx(reward, rel=1e-9, abs=1e-9)
+            assert np.allclose(observation, seen, rtol=1e-6, atol=1e-6)
+            by_state, by_control = env.scene.jacobian(before, env.control, env.task.dt)
+            # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
+            moved = by_control @ (np.atleast_1d(unfused.control) - np.atleast_1d(env.control))
+            assert np.abs(moved).max() <= 1e-10
+            steps.append((before, env.state, unfused.state, moved, by_state))
+            if any(over):
+                break
+        assert any(over)
+        starts, ends, own, moved = (np.array(x) for x in list(zip(*steps, strict=True))[:4])
+        sizes = np.maximum(np.abs(starts).max(axis=0), np.abs(ends).max(axis=0))
+        sizes[sizes == 0.0] = 1.0
+        error = np.max(np.abs(own - ends - moved) / sizes, axis=1)
+        condition = [max(1.0, np.linalg.norm(j / sizes[:, None] * sizes, np.inf)) for *_, j in steps]
+        assert np.max(error / condition) <= 1e-15
+
+
+@pytest.mark.parametrize("task", OWN, ids=lambda task: task.__name__)
+def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
+    outer = made(task)
+    scene = outer.scene
+    stepper = stepper_of(scene.mechanics)
+    constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
+    code = stepper.code(frozenset(n for n, x in constants.items() if x == 0.0), fused=False)
+    advance = code.compile()
+    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
+    env = Unfused(task())
+    order = float(env.program._order)
+    env.reset(3)
+    task = env.task
+    act = at_random(task, 4)
+    for i in range(30):
+        before = env.state
+        env.step(act(env, i))
+        if task.draws:
+            continue  # the state is the one after the kick
+        *after, status = advance(np.zeros(code.scratch), *before, *env.control, task.dt, order, *numbers)
+        assert status > 0 and [float(x).hex() for x in after] == [x.hex() for x in env.state]
+
+
+def test_constants_are_those_of_the_scene():
+    for id in REGISTERED:
+        env = Unfused(TASKS[id]())
+        found = dict(zip([*env.program.given, *env.program.derived], env.constants, strict=True))
+        for name, value in env.task.formulas.constants().items():
+            if name in found:
+                assert found[name] == pytest.approx(value, rel=1e-14), name
+
+
+def test_a_step_that_is_refused_changes_nothing():
+    env = Unfused(TASKS["PivotedBarFree-v0"](damping=0.0))
+    env.reset(1)
+    env.state = [0.0, 1e9]
+    with pytest.raises(StepRefused):
+        env.step([0.0])
+    assert env.state == [0.0, 1e9] and env.steps == 0
+
+
+def test_seeds_of_any_size():
+    for seed in (0, 2**53 + 1, 2**63 + 5, 2**64 - 1, 2**70):
+        env = gym.make("CylinderInCylinderTilt-v0").unwrapped
+        unfused = Unfused(env.task)
+        env.reset(seed=seed)
+        unfused.reset(seed)
+        assert np.allclose(unfused.state, env.state, rtol=1e-15)
+        assert np.allclose(unfused.target, env.target, rtol=1e-15)
