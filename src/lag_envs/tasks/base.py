@@ -100,6 +100,8 @@ class Task:
         Why it is hard, in a sentence or two, for its page.
     note : str
         What docs/agents.md says of its agents, without numbers: the tables have those.
+    quantities : mapping
+        For entries of the observation (unit, meaning), as the environment's page has them.
 
     Parameters
     ----------
@@ -134,6 +136,7 @@ class Task:
     examples: ClassVar[Examples] = Examples()
     difficulty: ClassVar[str] = ""
     note: ClassVar[str] = ""
+    quantities: ClassVar[Mapping[str, tuple[str, str]]] = MappingProxyType({})
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)

@@ -168,8 +168,6 @@ class Examples:
         Parameters, one for each environment of a batch, mild and extreme ones side by side.
     variants : mapping
         By name, keywords of the environment that are more than numbers.
-    feedback : str
-        The feedback law that the docstring states, in the names of the observation.
     """
 
     start: Mapping[str, Any] = field(default_factory=dict)
@@ -180,4 +178,3 @@ class Examples:
     rest: Sequence[float] | None = None
     batch: Mapping[str, Sequence[float]] = field(default_factory=dict)
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    feedback: str = ""
