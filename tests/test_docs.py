@@ -163,9 +163,9 @@ def test_equations(env_id, pages):
         (r"\\ddot\{\\?(\w+)\}", r"\1_ddot"),
         (r"\\dot\{\\?(\w+)\}", r"\1_dot"),
         (r"\\mathrm\{(\w+)\}", r"\1"),
-        (r"\\left|\\right|\\(?=theta|phi|psi|sin|cos)", ""),
+        (r"\\(?=theta|phi|psi|sin|cos)", ""),
         (r"\^\{2\}", "**2"),
-        (r"(sin|cos)\{\((\w+) \)\}", r"\1(\2)"),
+        (r"(sin|cos) \{(\w+)\}", r"\1(\2)"),
         (r"(?<=[\w)2]) (?=\w)", " * "),
     ):
         stated = re.sub(pattern, text, stated)

@@ -152,12 +152,12 @@ def _summary(env_id: str, task: Task) -> str:
     spaces = Actions(task.formulas.actions, task.formulas.choices).space, observation_space([task])
     shown = [str(space) if not hasattr(space, "low") else _box(space) for space in spaces]
     rows = [
+        ["Make it", f'`gym.make("{env_id}")`, `gym.make_vec("{env_id}", num_envs=64)`'],
         ["Action space", f"`{shown[0]}`"],
         ["Observation space", f"`{shown[1]}`"],
         ["Step, episode", f"{number(task.dt)} s, {number(task.limit)} steps"],
-        ["Make it", f'`gym.make("{env_id}")`, `gym.make_vec("{env_id}", num_envs=64)`'],
     ]
-    return table(["", ""], rows)
+    return table(rows[0], rows[1:])
 
 
 def _box(space: Any) -> str:

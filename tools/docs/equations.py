@@ -99,7 +99,8 @@ def _latex(scene: Scene, expression: Any) -> str:
             take(3, known, f"a{order[known.name]:02}", symbol(type(scene), known.name))
     for step in steps:  # derivatives before what they are of
         expression = expression.xreplace(step)
-    return sympy.latex(expression, symbol_names=shown)
+    latex = sympy.latex(expression, symbol_names=shown, fold_func_brackets=True)
+    return latex.replace(r"\left", "").replace(r"\right", "")
 
 
 def _word(name: str) -> str:
@@ -116,6 +117,8 @@ def mathml(latex: str, block: bool = True) -> str:
         lambda word: "<mtext>" + re.sub(r"<[^>]+>", "", word[0]) + "</mtext>",
         body,
     )
+    space = '<mspace width="0.17em"></mspace>'
+    body = re.sub(r"<mi>(sin|cos|tan|atan)</mi>", rf"{space}\g<0>{space}", body)
     source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
     whole = f"{head}<semantics><mrow>{body}</mrow>{source}</semantics></math>"
     return f'<div class="equation" tabindex="0">{whole}</div>' if block else whole

@@ -192,7 +192,8 @@ def markdown(accuracy: dict[str, Any]) -> str:
     lines = [
         "# Accuracy",
         "",
-        INTRODUCTION,
+        "What was measured, against whom, and where others are better. It is generated from what "
+        "`lag-envs report` measured.",
         "",
         "## Error against run time",
         "",
@@ -203,6 +204,9 @@ def markdown(accuracy: dict[str, Any]) -> str:
         *(f"- {text}" for text in (*FIRST, *overview.findings(accuracy))),
         "",
         *_command("work_precision,general"),
+        "## What is promised",
+        "",
+        INTRODUCTION,
     ]
     for part in PARTS:
         if part.section not in sections:
@@ -244,8 +248,9 @@ million substeps, or has no finite result, raises `StepRefused` and leaves the s
 Over many steps errors grow as the system makes them grow. The default bar, upright and without control,
 doubles an error every 0.14 s, whatever the method.
 
-Everything below is measured by `lag-envs report` (extras `report`, `peers`, `pinocchio`; `--quick` for a
-first look), which also writes a page with all rows as CSV and JSON. This page is generated from that."""
+`lag-envs report` measures all that follows (extras `report`, `peers`, `pinocchio`; `--quick` for a first
+look).
+It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
     "Only ours has a bound on its error that is known before or with the step. What the others reach was "
