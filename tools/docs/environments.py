@@ -66,6 +66,7 @@ def page(
     task: Task = TASKS[env_id]()
     prose = {name: _linked(text) for name, text in sections(type(task)).items()}
     parts: dict[str, list[str]] = {name: [prose.get(name, "")] for name in HEADINGS}
+    parts["Description"].append(" ".join(task.difficulty.split()))
     parts["Action Space"].append(_actions(task))
     parts["Observation Space"].append(_observation(task))
     parts["Starting State"].append(_start(task))
