@@ -260,12 +260,6 @@ def test_the_page_states_the_protocols_numbers():
     assert [state for state in STATES if f"| {state} |" not in text] == []
 
 
-def test_links():
-    text = page()
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        assert target.startswith("https://") or (ROOT / "docs" / target).exists(), target
-
-
 def test_the_recipe_of_the_docs_computes_a_rank(run, capsys):
     write("a", score=0.6)
     write("b", "b")

@@ -49,7 +49,7 @@ def plus_minus(mean: float, error: float) -> str:
 
     Examples
     --------
-    >>> plus_minus(418.987, 0.0115), plus_minus(0.000165, 0.0)
+    >>> plus_minus(418.987, 0.0117), plus_minus(0.000165, 0.0)
     ('418.987 ± 0.012', '0.0002 ± 0.0000')
     """
     digits = 4 if error <= 0.0 else max(0, 1 - math.floor(math.log10(error)))
