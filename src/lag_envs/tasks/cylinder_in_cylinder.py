@@ -212,10 +212,9 @@ class Tilt(_Shell):
         "turning at one rate; the cylinder swings about that place with little damping."
     )
     note = """
-Best is iLQR; LQR, PD and the greedy policy of value iteration are hardly behind. Among the learners TD3 is
-better than PPO on most seeds, with far fewer steps. Both are nearly as soon at the target as the
-controllers; what they lose, they lose mostly afterwards, beside the target, where the controllers end on
-it.
+Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 is
+better than PPO on most seeds, with far fewer steps. Both reach the target nearly as soon as the controllers.
+Most of their loss comes afterwards: they stop beside the target, where the controllers end on it.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -370,8 +369,9 @@ class Pump(_Shell):
     )
     note = """
 Best is the greedy policy of value iteration. Doing nothing is a trap: every action costs effort before it
-pays. All learners in the table have left it. TD3 gets to the wanted energy as soon as the energy pump, and
-then spends more on keeping it; PPO is later there, but for one seed, and keeps it at less expense than TD3.
+pays. All learners in the table have escaped it. TD3 reaches the wanted energy as soon as the energy pump
+does, and then spends more on keeping it. PPO gets there later, except for one seed, and keeps it at lower
+cost than TD3.
 """
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
@@ -520,10 +520,10 @@ class Damping(Task):
         "leave the shell: the best brake changes with the motion."
     )
     note = """
-Best is the greedy policy of value iteration, and the switching line is as good within what these episodes
-tell: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time as
-the line, but close to it for less: its network does not resolve that corner. TD3, with its one seed, ended
-with the action that lets go all the time.
+Best is the greedy policy of value iteration. The switching line is as good within the uncertainty of these
+episodes: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time
+as the line, but close to it for less, because its network does not resolve the corner of the switching line.
+TD3, with its one seed, ended with the action that never brakes.
 """
 
     def check(self) -> None:

@@ -149,8 +149,9 @@ class Tilt(Task):
         "other. Whoever tilts too far cannot turn the plane back in time to stop."
     )
     note = """
-Best is iLQR, before the greedy policy of value iteration, whose values are interpolated between targets, and
-the cascade. PPO is later at the mark than the cascade, and stops beside it where the cascade ends on it.
+Best is iLQR, ahead of the cascade and of the greedy policy of value iteration, whose values are interpolated
+between targets. PPO reaches the mark later than the cascade, and stops beside it where the cascade ends on
+it.
 """
 
     def check(self) -> None:
@@ -392,10 +393,10 @@ class Brake(Task):
         "where it does depends on the speed at the start."
     )
     note = """
-Best is the switching line: roll freely, then brake fully along the curve that ends at the line at the right
-speed. It is a hair below the optimum, which may switch in the midst of a step. It beats the greedy policy of
-value iteration, whose grid smears the moment of switching. PPO has found the same, but crosses most often a
-little sooner and too fast, and what that costs is more than the time it saves.
+Best is the switching line: roll freely, then brake fully along the curve that meets the line at the right
+speed. It is slightly below the optimum, which may switch in the middle of a step. It beats the greedy policy
+of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
+crosses a little too early and too fast, which costs more than the time it saves.
 """
 
     def check(self) -> None:

@@ -163,10 +163,11 @@ class SwingUp(_Bar):
         "one."
     )
     note = """
-Best is iLQR, which plans on the exact model from two sides and leaves the hold to the LQR. Energy shaping
-pumps to the energy of upright and waits for the bar to get there. PPO's seeds are nearly as good, but for one
-that misses the catch from some starts and swings on. What value iteration estimates is for the bar without a
-track, so nobody knows whether the difference can be had. The other learners catch the bar now and then only.
+Best is iLQR. It plans on the exact model, from both ends, and hands over to the LQR for the hold. Energy
+shaping pumps until the energy is that of upright, then waits for the bar to get there. PPO's seeds are nearly
+as good, except one that misses the catch from some starts and keeps swinging. The estimate by value iteration
+is for the bar without a track, so nobody knows whether the difference can be gained. The other learners catch
+the bar only now and then.
 """
 
     def check(self) -> None:
@@ -295,9 +296,9 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
         "swings, and the unstable upright rest caught at the right speed."
     )
     note = """
-Best is iLQR, and it beats the greedy policy of value iteration, whose moments of switching are smeared over a
-cell of the grid. PPO's seeds differ by how soon the bar is up. Energy shaping holds back once the energy is
-right, which is too careful without a track to mind.
+Best is iLQR. It beats the greedy policy of value iteration, whose switching times are smeared over a cell of
+the grid. PPO's seeds differ in how soon the bar is up. Energy shaping stops pumping once the energy is right,
+which is too cautious without a track to watch.
 """
 
 
@@ -415,9 +416,9 @@ class Balance(_Bar):
         "first move the wrong way: what saves the bar uses up the track."
     )
     note = """
-Best is the LQR whose weights were tuned for the kicks, and PPO is as good within what these episodes tell.
-They are unlucky ones: in many more the LQR gets what is called best known here. Both lose the bar in about as
-many episodes.
+Best is the LQR, with weights tuned for the kicks; PPO is as good within the uncertainty of these episodes.
+The episodes are unlucky ones: over many more the LQR's return is the one called best known here. Both lose
+the bar in about as many episodes.
 """
 
     def check(self) -> None:
