@@ -143,10 +143,9 @@ def _range(task: Task, acting: Any) -> str:
 
 
 def _picture(env_id: str) -> str:
-    for file, alt in ((f"moving/{env_id}.webp", "a trained agent at work"), (f"{env_id}.png", "a picture")):
-        if (ROOT / "docs" / "images" / file).exists():
-            return f"![{env_id}: {alt}](../images/{file})"
-    return ""
+    if not (ROOT / "docs" / "images" / "moving" / f"{env_id}.webp").exists():
+        return ""
+    return f"![{env_id}: a trained agent at work](../images/moving/{env_id}.webp)"
 
 
 def _summary(env_id: str, task: Task) -> str:
