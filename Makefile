@@ -14,7 +14,7 @@ NUMBA_TESTS ?= tests/test_golden.py tests/test_series.py tests/test_own_tasks.py
 GYMNASIUM_TESTS ?= tests
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo baselines test test-slow notebooks test-libraries test-oldest lint types check audit bench bench-docs report report-docs submissions site format clean
+.PHONY: help setup demo baselines test test-slow notebooks test-libraries test-oldest lint types check audit bench bench-docs report report-docs submissions docs pictures format clean
 
 help:  ## list the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -77,18 +77,21 @@ bench: setup  ## compare the speed with other environments
 bench-docs: setup  ## the same, taken over into docs and README; on a machine with nothing else to do
 	$(BIN)/lag-envs bench --checkout . $(ARGS)
 
-report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs and README too
+report: setup  ## measure errors and write a page about them, into the folder report; ARGS='--docs .' into docs too
 	$(BIN)/lag-envs report $(ARGS)
 
-report-docs: setup  ## take the folder report over into docs and README
+report-docs: setup  ## take the folder report over into docs
 	$(BIN)/python -m lag_envs.report.docs report
 
 submissions: setup  ## make submissions of all our agents, from what `make baselines` left, in runs/submissions
 	$(BIN)/python -m agents.board_values
 	$(BIN)/python -m agents.submit runs/submissions $(ARGS)
 
-site: setup  ## build the leaderboard's page, into the folder site
-	$(BIN)/lag-envs leaderboard build $(ARGS)
+docs: setup  ## build the documentation and the leaderboard's page as one site, into the folder site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict $(ARGS)
+
+pictures: setup  ## write README's table of environments, and draw their moving pictures
+	SDL_VIDEODRIVER=dummy $(BIN)/python -m tools.docs --pictures
 
 format: setup  ## format the code and auto-fix what ruff can
 	$(BIN)/ruff check --fix

@@ -74,7 +74,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
 
 
 def summary(data: Data) -> str:
-    """Return README's table: the best agent of each kind, by environment, with the range that scores have."""
+    """Return the table of docs/training.md: scores' range and the best agent of each kind, by environment."""
     rows = []
     for env_id, env in data["envs"].items():
         best: dict[str, str] = {}

@@ -25,6 +25,8 @@ from lag_envs.store import write
 
 ROOT = Path(__file__).parents[1]
 SUMMARY, PAGE, PICTURES = "agents/results/summary.json", "docs/agents.md", "docs/images"
+#: What has the table of the best agents.
+TRAINING = "docs/training.md"
 #: Episodes under each condition, and with --quick.
 EPISODES, QUICK = 1000, 20
 PACKAGES = ("gymnasium", "numpy", "numba", "scipy", "torch", "stable-baselines3", "sb3-contrib", "matplotlib")
@@ -34,7 +36,7 @@ EPILOG = f"""what it reads and writes:
   RUNS/measurements/ENV.jsonl  what has been measured; it is not measured again
   OUTPUT/{SUMMARY}   all numbers
   OUTPUT/{PAGE}        the page, with figures in OUTPUT/{PICTURES}
-  OUTPUT/README.md            the table in it, where there is one
+  OUTPUT/docs/training.md     the table in it, where there is one
 
 It can be interrupted at any time; re-run it to resume. Agents that are not there now (other machines'
 runs, say) keep the numbers that the summary has of them. Commands for different --envs may run side by side.
@@ -182,7 +184,7 @@ def load_summary(output: Path, needed: bool = False) -> Data:
 
 
 def show(data: Data, output: Path) -> int:
-    """Write figures, page, and README's table."""
+    """Write figures, page, and the table of the best agents."""
     from agents.figures import figures
     from agents.report import page, summary
     from lag_envs.generated import replaced
@@ -191,9 +193,9 @@ def show(data: Data, output: Path) -> int:
     for old in set((output / PICTURES).glob("agents-*.png")) - set(files):
         old.unlink()
     write(output / PAGE, page(data))
-    readme = output / "README.md"
-    if readme.exists():
-        write(readme, replaced(readme.read_text(encoding="utf-8"), "agents", summary(data)))
+    training = output / TRAINING
+    if training.exists():
+        write(training, replaced(training.read_text(encoding="utf-8"), "agents", summary(data)))
     print(f"Written: {output / PAGE} and {len(files)} figures")
     return 0
 

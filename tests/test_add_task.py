@@ -32,6 +32,7 @@ from lag_envs.leaderboard.standings import board_data
 from lag_envs.leaderboard.submission import load
 from lag_envs.scores import known_returns
 from lag_envs.tasks import find, measured
+from tools.docs import environments
 
 ROOT = Path(__file__).parents[1]
 RECIPE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -116,6 +117,16 @@ def test_commands(task, file, capsys):
     for command, wanted in (("list", ID), ("info", "goal_1"), ("hyperparams", f"{ID}:\n")):
         assert cli.main([command, *{"info": [ID], "hyperparams": ["ppo"]}.get(command, [])]) == 0
         assert wanted in capsys.readouterr().out
+
+
+def test_docs_page(task):
+    """Its page, though it has neither prose nor results yet."""
+    page = environments.page(ID)
+    headings = re.findall("^## (.+)$", page, re.MULTILINE)
+    assert headings == [name for name in environments.HEADINGS if name in headings]
+    assert {"Action Space", "Observation Space", "Arguments", "Equations"} <= set(headings)
+    assert "| 1 | `elbow` | N m | -2 | 2 |" in page and '"target": [goal_1, goal_2]' in page
+    assert "| 0 | `theta_1` |  | rad | -∞ | ∞ |" in page and page.count("<math") == 3
 
 
 def test_report(task, file, tmp_path, monkeypatch):

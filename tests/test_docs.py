@@ -1,5 +1,6 @@
 """What the documentation says is what the code does: headings, tables, figures, links."""
 
+import ast
 import dataclasses
 import inspect
 import itertools
@@ -11,6 +12,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from PIL import Image
 from rollouts import IDS, make
 
 from lag_envs.benchmark import TARGETS
@@ -26,23 +28,10 @@ from lag_envs.scores import known_returns
 from lag_envs.stepping import pendulum
 from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.measured import measured
+from tools.docs import environments, pictures
+from tools.docs.__main__ import generated as from_records
 
 ROOT = Path(__file__).parents[1]
-HEADINGS = [
-    "Description",
-    "Action Space",
-    "Observation Space",
-    "Rewards",
-    "Starting State",
-    "Episode End",
-    "Arguments",
-    "Equations",
-    "Signs and Units",
-    "Numerical Accuracy",
-    "Optimal Value",
-    "Version History",
-]
-
 each_id = pytest.mark.parametrize("env_id", IDS)
 
 
@@ -61,10 +50,6 @@ def table(text):
     return [dict(zip(head, row, strict=True)) for row in body]
 
 
-def page(env):
-    return sections(type(env.task).__doc__)
-
-
 def plain(text):
     """Return a text without its line breaks."""
     return " ".join(text.split())
@@ -76,94 +61,140 @@ def agrees(stated, value):
     return abs(float(stated) - value) <= 0.5001 * 10.0**-digits + 1e-6 * abs(value)
 
 
-# --- the tasks' pages ---
+# --- the environments' pages, which are generated from their records ---
+
+
+@pytest.fixture(scope="module")
+def pages():
+    return environments.pages(ROOT)
+
+
+def rows(page, heading, head):
+    """Return a section's table by the entries of its second column, or of its first."""
+    found = table(sections(page)[heading])
+    return {row[head].split("`")[1] if "`" in row[head] else row[head]: row for row in found}
 
 
 @each_id
-def test_headings(env_id):
-    env = make(env_id)
-    assert list(page(env)) == HEADINGS
-    assert env.__doc__ == type(env.task).__doc__
-    assert all(text.strip() for text in page(env).values())
+def test_docstring_has_prose_only(env_id):
+    task = TASKS[env_id]
+    found = sections(task.__doc__)
+    assert set(found) <= set(environments.HEADINGS) and "Version History" in found
+    assert "| --" not in task.__doc__
+    assert make(env_id).__doc__ == task.__doc__
 
 
 @each_id
-def test_action_table(env_id):
+def test_headings(env_id, pages):
+    found = sections(pages[env_id])
+    assert list(found) == list(environments.HEADINGS)
+    assert all(text.strip() for text in found.values())
+
+
+@each_id
+def test_action_table(env_id, pages):
+    """The controls at both ends of the action are those that a step applies."""
     env = make(env_id)
-    (row,) = table(page(env)["Action Space"])
+    ((name, row),) = rows(pages[env_id], "Action Space", "Control").items()
     for column, action in (("At -1", -1.0), ("At 1", 1.0)):
         env.reset(seed=0, options={"state": env.task.centre})
         env.step(np.array([action]))
         assert env.control == float(row[column])
-    assert env.scene.control_units == (row["Unit"],)
+    assert (name,) == env.scene.control_names and row["Unit"] in env.scene.control_units
 
 
 @each_id
-def test_observation_table(env_id):
+def test_observation_table(env_id, pages):
     env = make(env_id)
-    rows = {row["Observation"]: row for row in table(page(env)["Observation Space"])}
-    assert [name for name in rows if name in env.task.observation] == list(env.task.observation)
-    space = env.observation_space
-    for name, low, high in zip(env.task.observation, space.low, space.high, strict=True):
-        assert agrees(rows[name]["Min"], low) and agrees(rows[name]["Max"], high), name
+    found = rows(pages[env_id], "Observation Space", "Observation")
+    assert list(found) == list(env.task.observation) and set(env.task.quantities) >= set(found)
+    for row, low, high in zip(
+        found.values(), env.observation_space.low, env.observation_space.high, strict=True
+    ):
+        assert float(row["Min"]) == pytest.approx(low, rel=1e-3)
+        assert float(row["Max"]) == pytest.approx(high, rel=1e-3)
+        assert row["Unit"] and row["Meaning"]
 
 
 @each_id
-def test_start_table(env_id):
-    env = make(env_id)
-    rows = {row["State"]: row for row in table(page(env)["Starting State"])}
-    names = zip(
-        env.scene.state_names, env.scene.state_units, env.task.centre, env.task.half_widths, strict=True
-    )
-    for name, unit, centre, half in names:
-        row = rows[name]
-        assert row["Unit"] == unit and agrees(row["Centre"], centre), name
-        assert float(row["To either side"]) == pytest.approx(half), name
-    if env.task.target_range is not None:
-        assert float(rows["target"]["To either side"]) == env.task.target_range
-    kicks = page(env)["Starting State"].count("kick")
-    assert bool(kicks) == bool(env.task.draws)
-
-
-@each_id
-def test_episode_length(env_id):
+def test_start_table(env_id, pages):
+    """Starts lie in the box that the page states, and reach its edges."""
     task = make(env_id).task
-    assert f"after {task.steps} steps ({task.duration:g} s)" in plain(page(make(env_id))["Episode End"])
+    found = rows(pages[env_id], "Starting State", "Entry")
+    envs = gym.make_vec(env_id, num_envs=2000)
+    envs.reset(seed=0)
+    for name, starts in zip(task.scene.state_names, np.asarray(envs.unwrapped.state).T, strict=True):
+        centre, half = float(found[name]["Centre"]), float(found[name]["To either side"])
+        assert np.ptp(starts) == pytest.approx(2.0 * half, rel=0.01, abs=1e-12), name
+        assert starts.mean() == pytest.approx(centre, abs=0.05 * half + 1e-4), name
+    assert ("kick" in sections(pages[env_id])["Starting State"]) == bool(task.draws)
 
 
-@pytest.mark.parametrize("kind", {t.__doc__: t for t in reversed([*TASKS.values()])}.values())
-def test_argument_table(kind):
-    """Every parameter that the task leaves free is there, with its default and its range."""
-    task = kind()
-    rows = {row["Keyword"]: row for row in table(sections(type(task).__doc__)["Arguments"])}
-    fields = {field.name: field for field in dataclasses.fields(task.scene)}
-    own = {"dt": task.dt, "duration": task.duration}
-    if task.target_range is not None:
-        own["target"] = None
-    optional = {name for name in ("control", "tilt") if name in fields}
-    assert set(fields) - optional <= set(rows) - set(own) <= set(fields)
-    for name, row in rows.items():
-        value = own[name] if name in own else getattr(task.scene, name)
-        if isinstance(value, float):
-            assert float(row["Default"]) == pytest.approx(value, rel=1e-5), name
-        else:
-            assert row["Default"] == str(value), name
-        if name in fields and "unit" in fields[name].metadata:
-            assert row["Unit"] == fields[name].metadata["unit"], name
-        if name in task.usable_ranges():
-            stated = [float(number) for number in row["Range"].split(" to ")]
-            assert stated == pytest.approx(task.usable_ranges()[name], rel=1e-3), name
+@each_id
+def test_argument_table(env_id, pages):
+    """Every keyword is there, and makes an environment with its default."""
+    found = rows(pages[env_id], "Arguments", "Keyword")
+    task = make(env_id).task
+    names = {field.name for field in dataclasses.fields(task.scene)}
+    own = {"dt", "duration"} | ({"target"} if task.formulas.target_boxes else set())
+    assert set(found) == names | own and all(row["Meaning"] for row in found.values())
+    given = {name: ast.literal_eval(row["Default"]) for name, row in found.items()}
+    again = gym.make(env_id, **given).unwrapped.task
+    for name in names:
+        value, default = getattr(again.scene, name), getattr(task.scene, name)
+        assert value == (pytest.approx(default, rel=1e-4) if isinstance(default, float) else default), name
+    assert again.limit == task.limit
+
+
+@each_id
+def test_equations(env_id, pages):
+    """The formula with numbers is the scene's acceleration."""
+    scene = make(env_id).scene
+    latex = re.findall(r"application/x-tex\">(.*?)</annotation>", pages[env_id])
+    assert len(latex) == 3 and latex[0].startswith(r"\mathcal{L} = ") and latex[1].endswith("= 0")
+    (free,) = scene._layout.free
+    state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
+    found = scene.acceleration(state, 0.7)[free]
+    values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
+    if "w" in values:  # the momentum's speed stands for the place's rate
+        values["x_dot"] = values["w"] - scene.radius * values["phi_dot"]
+    stated = latex[2].partition("=")[2]
+    for pattern, text in (
+        (r"\\ddot\{\\?(\w+)\}", r"\1_ddot"),
+        (r"\\dot\{\\?(\w+)\}", r"\1_dot"),
+        (r"\\mathrm\{(\w+)\}", r"\1"),
+        (r"\\(?=theta|phi|psi|sin|cos)", ""),
+        (r"\^\{2\}", "**2"),
+        (r"(sin|cos) \{(\w+)\}", r"\1(\2)"),
+        (r"(?<=[\w)2]) (?=\w)", " * "),
+    ):
+        stated = re.sub(pattern, text, stated)
+    values |= {"sin": math.sin, "cos": math.cos, "phi_ddot": 0.0}
+    assert eval(stated, values) == pytest.approx(float(found), rel=1e-4)
+
+
+@each_id
+def test_known_returns_and_agents(env_id, pages):
+    found = sections(pages[env_id])
+    known, agents = measured(env_id)["measured"], table(found["Agents"])
+    stated = {row["Policy"]: row for row in table(found["Known Returns"])}
+    assert float(stated["random actions"]["Return"].split(" ")[0]) == pytest.approx(
+        known["random"]["mean"], rel=1e-3
+    )
+    assert any(known_returns(env_id).policy in name for name in stated)
+    assert agents[0]["Rank"] == "1" and f"board/{env_id}.html" in found["Agents"]
+    assert TASKS[env_id].note.strip() in found["Agents"]
 
 
 # --- figures ---
 
 
 @each_id
-def test_certified_speed(env_id):
+def test_certified_speed(env_id, pages):
     """The stated speed is the task's own, rounded down, and one series suffices up to it and no further."""
     env = make(env_id)
-    scene, task, text = env.scene, env.task, plain(page(env)["Numerical Accuracy"])
-    stated = re.search(r"\|θ'\| is at most ([\d.]+) rad/s", text)
+    scene, task, text = env.scene, env.task, plain(sections(pages[env_id])["Numerical Accuracy"])
+    stated = re.search(r"\|`theta_dot`\| is at most ([\d.]+) rad/s", text)
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
     if not order:
@@ -191,14 +222,13 @@ def test_certified_speed(env_id):
 
 @each_id
 def test_measured_error(env_id):
-    """A step errs by less than 1e-15 of the state's size: the pages and README say so, as the report claims.
+    """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
     Here some steps of an episode of random actions; the report's tests take all of them.
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
-    assert f"against 40 digits: below {limit} of the state's size" in plain(page(env)["Numerical Accuracy"])
-    assert f"no step of any of the eight environments errs by more than {limit} of" in plain(readme())
+    assert f"No step of any of the eight environments errs by more than {limit} of" in plain(readme())
     assert f"errs by less than {limit} of the largest that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
@@ -214,58 +244,9 @@ def test_measured_error(env_id):
         assert max(errors) < LARGEST_STEP
 
 
-def feedback(task):
-    """Return the law that the page states, as a policy; None where there is none."""
-    law = compile(task.examples.feedback or "None", "feedback", "eval")
-
-    def policy(observations):
-        seen = dict(zip(task.observation, observations.T, strict=True))
-        return eval(
-            law, {"clip": np.clip, "abs": np.abs, "where": np.where, "sin": np.sin, "cos": np.cos}, seen
-        )
-
-    return policy if task.examples.feedback else None
-
-
-def returns(env_id, policy, episodes=4096):
-    """Return mean and standard error of the first episodes of as many environments."""
-    envs = gym.make_vec(env_id, num_envs=episodes)
-    observations, _ = envs.reset(seed=1)
-    total, going = np.zeros(episodes), np.ones(episodes, dtype=bool)
-    while going.any():
-        observations, rewards, terminations, truncations, _ = envs.step(policy(observations)[:, None])
-        total += np.where(going, rewards, 0.0)
-        going &= ~(terminations | truncations)
-    return total.mean(), total.std() / math.sqrt(episodes)
-
-
-@each_id
-def test_stated_returns(env_id):
-    """Random actions, zero control, and the page's feedback law return what the page says."""
-    rng = np.random.default_rng(0)
-    task = TASKS[env_id]()
-    zero = task.rest_action
-    policies = [lambda o: rng.uniform(-1.0, 1.0, len(o)), lambda o: np.full(len(o), zero)]
-    policies += [law] if (law := feedback(task)) else []
-    rows = {row["Id"]: row for row in table(page(make(env_id))["Optimal Value"])}
-    _, *cells, best = rows[env_id].values()
-    assert_measured(best, env_id, known_returns(env_id).policy)
-    for cell, policy in zip(cells, policies, strict=True):
-        stated, error = cell.split(" ± ")
-        mean, standard_error = returns(env_id, policy)
-        assert agrees(stated, mean) or abs(float(stated) - mean) <= standard_error, (mean, cell)
-        assert agrees(error, standard_error), (standard_error, cell)
-
-
 def scale(env_id):
     """Return what `python -m agents.scale` measured, by policy."""
     return measured(env_id)["measured"]
-
-
-def assert_measured(cell, env_id, policy):
-    """Hold a mean ± standard error against what was measured."""
-    found, (mean, error) = scale(env_id)[policy], cell.split(" ± ")
-    assert agrees(mean, found["mean"]) and agrees(error, found["error"]), (env_id, cell, found)
 
 
 @each_id
@@ -301,49 +282,48 @@ def numerics():
     return (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
 
 
-def environments():
-    """Return README's table of environments by id."""
-    rows = table(readme().partition("## Environments")[2].partition("Keywords of")[0])
-    return {re.match(r"\[([\w-]+)\]", row["id"])[1]: row for row in rows}
+def test_readme_is_short_and_shows_what_it_must():
+    text = readme()
+    assert len(text.encode()) <= 8192
+    block = text.partition("<!-- environments:begin -->")[2].partition("<!-- environments:end -->")[0]
+    assert re.findall(r"\[([\w-]+-v\d+)\]", block) == IDS
+    pictures = [ROOT / name for name in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)]
+    assert len(pictures) == 2 and all(path.stat().st_size < 1_000_000 for path in pictures)
+    for command in ("make demo", "make check"):
+        assert re.search(rf"^{command}", text, re.MULTILINE)
 
 
-def test_readme_names_every_id():
-    assert list(environments()) == IDS
-    gallery = readme().partition("## ")[0]
-    assert re.findall(r"docs/images/([\w-]+)\.png", gallery) == IDS
+def test_moving_pictures_are_small_and_move():
+    folder = ROOT / "docs" / "images" / "moving"
+    assert sorted(path.stem for path in folder.iterdir()) == sorted(IDS)
+    for path in folder.iterdir():
+        assert path.stat().st_size <= pictures.LARGEST
+        with Image.open(path) as picture:
+            assert picture.n_frames > 20
 
 
-@each_id
-def test_readme_row(env_id):
-    """README's table repeats what page and measurements say."""
-    env, row = make(env_id), environments()[env_id]
-    best, _, optimum = row["best known"].partition("; optimum ")
-    assert_measured(best, env_id, known_returns(env_id).policy)
-    assert_measured(row["random"], env_id, "random")
-    if optimum or "optimum" in scale(env_id):
-        assert agrees(optimum, scale(env_id)["optimum"]["mean"])
-    stated = re.search(r"is at most ([\d.]+) rad/s", plain(page(env)["Numerical Accuracy"]))
-    assert row["certified"] == (stated[1] if stated else "exact")
-    (control,) = table(page(env)["Action Space"])
-    assert control["At 1"] in row["control"] and control["Unit"] in row["control"]
-    assert len(row["observation"].split(", ")) == len(env.task.observation)
+#: Pages for readers of the repository; the site has more (`test_docs_site.py`), and its home links to them.
+FILES = [
+    *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "NOTICE.md"),
+    *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md") if path.name != "index.md"),
+]
 
 
-@pytest.mark.parametrize(
-    "file", ["README.md", "CONTRIBUTING.md", *sorted(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
-)
+def anchors(path):
+    """Return the anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("file", FILES)
 def test_links(file):
     path = ROOT / file
-    text = path.read_text(encoding="utf-8")
-    headings = {
-        re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-")
-        for h in re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-    }
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        if target.startswith("#"):
-            assert target[1:] in headings, target
-        elif not target.startswith("http"):
-            assert (path.parent / target).exists(), target
+    for target in re.findall(r"\]\(([^)]+)\)", path.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            place, _, anchor = target.partition("#")
+            found = path.parent / place if place else path
+            assert found.exists(), target
+            assert not anchor or anchor in anchors(found), target
 
 
 @pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md"])
@@ -358,21 +338,24 @@ def test_make_targets(file):
 
 
 def test_generated_parts_are_as_generated():
-    """README's tables and docs/accuracy.md follow from the JSON files beside them."""
+    """Pages and README's tables follow from the JSON files beside them, and from the records."""
     for path, text in generated(ROOT).items():
         assert path.read_text(encoding="utf-8") == text, (
-            f"{path.name}: `make report ARGS='--docs .'` writes it anew"
+            f"{path.name}: `python -m lag_envs.report.docs` writes it anew"
         )
+    for path, text in from_records(ROOT).items():
+        assert path.read_text(encoding="utf-8") == text, f"{path.name}: `python -m tools.docs` writes it anew"
 
 
 def test_speeds():
     """One table with all ids at four sizes; what misses its aim says so, and README claims no more."""
     speed = json.loads((ROOT / "docs" / "speed.json").read_text(encoding="utf-8"))
     assert speed["complete"]
-    block = readme().partition("<!-- bench:begin -->")[2].partition("<!-- bench:end -->")[0]
+    page = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8")
+    block = page.partition("<!-- bench:begin -->")[2].partition("<!-- bench:end -->")[0]
     rows = {row.pop("id"): list(row.values()) for row in table(block)}
-    assert list(rows) == [*IDS, "CartPole-v1", "*aim*"]
-    aims = [float(cell.strip("*×")) for cell in rows["*aim*"]]
+    assert list(rows) == [*IDS, "CartPole-v1", "*target*"]
+    aims = [float(cell.strip("*×")) for cell in rows["*target*"]]
     assert aims == [target.ratio for target in TARGETS] and len(aims) == 4
     found = {(r["id"], r["kind"], r["num_envs"]): r for r in speed["rows"] if r["library"] == "lag_envs"}
     for env_id, target in itertools.product(IDS, TARGETS):
@@ -386,20 +369,13 @@ def test_speeds():
 
 
 def test_numbers_in_the_prose():
-    """What README and docs/numerics.md say of the code's own numbers is so."""
-    pages = {
-        name: plain((ROOT / name).read_text(encoding="utf-8")) for name in ("README.md", "docs/numerics.md")
-    }
+    """What pages say of the code's own numbers is so."""
     weight = make(pivoted_bar.SwingUpFree.id).scene._constants()["alpha"]
     doubling = math.log(2.0) / math.sqrt(weight)
     bar, brake = PivotedBar(), CylinderInCylinder(control="damping")
     assert brake._order(0.02) == bar._order(0.031)
     said = {
-        "README.md": [
-            f"doubles an error every {doubling:.2f} s",
-            f"stepped in blocks of {BLOCK},",
-            "more than a million substeps",
-        ],
+        "docs/accuracy.md": [f"doubles an error every {doubling:.2f} s", "more than a million substeps"],
         "docs/numerics.md": [
             f"more than {pendulum.MAX_SUBSTEPS:,} substeps",
             f"blocks of {BLOCK} environments",
@@ -407,11 +383,13 @@ def test_numbers_in_the_prose():
         ],
     }
     assert pendulum.MAX_SUBSTEPS == 1_000_000
-    assert [(page, text) for page, texts in said.items() for text in texts if text not in pages[page]] == []
+    found = {name: plain((ROOT / name).read_text(encoding="utf-8")) for name in said}
+    assert [(page, text) for page, texts in said.items() for text in texts if text not in found[page]] == []
 
 
 def test_figures_of_the_report_are_there():
-    text = (ROOT / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    pages = [ROOT / "docs" / name for name in ("accuracy.md", "accuracy-details.md")]
+    text = "".join(page.read_text(encoding="utf-8") for page in pages)
     shown = set(re.findall(r"\]\((images/accuracy/[^)]+)\)", text))
     kept = {f"images/accuracy/{path.name}" for path in (ROOT / "docs" / "images" / "accuracy").iterdir()}
     assert shown == kept and shown

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from lag_envs.cli import main
 from lag_envs.report import docs, page
@@ -210,17 +211,32 @@ def test_compact_form(written, tmp_path, monkeypatch):
     (tmp_path / "docs" / "speed.json").write_text(
         (PROJECT / "docs" / "speed.json").read_text(encoding="utf-8")
     )
-    names = ("accuracy", "bench", "fast")
-    marks = " b ".join(f"<!-- {name}:begin --> <!-- {name}:end -->" for name in names)
-    (tmp_path / "README.md").write_text(f"a {marks} c")
+    marks = {name: f"a <!-- {name}:begin --> <!-- {name}:end --> c" for name in ("bench", "fast")}
+    (tmp_path / "README.md").write_text(marks["fast"])
+    (tmp_path / "docs" / "speed.md").write_text(marks["fast"] + marks["bench"])
+    monkeypatch.setattr(
+        docs, "PARTS", (docs.Part(dummy_section.SECTION, "Dummies", "How many there are.", ("dots",)),)
+    )
+    monkeypatch.setattr(docs.overview, "draw", lambda _: Figure())
+    monkeypatch.setattr(docs.overview, "findings", lambda _: ["Nobody is faster."])
     assert docs.main([str(written), str(tmp_path)]) == 0
-    text = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    text = (tmp_path / "docs" / "accuracy-details.md").read_text(encoding="utf-8")
     assert "| There are five. | **holds** | 5 found |" in text
     assert "![A line](images/accuracy/dummy.svg)" in text
-    assert (tmp_path / "docs" / "images" / "accuracy" / "dots.png").exists()
-    readme = (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert "1 of 2 claims hold" in readme and "`gym.make`" in readme
-    assert readme.startswith("a ") and readme.endswith(" c")
+    page = (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8")
+    assert page.index("overview.png") < page.index("- Nobody is faster.") < page.index("## Dummies")
+    assert "images/accuracy/dots.png" in page and "dummy.svg" not in page
+    assert "lag-envs report --sections tests.dummy" in page and "1 of 2 claims hold" in page
+    for name in ("dots.png", "overview.png"):
+        assert (tmp_path / "docs" / "images" / "accuracy" / name).exists()
+    readme, speed = (tmp_path / name for name in ("README.md", "docs/speed.md"))
+    assert "targets are missed" in readme.read_text() and "`gym.make`" in speed.read_text(encoding="utf-8")
+    assert readme.read_text().startswith("a ") and readme.read_text().endswith(" c")
+    # Without the report's folder, the same from the committed file.
+    readme.write_text(marks["fast"])
+    monkeypatch.chdir(tmp_path)
+    assert docs.main([]) == 0 and "targets are missed" in readme.read_text()
+    assert (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8") == page
 
 
 def test_broken_off_report_is_not_taken_over(written, tmp_path, capsys):

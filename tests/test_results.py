@@ -363,8 +363,8 @@ def test_notes_are_about_environments_that_exist_and_hold_no_numbers():
 
 def test_committed_page_is_made_from_the_committed_results():
     data = summary(ROOT)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert readme == replaced(readme, "agents", report.summary(data)), "python -m agents.results --redraw"
+    training = (ROOT / results.TRAINING).read_text(encoding="utf-8")
+    assert training == replaced(training, "agents", report.summary(data)), "python -m agents.results --redraw"
     text = (ROOT / results.PAGE).read_text(encoding="utf-8")
     assert text == report.page(data), "python -m agents.results --redraw"
     for line in text.splitlines():

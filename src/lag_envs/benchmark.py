@@ -116,7 +116,7 @@ class Settings:
     cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
     date: str = ""
     output: str | None = None
-    checkout: str | None = None  #: whose docs and README take the result over
+    checkout: str | None = None  #: whose docs take the result over
 
 
 @dataclass
@@ -375,7 +375,7 @@ def bench(settings: Settings) -> dict[str, Any]:
         print(f"written to {settings.output}")
     if settings.checkout and complete:
         take_over(report, Path(settings.checkout))
-        print(f"written to docs/speed.json and README.md in {settings.checkout}")
+        print(f"written to docs/speed.json, docs/speed.md and README.md in {settings.checkout}")
     return report
 
 
@@ -603,7 +603,7 @@ def table(report: dict[str, Any]) -> list[str]:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Return README's table: every environment at the sizes of `TARGETS`; what misses its aim is marked.
+    """Return the table of docs/speed.md: every environment at the sizes of `TARGETS`; what misses is marked.
 
     Parameters
     ----------
@@ -628,13 +628,14 @@ def markdown(report: dict[str, Any]) -> str:
     lines = [
         *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in _ours(report)),
         ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
-        ["*aim*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
+        ["*target*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
     ]
     machine, settings = report["machine"], report["settings"]
     parts = [
-        "Time of a step, and how many times that as many of Gymnasium's `CartPole-v1` take for one: medians"
-        f" of {settings['rounds']} rounds, {settings['clock']} time on one core of {machine['processor']}"
-        f" (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, {report['date']}).",
+        "Time of a step, and how many times as long a step of as many of Gymnasium's `CartPole-v1` takes: "
+        f"medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
+        f"{machine['processor']} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
+        f"{report['date']}).",
         markdown_table(["id", *sizes], lines),
     ]
     exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
@@ -656,7 +657,7 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def claim(report: dict[str, Any]) -> str:
-    """Return README's sentence on speed: the ranges of its table, and how many aims are missed."""
+    """Return a sentence on speed: the ranges of the table, and how many targets are missed."""
     rows = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
     found = [
         sorted(row["ratio"][1] for row in rows if (row["kind"], row["num_envs"]) == target[:2])
@@ -671,11 +672,8 @@ def claim(report: dict[str, Any]) -> str:
     missed = sum(
         ratio < target.ratio for target, ratios in zip(TARGETS, found, strict=True) for ratio in ratios
     )
-    aims = f"{missed} of {sum(map(len, found))} aims are missed" if missed else "all aims are met"
-    return (
-        "- Fast: a step, observation, reward, endings and resets included, is quicker than one of Gymnasium's"
-        f" `CartPole-v1`: {ranges}; {aims}. See [Speed](#speed)."
-    )
+    aims = f"{missed} of {sum(map(len, found))} targets are missed" if missed else "all targets are met"
+    return f"Steps per second, relative to Gymnasium's `CartPole-v1`: {ranges}; {aims}."
 
 
 def _ours(report: dict[str, Any]) -> list[str]:
@@ -683,13 +681,22 @@ def _ours(report: dict[str, Any]) -> list[str]:
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
-    """Write a report into a checkout: ``docs/speed.json``, and what README says of it."""
+    """Write a report into a checkout: ``docs/speed.json``, and what docs/speed.md and README say of it."""
+    write(checkout / "docs" / "speed.json", to_json(report))
+    for path, text in texts(report, checkout).items():
+        write(path, text)
+
+
+def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
+    """Return the files of a checkout that tell of a report, as they ought to be."""
     from lag_envs.generated import replaced
 
-    write(checkout / "docs" / "speed.json", to_json(report))
-    readme = checkout / "README.md"
-    text = replaced(readme.read_text(encoding="utf-8"), "bench", markdown(report))
-    write(readme, replaced(text, "fast", claim(report)))
+    page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
+    text = replaced(page.read_text(encoding="utf-8"), "bench", markdown(report))
+    return {
+        page: replaced(text, "fast", claim(report)),
+        readme: replaced(readme.read_text(encoding="utf-8"), "fast", claim(report)),
+    }
 
 
 def to_json(report: dict[str, Any]) -> str:

@@ -141,7 +141,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checkout",
         metavar="FOLDER",
-        help="take everything over into docs/speed.json and README.md of this checkout",
+        help="take everything over into docs/speed.json, docs/speed.md and README.md of this checkout",
     )
     parser.add_argument(
         "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
@@ -180,7 +180,7 @@ def run_bench(args: argparse.Namespace) -> int:
                 raise UserError(
                     "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes"
                 )
-        for name in ("README.md", "docs/speed.json"):
+        for name in ("README.md", "docs/speed.json", "docs/speed.md"):
             if not os.access(Path(args.checkout, name), os.W_OK):
                 raise UserError(
                     f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
@@ -299,9 +299,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
     )
-    parser.add_argument(
-        "--docs", metavar="PROJECT", help="then write docs/accuracy and README's part of it in this checkout"
-    )
+    parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
 
 
 def run_report(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""The native vector environments as Stable-Baselines3 sees vector environments (extra ``agents``).
+"""The native vector environments as Stable-Baselines3's `VecEnv` (extra ``agents``).
 
 Learners then step all environments in one compiled call:
 
@@ -6,8 +6,8 @@ Learners then step all environments in one compiled call:
 >>> envs = make_vec_env("PivotedBar-v0", 64)
 >>> model = PPO("MlpPolicy", envs)
 
-The hyperparameters that the agents were trained with, in the RL Zoo's form, are printed by
-``lag-envs hyperparams ppo``.
+``lag-envs hyperparams ppo`` prints the hyperparameters that the agents were trained with, in the RL Zoo's
+form.
 """
 
 from __future__ import annotations
@@ -66,9 +66,10 @@ class VecEnv(vec_env.VecEnv):
     env : VectorEnv
         A vector environment that resets in the same step.
     stagger : int, default 0
-        Steps over which the beginnings of the first episodes are spread; the length of an episode is a good
-        choice. A reset then takes so many steps with random actions and restarts the environments one after
-        the other. Else, where episodes are equally long, a learner's roll-out shows one phase of them.
+        Number of steps over which the starts of the first episodes are spread; the length of an episode is a
+        good choice. A reset then takes that many steps with random actions and restarts the environments one
+        after the other. Otherwise, if episodes are equally long, a learner's roll-out sees only one phase of
+        them.
 
     Raises
     ------

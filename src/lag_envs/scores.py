@@ -1,6 +1,6 @@
 """The scale on which agents are compared: 0 for the random policy, 1 for the best policy known.
 
-The numbers belong to a version of an environment: with ``-v1`` come new ones, and these stay as they are.
+The numbers belong to a version of an environment: ``-v1`` gets new ones, and these stay as they are.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ def normalised(scale: Scale, returns: ArrayLike) -> NDArray[np.float64]:
 
 
 class KnownReturns(NamedTuple):
-    """Mean returns that are known of an environment with its default parameters.
+    """Known mean returns of an environment with its default parameters.
 
-    The first two are the scale, set once: what is measured later, and more precisely, does not change them.
-    In a clone, ``python -m agents.scale`` measures all of them anew; ``lag_envs/tasks/measured.json`` has
+    `random` and `best` are the scale. They are set once; later, more precise measurements do not change them.
+    In a clone, ``python -m agents.scale`` measures all of them again; ``lag_envs/tasks/measured.json`` has
     both.
 
     Parameters
@@ -51,12 +51,12 @@ class KnownReturns(NamedTuple):
     best : float
         Of the best policy known.
     error : float
-        Standard error of `best`, as far as the luck of its episodes goes.
+        Standard error of `best` over its episodes.
     policy : str
-        Which policy that is.
+        Name of the best policy.
     optimum : float, optional
-        The optimum, in the same episodes as `best`, where it is known; None elsewhere. What is estimated of
-        it there, tells ``docs/agents.md``.
+        The optimum, in the same episodes as `best`, where it is known. ``docs/agents.md`` has estimates where
+        it is not.
     """
 
     random: float
@@ -67,13 +67,13 @@ class KnownReturns(NamedTuple):
 
 
 def known_returns(env_id: str) -> KnownReturns | None:
-    """Return what is known of an environment; None where nothing was measured."""
+    """Return the known returns of an environment; None if nothing was measured."""
     scale = measured(env_id).get("scale")
     return scale and KnownReturns(**scale)
 
 
 def score(env_id: str, mean_return: float) -> float | None:
-    """Return how far a mean return lies on the way from the random policy's to the best one known.
+    """Return a mean return on the scale from 0, the random policy, to 1, the best policy known.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def score(env_id: str, mean_return: float) -> float | None:
     Returns
     -------
     float or None
-        The score, not clipped: below 0 is worse than random, above 1 better than what was known. None for an
-        environment of which nothing is known.
+        The score, not clipped: below 0 is worse than random, above 1 better than the best known. None for an
+        environment without known returns.
 
     Examples
     --------

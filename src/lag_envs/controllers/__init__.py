@@ -1,10 +1,10 @@
-"""Classical controllers, and agents that know nothing, all with Stable-Baselines3's `predict`.
+"""Classical controllers, and trivial agents, all with Stable-Baselines3's `predict`.
 
-Every agent takes one observation or a batch, and hands back what it has to remember until the next call::
+Every agent takes one observation or a batch, and returns the state that it needs in the next call::
 
     action, state = agent.predict(observation, state, episode_start)
 
-A task says which it has (`Task.controllers`); `make_controller` makes one::
+`Task.controllers` lists the controllers of a task; `make_controller` makes one::
 
     agent = make_controller("PivotedBar-v0", "energy shaping + LQR")
 """
@@ -72,7 +72,7 @@ def build(task: Any, name: str, **numbers: Any) -> Any:
     name : str
         Name of the controller.
     **numbers
-        Keywords in place of those that it is made with.
+        Keywords that override those of the task's record.
     """
     found = controllers(task)
     if name not in found:
@@ -81,7 +81,7 @@ def build(task: Any, name: str, **numbers: Any) -> Any:
 
 
 def plan(task: Any, *, guess: str) -> ILQR:
-    """Return an iLQR that starts from what another of the task's controllers does."""
+    """Return an iLQR whose initial guess is another of the task's controllers."""
     return ILQR(task, [build(task, guess)])
 
 
@@ -100,7 +100,7 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
     Raises
     ------
     ValueError
-        For an unknown id or name; it tells close ones.
+        For an unknown id or name; it suggests similar ones.
     """
     if env_id not in gym.registry and ":" not in env_id:
         raise ValueError(f"there is no environment {env_id!r}; {hint(env_id, TASKS)}")

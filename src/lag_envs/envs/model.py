@@ -30,7 +30,7 @@ class Expansion(NamedTuple):
     gradient : ndarray, shape (n, m)
         Of the reward.
     curvature : ndarray, shape (n, m, m)
-        Its second derivatives, without what the motion's own second derivatives add.
+        Its second derivatives, without the contribution of the motion's second derivatives.
     """
 
     slopes: Array
@@ -39,10 +39,10 @@ class Expansion(NamedTuple):
 
 
 class Model:
-    """What one step does: control, motion, reward and ending, from the formulas that the environments step.
+    """One step as a function: control, motion, reward and ending, from the environments' own formulas.
 
-    It agrees with the environment's step to rounding, not bit for bit: from step to step an environment
-    carries cosθ and sinθ along, the model takes them from θ. Random kicks are left to `kicked`.
+    It agrees with the environment's step to rounding, not bit for bit: an environment carries cosθ and sinθ
+    along, the model computes them from θ. It applies no random kicks; `kicked` does.
 
     Parameters
     ----------

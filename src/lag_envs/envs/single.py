@@ -27,14 +27,14 @@ FLOAT32 = np.dtype(np.float32)
 class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """One environment of any task; made by ``gym.make(id, **parameters)``.
 
-    What it does is described by its task: ``help(env.unwrapped.task)``.
+    ``help(env.unwrapped.task)`` describes its task.
 
     Parameters
     ----------
     task : str
         The task, as "module:Class". The ids fix it.
     render_mode : {"human", "rgb_array"}, optional
-        How `render` shows the scene.
+        What `render` does: show the scene in a window, or return a picture.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     show_arrows : bool, default False

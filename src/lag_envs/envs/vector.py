@@ -42,8 +42,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     Made by ``gym.make_vec(id, num_envs=..., **parameters)``.
 
-    Sub-environment i of a batch seeded s goes through the same numbers, bit for bit, as the single
-    environment seeded s + i.
+    Sub-environment i of a batch with seed s gives the same numbers, bit for bit, as the single environment
+    with seed s + i.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     num_envs : int
         Number of environments.
     max_episode_steps : int, optional
-        Steps after which an episode is truncated, if earlier than the task's own limit.
+        Steps after which an episode is truncated, if that is earlier than the task's own limit.
     autoreset_mode : {"NextStep", "SameStep", "Disabled"} or AutoresetMode
         What happens when an episode is over; see `gymnasium.vector.AutoresetMode`.
     render_mode : {"rgb_array"}, optional

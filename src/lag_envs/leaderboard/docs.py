@@ -1,8 +1,8 @@
 """The leaderboard in README and docs: ``python -m lag_envs.leaderboard.docs PROJECT``.
 
-From a checkout's folder ``leaderboard`` it writes the top of each board into README.md, and what counts as
-success into ``docs/leaderboard.md``. The texts follow from the files alone, so a test makes them again and
-compares.
+From a checkout's folder ``leaderboard`` it writes the best agents of each board into README.md, and what
+counts as success into ``docs/leaderboard.md``. The texts follow from the files alone, so a test makes them
+again and compares.
 """
 
 from __future__ import annotations
@@ -19,9 +19,6 @@ from lag_envs.leaderboard.standings import board_data
 from lag_envs.store import write
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
-
-#: Rows of each board that README shows.
-TOP = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,24 +41,24 @@ def generated(project: Path) -> dict[Path, str]:
 
 
 def top(data: dict[str, Any]) -> str:
-    """Return a table of the first rows of every board that is open and has some."""
+    """Return a table: for every open board all agents that share first place, and the best learned one."""
     rows = []
     for environment in data["environments"]:
-        if not environment["frozen"]:
-            best = [row for row in environment["rows"] if row["rank"] is not None][:TOP]
-            rows += [_line("" if number else environment["id"], row) for number, row in enumerate(best)]
+        if environment["frozen"]:
+            continue
+        best = [row for row in environment["rows"] if row["rank"] is not None]
+        first = [row for row in best if row["rank"] == best[0]["rank"]]
+        learned = [row for row in best if row["kind"] == "learned"][:1]
+        if first:
+            rows.append([environment["id"], ", ".join(map(_scored, first)), ", ".join(map(_scored, learned))])
     if not rows:
         return "Nothing has been submitted yet."
-    head = ("environment", "rank", "agent", "score (95 % interval)", "success", "acting 10 × as often")
-    return markdown_table(head, rows)
+    return markdown_table(("environment", "best (95 % interval)", "best learned"), rows)
 
 
-def _line(environment: str, row: dict[str, Any]) -> list[str]:
+def _scored(row: dict[str, Any]) -> str:
     low, high = row["interval"]
-    success = "" if row["success"] is None else f"{100.0 * row['success']['rate']:.1f} %"
-    often = "" if row["often"] is None else f"{row['often']:.3f}"
-    score = f"{row['score']:.4f} ({low:.4f} to {high:.4f})"
-    return [environment, str(row["rank"]), f"{_text(row['name'])}, {row['kind']}", score, success, often]
+    return f"{plain(row['name'])} {row['score']:.4f} ({low:.4f} to {high:.4f})"
 
 
 def goals() -> str:
@@ -71,7 +68,7 @@ def goals() -> str:
     return markdown_table(("environment", "success and time"), rows)
 
 
-def _text(text: str) -> str:
+def plain(text: str) -> str:
     """Return text that means nothing but itself in Markdown and HTML."""
     escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return "".join("\\" + c if c in "\\`*_{}[]()#!~" else c for c in " ".join(escaped.split()))

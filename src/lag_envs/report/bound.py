@@ -313,12 +313,13 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     return Content(
         "A bound known before the step",
         [
-            "Before a step is taken, a bound on what the Taylor series leaves out is known. Here it is "
-            "compared with what is left out: the sum of the exact motion's Taylor coefficients beyond the "
-            f"order, which the oracle computes with {DIGITS} digits. Rounding plays no part.",
-            "The bound holds for every field, drag and drive of a given size, whatever the angle, so it is "
-            "far above what most steps leave out. That costs little: a series of order N makes up for such a "
-            "factor by a step that is shorter by the factor's (N + 1)th root.",
+            "A bound on the truncation error of the Taylor series is known before the step is taken. Here "
+            "it is compared with the true truncation error: the sum of the exact motion's Taylor "
+            f"coefficients beyond the order, which the oracle computes with {DIGITS} digits. Rounding "
+            "plays no part.",
+            "The bound holds for every field, drag and drive of a given size, whatever the angle, so it "
+            "is far above the truncation error of most steps. That costs little: a series of order N "
+            "compensates for such a factor by a step that is shorter by the factor's (N + 1)th root.",
             _cost_text(kinds["cost"]),
         ],
         tables=[table for table in (tight, scenes, _problem_table(problems)) if table],

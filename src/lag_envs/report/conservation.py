@@ -229,20 +229,22 @@ def worst(values: Sequence[float | None]) -> float | None:
 
 
 TEXT = (
-    "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is taken from the cosine and"
-    " sine that are stepped; its drift is relative to kinetic plus potential energy at the start, or to the"
-    " kinetic energy where that has grown beyond. The comparison integrators take one step per control step.",
-    "The growth of our error is held against the closed form, Jacobi's elliptic functions or a parabola, in"
-    " 30 digits. The amplified rounding is what the same closed form makes of a start that is moved by 2^-53"
-    " of its size, at least 1 rad or rad/s, in both entries. A step rounds its result once at least, and n"
-    " such roundings at random add up to some √n of one: the error is compared with √n amplified roundings.",
-    "Two things are larger than that. Where energy drifts steadily (growth 1), because the same roundings"
-    " come again in every period, the error grows with the square of the time. On the incline place and"
-    " speed grow without end, and equal increments round to the same side for long stretches.",
-    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which"
-    " the cosine and sine that are stepped do not share.",
-    "With drag and random controls the change of energy is compared with the work of the drive less the loss"
-    " to drag, both by Gauss quadrature with 16 nodes within each step.",
+    "Runs without drag and drive, of {steps:,} control steps of 0.02 s. Energy is computed from the "
+    "cosine and sine that are stepped. Its drift is relative to kinetic plus potential energy at the "
+    "start, or to the kinetic energy where that has become larger. The comparison integrators take one "
+    "step per control step.",
+    "The growth of our error is checked against the closed form, Jacobi's elliptic functions or a "
+    "parabola, in 30 digits. The rounding floor is a one-ulp perturbation, propagated exactly: the start "
+    "is moved by 2^-53 of its size, at least 1 rad or rad/s, in both entries. A step rounds its result at "
+    "least once, and n random roundings add up to about √n of one, so the error is compared with √n times "
+    "the floor.",
+    "Two effects are larger than that. If energy drifts steadily (growth 1), because the same roundings "
+    "recur in every period, the error grows with the square of the time. On the incline place and speed "
+    "grow without end, and equal increments round to the same side for long stretches.",
+    "The angle θ is not wrapped. On a bar that turns over it is a large number with large roundings, which do"
+    " not affect the cosine and sine that are stepped.",
+    "With drag and random controls the change of energy is compared with the work of the drive minus the "
+    "loss to drag, both by Gauss quadrature with 16 nodes within each step.",
 )
 DRIFT = (
     "Largest relative drift of energy, of c² + s² from 1, and of θ from the angle of (c, s) [rad]. Growth:"

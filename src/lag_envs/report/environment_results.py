@@ -65,24 +65,24 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
 def _text() -> list[str]:
     return [
         "Episodes are recorded from gym.make under random actions: float64 states, and the controls that "
-        "were applied. The exact states have the same start and the same controls, and are not rounded in "
-        f"between. The oracle computes them with {DIGITS} digits, and those of ours once more with "
-        f"{DIGITS + 12} for the first seed. Where a task kicks, the kicks are made by its own formula from "
-        "the environment's own random numbers, without rounding.",
+        "were applied. The exact motion has the same start and the same controls, without rounding in "
+        f"between. The oracle computes it with {DIGITS} digits, and for the first seed of ours again with "
+        f"{DIGITS + 12}. Where a task kicks, the kicks are computed by its own formula from the "
+        "environment's own random numbers, without rounding.",
         "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
-        "cut speeds: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 wraps "
-        "are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its actions "
-        "are; that counts as its error. CartPole-v1 falls within a second under random actions, so its "
-        "update is also carried on past that end, to 10 s.",
+        "clip velocities: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 "
+        "wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its "
+        "actions are; that counts as its error. CartPole-v1 falls within a second under random actions, so "
+        "its update is also continued past that end, to 10 s.",
         "An error is the largest over the entries of the state and over the time until then, each entry "
         "relative to the largest that it gets in the episode, at least 1 in SI units. No method that starts "
         "from float64 numbers can do better than about one rounding of the start, amplified by the system. "
-        "So that is shown beside it: every entry of the start is moved by 2^-53 of its size, and followed in "
-        "exact arithmetic. Where the system damps or does not amplify, roundings of later steps add to it.",
-        "The error of one step is the largest that any step of the episode makes by itself: each is taken "
-        "again from the state that was recorded before it, in exact arithmetic, and compared with the state "
-        "recorded after it. Ours carry cosine and sine beside the angle; where an angle has grown to many "
-        "turns, its rounding and theirs differ, and that counts as error too.",
+        "So this rounding floor is shown too: every entry of the start is moved by 2^-53 of its size, and "
+        "propagated exactly. Where the system damps or does not amplify, roundings of later steps add to it.",
+        "The error of one step is the largest of any step of the episode. Each step is repeated in exact "
+        "arithmetic from the state recorded before it, and compared with the state recorded after it. "
+        "Ours carry cosine and sine beside the angle. If an angle has grown to many turns, its rounding "
+        "and theirs differ, and that counts as error too.",
     ]
 
 

@@ -111,23 +111,22 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     return Content(
         "Any Lagrangian",
         [
-            "Scenes that state nothing but their energies are stepped by the general series, with the "
-            f"certificate that comes with each step. Here they take one control step of {DT:g} s from "
-            f"{MEMBERS} harsh states, each joint turning at up to 6 to 12 rad/s at once. An error is that "
-            "of the worst entry of the worst state, relative to max(1, |entry|), against Taylor series of "
-            "Lagrange's equations by SymPy in python-flint's ball arithmetic.",
-            "All run in compiled loops, many states in one call, on one core; what a call costs counts for "
-            "everybody, compiling for nobody. Samples are taken in turn, and times are medians of the "
-            "processor's time. The errors are those of the calls that are timed, at the quickest setting "
-            "that reaches the error given.",
-            "Ours certifies each step, at a tolerance and an order. The others give no bound: which "
-            "setting reaches an error is known here from the exact ends. heyoka runs with fast_math, "
-            "without compact mode, its compiled step in a compiled loop, in a batch in blocks of two "
-            "widths. MuJoCo runs its own model in compiled rollouts, by Euler, implicitfast and RK4, "
-            "Pinocchio its articulated-body algorithm in RK4 steps in a C++ loop; a driven support is a "
-            "field in its frame for both. RK4, DOP853 and Radau IIA take steps of one length and are "
-            "compiled as ours is.",
-            *([f"Not taken part: {', '.join(missing)}."] if missing else []),
+            "Scenes that state nothing but their energies are stepped by the general series, which "
+            f"certifies each step. Here they take one control step of {DT:g} s from {MEMBERS} harsh "
+            "states, in which each joint turns at up to 6 to 12 rad/s. An error is that of the worst "
+            "entry of the worst state, relative to max(1, |entry|), against Taylor series of Lagrange's "
+            "equations by SymPy in python-flint's ball arithmetic.",
+            "All run in compiled loops, many states in one call, on one core. The overhead of a call counts, "
+            "compilation does not. Samples are taken in turn, and times are medians of processor time. The "
+            "errors are those of the calls that are timed, at the fastest setting that reaches the given "
+            "error.",
+            "Ours certifies each step, at a tolerance and an order. The others give no bound: which setting "
+            "reaches an error is known here from the exact ends. heyoka runs with fast_math, without compact "
+            "mode, its compiled step in a compiled loop, in a batch in blocks of two widths. MuJoCo runs its "
+            "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
+            "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
+            "DOP853 and Radau IIA take steps of one length and are compiled as ours is.",
+            *([f"Not compared: {', '.join(missing)}."] if missing else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
         [t for t in tables if t.rows],

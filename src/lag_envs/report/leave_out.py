@@ -188,14 +188,14 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
 # --- what is shown ---
 
 TEXT = (
-    "A constant that is zero leaves no operation behind, and state entries that an environment does not need"
-    " are not there. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of"
-    " x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
-    "Unused is what the compiled step of an id takes and no result depends on: its lines are followed"
-    " backwards from the next state, reward, ending and observation to constants, state, target and action."
-    " Idle is what it computes for nothing.",
-    "Savings: a control step of 1,024 states at once, dynamics only, compiled without something and with it;"
-    " both in turn, medians.",
+    "A constant that is zero leaves no operation behind, and the state has no entries that an environment "
+    "does not need. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of "
+    "x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
+    "Unused are inputs of an id's compiled step on which no result depends: its lines are followed "
+    "backwards from the next state, reward, ending and observation to constants, state, target and "
+    "action. Idle are operations whose result is not used.",
+    "Savings: a control step of 1,024 states at once, dynamics only, compiled without something and with "
+    "it. Both are timed in turn; the numbers are medians.",
 )
 
 

@@ -44,22 +44,23 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         "Stiff and extreme cases",
         [
             "Each cell of a map is one control step from one start with the control held, once with our step "
-            "and once with each comparison integrator, which takes the step at once (or in 16 parts, where "
-            "that is said). The error is the largest of the state's entries, each relative to its scale: "
+            "and once with each comparison integrator, which takes it in one step (or in 16, where that is "
+            "said). The error is the largest of the state's entries, each relative to its scale: "
             "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means "
             f"a result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has "
-            "30 digits; where it cannot vouch for itself, the cell says so.",
-            "Maps in float32 run the same formulas on float32 numbers. Ours then takes the substeps that the "
-            f"bound asks for, up to {MOST_SUBSTEPS:,}; the jump along the slow manifold, which spares most "
-            "of them where damping is heavy, exists in float64 only.",
-            "A named case is expected to have full accuracy, to be accurate up to amplified rounding, or to "
-            f"be refused with an error. Full accuracy means an error of at most {EXACT:g} times the scale in "
-            "every entry. Where the system itself makes so much of a rounding of its start that no method "
-            f"can have that, {extremes.ROUNDINGS:g} times the effect of such a rounding is allowed on top. "
-            "That effect is measured, by moving every entry of the start by 2^-53 of its size in the "
-            "reference. A case is met if it does what was expected, or is more accurate.",
-            "Where a step is divided, substeps are computed with twice the digits, so that nothing adds up "
-            "over hundreds of thousands of them. A step that would need more than a million is refused.",
+            "30 digits; where that is not enough, the cell says so.",
+            "Maps in float32 run the same formulas on float32 numbers. Ours then takes the substeps that "
+            f"the bound asks for, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which avoids "
+            "most of them under heavy damping, exists in float64 only.",
+            "A named case should have full accuracy, be accurate up to the rounding floor, or be refused "
+            f"with an error. Full accuracy means an error of at most {EXACT:g} times the scale in every "
+            "entry. Where the system itself amplifies a rounding of its start so much that no method can "
+            f"have that, {extremes.ROUNDINGS:g} times the effect of such a rounding is allowed in "
+            "addition. That effect is measured: every entry of the start is moved by 2^-53 of its size in "
+            "the reference. A case is met if it does what was expected, or is more accurate.",
+            "When a step is divided, substeps are computed with twice the digits, so that rounding does "
+            "not add up over hundreds of thousands of them. A step that would need more than a million is "
+            "refused.",
         ],
         tables=[t for t in (verdicts, shares, _amplified(cells), _problem_table(problems, rows)) if t],
         pictures=_pictures(maps, found),
@@ -232,7 +233,7 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
                 Picture(
                     f"stability-{map}-{_slug(name)}{n.replace(', ', '-')}",
                     f"{name}: error of one control step over {MAPS[map].label} and the step; comparison "
-                    f"steppers {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
+                    f"integrators {times}. Beside each map the same in float32. Start {STARTS[name][0]}. "
                     "Reference: 30 digits.",
                     partial(_draw_map, rows, MAPS[map].label, n),
                     raster=True,
@@ -244,7 +245,7 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
             Picture(
                 "extreme-cases-map",
                 "The named cases: log10 of the error of one control step, ours beside the comparison "
-                "steppers in one step and in 16. Cases that are to be refused are in the table only.",
+                "integrators in one step and in 16. Cases that are to be refused are in the table only.",
                 lambda: _draw_cases(measured),
                 raster=True,
             )

@@ -187,30 +187,30 @@ def _text(rows: Sequence[Row]) -> list[str]:
     members = f" (from {min(sizes)} to {max(sizes)} of them)" if len(sizes) > 1 else ""
     return [
         f"Errors are the largest over an ensemble of random states, controls and parameters{members}, and "
-        "over the entries of the state, each relative to its size as the README defines accuracy; over 10 s "
-        "and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms where there "
-        "is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and drive), else "
-        "Taylor series in fixed-point arithmetic. The control is held over the whole time. Over 1,000 s "
-        "there is no control, and pendulums have no damping.",
-        "Ours is what the package ships: each scene's own order and tolerance, control step by control step, "
-        "and over 10 s and 1,000 s also with steps of half to eight times that length, and as one step "
-        "that "
-        "`simulate` divides ('lag_envs, one call'). The test whether a step is certified is part of it.",
-        "Everybody is given the scene's own equation and the fastest form there is, and the errors are those "
-        "of the calls that are timed. The usual integrators are compiled by the same compiler at the same "
-        "vector width as ours, with coefficients that come ready; 'carried' ones have cosine and sine as "
-        "unknowns, or turn them by short polynomials, and call no function. Where a control is held for "
-        "long they also take one step for several control steps. heyoka runs with fast_math; single steps "
-        "are its own machine code called from a compiled loop, longer times one call of propagate_until, a "
-        "batch goes in blocks of twice the width that it recommends. SciPy's compiled dopri5, dop853 and "
-        "lsoda have a compiled right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is "
-        "compiled as a whole, a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo "
-        "runs in its compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no "
-        "batch, so that theirs is one state after the other. What would take longer than some seconds is not "
+        "over the entries of the state. Each is relative to its size, as docs/numerics.md defines accuracy; "
+        "over 10 s and 1,000 s to its size at the end. The reference is exact to 30 digits: closed forms "
+        "where there is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and "
+        "drive), else Taylor series in fixed-point arithmetic. The control is held over the whole time. Over "
+        "1,000 s there is no control, and pendulums have no damping.",
+        "Ours is what the package ships: each scene's own order and tolerance, control step by control step. "
+        "Over 10 s and 1,000 s there are also steps of half to eight times that length, and a single step "
+        "that `simulate` divides ('lag_envs, one call'). The time includes the test whether a step is "
+        "certified.",
+        "Every rival gets the scene's own equation in its fastest form, and errors are those of the calls "
+        "that are timed. The usual integrators are compiled by the same compiler at the same vector width "
+        "as ours, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or turn "
+        "them by short polynomials, and call no function. When a control is held for long they also take "
+        "one step for several control steps. heyoka runs with fast_math: single steps are its own machine "
+        "code called from a compiled loop, longer times one call of propagate_until, and a batch goes in "
+        "blocks of twice the recommended width. SciPy's compiled dopri5, dop853 and lsoda have a compiled "
+        "right-hand side, and a batch is one system; Radau is solve_ivp's. diffrax is compiled as a "
+        "whole, as a loop over states or a map. torchdiffeq has a batch as one tensor. MuJoCo runs in its "
+        "compiled rollouts without contacts and constraints. SciPy's Radau and MuJoCo have no batch, so "
+        "theirs is one state after the other. Anything that would take longer than some seconds is not "
         "run.",
         "Times are those of one control step. Everything in a job is timed in turn with ours, and the median "
-        "is taken; jobs are brought to one scale by the time that ours took in each. What takes long over "
-        "10 s or 1,000 s is timed over a part of that, in one call too.",
+        "is taken. Jobs are brought to one scale by our own time in each. Over 10 s or 1,000 s, slow methods "
+        "are timed over a part of that, in one call too.",
     ]
 
 
@@ -434,8 +434,8 @@ def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Compari
     off = [f"{name} on {where}: {error:.1e}" for (name, where), error in finest.items() if error > ACCURATE]
     made.append(
         _claim(
-            "No form is fast because it is broken: at its finest setting every library, and every stepper of "
-            f"order 4 and more, errs by at most {ACCURATE:.0e} in one step",
+            "No form is fast because it is broken: at its finest setting every library, and every "
+            f"integrator of order 4 and more, errs by at most {ACCURATE:.0e} in one step",
             finest,
             lambda: not off,
             lambda: _listed(off) if off else f"{len(finest)} forms; largest {max(finest.values()):.1e}",

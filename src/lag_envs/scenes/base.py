@@ -62,7 +62,7 @@ class SceneType(ABCMeta):
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 class Scene(metaclass=SceneType):
-    """A mechanical scene: parameters and energies, from which all else is derived. Immutable.
+    """A mechanical scene: parameters and energies, from which everything else is derived. Immutable.
 
     A subclass declares its parameters with `parameter`, its coordinates and controls with their units, and
     writes its energies::
@@ -84,8 +84,8 @@ class Scene(metaclass=SceneType):
                 return {"theta": u.torque}
 
     Formulas use ``+ - * /``, whole powers and functions of ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log.
-    They are run on recorded numbers, so they cannot branch on them. Fields that are no `parameter`, such as a
-    number of bars, are structural: they may branch and count, and another value compiles anew.
+    They are run on recorded numbers, so they cannot branch on them. Fields that are not a `parameter`, such
+    as a number of bars, are structural: formulas may branch on them, and another value compiles again.
 
     Attributes
     ----------
@@ -97,15 +97,15 @@ class Scene(metaclass=SceneType):
         Controls and their units. ``s_ddot``, ``s_dot`` or ``s`` sets the acceleration, the rate or the place
         of a prescribed coordinate ``s``; any other acts in `applied` or `dissipation`.
     modes : mapping from str to mapping
-        In place of `controls`: several sets of them, chosen by the keyword ``control``.
+        In place of `controls`: several sets of controls, chosen by the keyword ``control``.
     reactions : mapping from str to str
-        Names of forces and the prescribed coordinate that each moves or holds.
+        Names of forces, and the prescribed coordinate that each force moves or holds.
     ratios : mapping from str to pair of str
         Names of ratios |F|/N and the reactions F and N.
     state : tuple of str
         Another order of the state.
     left_out : tuple of str
-        What the state leaves out.
+        Entries that the state leaves out.
     """
 
     coordinates: ClassVar[Any] = MappingProxyType({})
@@ -136,7 +136,7 @@ class Scene(metaclass=SceneType):
         return {}
 
     def rests(self) -> Any:
-        """Return where prescribed coordinates rest that no control moves; by default at 0."""
+        """Return where prescribed coordinates without a control rest; by default at 0."""
         return {}
 
     def poses(self, q: Any, xp: Any) -> Any:

@@ -43,7 +43,7 @@ class Incline(Scene):
     damping : float [N s/m]
         Coefficient c of the drag -cx' at the axis. It adds to a drag that is the control.
     tilt : float [rad], optional
-        Fixed tilt, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
+        Fixed tilt φ, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
         control "damping".
     gravity : float [m/s²]
         Field g, downward.

@@ -44,8 +44,8 @@ class PivotedBar(Scene):
     gravity : float [m/s²]
         Field g, downward.
     track : float [m] or None
-        The support's travel to either side, for tasks that have a track. None leaves s and s' out
-        of the state; infinity keeps them without a limit. `simulate` does not enforce it.
+        Travel S of the support to either side, for tasks with a track. None leaves s and s' out of the
+        state; infinity keeps them without a limit. `simulate` does not enforce it.
 
     Notes
     -----

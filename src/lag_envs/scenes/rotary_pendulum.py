@@ -42,7 +42,7 @@ class RotaryPendulum(Scene):
     inertia : float [kg m²], optional
         Inertia I of the pendulum about its centre of mass; by default that of a uniform rod, mL²/3.
     arm_damping, damping : float [N m s]
-        Coefficients of the viscous torques at the arm's axis and at the hinge.
+        Coefficients b of the viscous torques at the arm's axis and at the hinge.
     gravity : float [m/s²]
         Field g, downward.
 

@@ -32,13 +32,13 @@ class TwoLinkArm(Scene):
     Parameters
     ----------
     mass_1, mass_2 : float [kg]
-        Masses of upper arm and forearm, uniform bars.
+        Masses m of upper arm and forearm, uniform bars.
     length_1, length_2 : float [m]
-        Their lengths.
+        Lengths l of the two.
     load : float [kg]
-        Mass of a point in the hand.
+        Mass p of a point in the hand.
     damping : float [N m s]
-        Coefficient of the viscous torque in both joints.
+        Coefficient b of the viscous torque in both joints.
     gravity : float [m/s²]
         Field g, downward.
 

@@ -1,4 +1,4 @@
-"""The contract of a task: what it adds to a scene, written by name."""
+"""The contract of a task: what it adds to a scene."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _UNBOUNDED = float(np.finfo(np.float32).max)
 class Task:
     """A task on a scene.
 
-    A subclass says what its attributes and methods ask for; `scene`, `interval`, `steps`, `action`, `observe`
-    and `reward` at least. Formulas go by name: ``before`` and ``after`` are the state at the step's two ends,
-    with the names of ``scene.state_names``, ``control`` the controls that were applied, ``target`` the
-    targets. They use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, and functions of
-    ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum. The scene's parameters
-    and energies may be used: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
+    A subclass defines attributes and methods of those below, at least `scene`, `interval`, `steps`, `action`,
+    `observe` and `reward`. Formulas use names: ``before`` and ``after`` are the state at both ends of the
+    step, with the names of ``scene.state_names``; ``control`` has the controls that were applied, ``target``
+    the targets. Formulas may use ``+ - * /``, whole powers, comparisons joined by ``|`` and ``&``, functions
+    of ``xp`` (sin, cos, tan, atan, tanh, sqrt, exp, log, where, abs, minimum, maximum), and the scene's
+    parameters and energies: ``self.scene.mass``, ``self.scene.potential(after, xp)``.
 
     Attributes
     ----------
@@ -59,37 +59,37 @@ class Task:
     scene : type
         The scene; an instance has the scene itself here.
     defaults : mapping
-        Parameters of the scene that differ from its own.
+        Parameters of the scene whose defaults this task changes.
     interval : float
         Control interval [s].
     steps : int
         Steps of an episode.
     action : mapping
-        For each control that is acted on its limit, (low, high), or a list of values to choose from.
+        For each control that actions set: its limit, (low, high), or a list of values to choose from.
     start : mapping
-        For entries of the state a half width around 0, or (centre, half width); the others start at 0.
+        For entries of the state: a half width around 0, or (centre, half width). The others start at 0.
     target : mapping
-        For each target (unit, half width) or (unit, centre, half width).
+        For each target: (unit, half width) or (unit, centre, half width).
     draws : int
         Random numbers in [0, 1) that `kick` uses.
     scaled : bool
-        Whether rewards of another `dt` are scaled by dt/interval.
+        Whether rewards are scaled by dt/interval for another `dt`.
     order : int, optional
-        Order of the general series, 6 to 24; by default it follows from `dt`. Calm tasks are stepped in less
-        time with a lower one, wild ones with a higher one; each step is certified with any.
+        Order of the general series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
+        faster with a lower order, fast ones with a higher one. Steps are certified with any order.
         ``lag-envs order FILE`` measures which is best.
     usable : mapping
-        Ranges of parameters in which the task can be used, where they are not those that the scene declares.
-        Wherever in these ranges all of them lie, unless `fastest` forbids it, every accepted start and action
-        gives finite observations within their space, and every step is taken.
+        Ranges of parameters in which the task can be used, if they differ from those that the scene declares.
+        For any combination of values in these ranges that `fastest` does not forbid, every accepted start and
+        action gives finite observations within their space, and every step is taken.
     controllers : mapping
-        A `record.Controller` for each of its controllers, by name; all have "zero" and "random" too.
+        A `record.Controller` for each of its controllers, by name. Every task also has "zero" and "random".
     reference : str
-        A quick controller among them, which takes the luck out of episodes that differ much.
+        A quick controller among them, used as a control variate where episodes differ much.
     hyperparameters : mapping
-        For a learner ("ppo", "sac", "td3", "tqc", "dqn") what differs from `lag_envs.hyperparams.DEFAULTS`.
+        For a learner ("ppo", "sac", "td3", "tqc", "dqn"): what differs from `lag_envs.hyperparams.DEFAULTS`.
     goal : record.Goal, optional
-        When it is solved; tasks of the package that say so have a board.
+        When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
         The grid on which ``python -m agents.optimum`` solves it.
     optimum : record.Optimum, optional
@@ -99,14 +99,16 @@ class Task:
     difficulty : str
         Why it is hard, in a sentence or two, for its page.
     note : str
-        What docs/agents.md says of its agents, without numbers: the tables have those.
+        A text about its agents for docs/agents.md, without numbers: the tables have those.
+    quantities : mapping
+        For entries of the observation (unit, meaning), as the environment's page has them.
 
     Parameters
     ----------
     dt : float, optional
-        Control interval [s]. The episode keeps its seconds, not its steps.
+        Control interval [s]. The episode keeps its length in seconds, not in steps.
     duration : float, optional
-        Length of an episode [s]; infinity for one without an end.
+        Length of an episode [s]; infinity for no end.
     target : float, sequence or mapping, optional
         Fixed targets in place of random ones.
     **parameters
@@ -134,6 +136,7 @@ class Task:
     examples: ClassVar[Examples] = Examples()
     difficulty: ClassVar[str] = ""
     note: ClassVar[str] = ""
+    quantities: ClassVar[Mapping[str, tuple[str, str]]] = MappingProxyType({})
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -183,7 +186,7 @@ class Task:
     # --- what a task defines -------------------------------------------------------------------------------
 
     def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
-        """Return the controls that are applied in place of those that are wanted, by name."""
+        """Return the controls to apply in place of the wanted ones, by name."""
         return wanted
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -191,7 +194,7 @@ class Task:
         raise FormulaError("it is not defined; write observe(self, after, target, xp)")
 
     def bounds(self) -> Mapping[str, Any]:
-        """Return bounds on entries of the observation, ±bound or (low, high), where they are proved."""
+        """Return proved bounds on entries of the observation: ±bound or (low, high)."""
         return {}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -199,34 +202,34 @@ class Task:
         raise FormulaError("it is not defined; write reward(self, before, after, control, target, dt, xp)")
 
     def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return the reward of the step that terminates; by default that of any other."""
+        """Return the reward of the terminating step; by default the same as of any other."""
         return self.reward(before, after, control, target, dt, xp)
 
     def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the episode has come to its end."""
+        """Return whether the episode terminates."""
         return False
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
-        """Return what a random disturbance adds to entries of the state; draws lie in [0, 1)."""
+        """Return what a random kick adds to entries of the state; draws lie in [0, 1)."""
         return {}
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the `goal` holds at a step's end."""
+        """Return whether the `goal` holds at a step's end."""
         return False
 
     def behaviour(self, played: Any) -> Mapping[str, float]:
-        """Return what docs/agents.md says of `evaluation.rollout.Episodes`, besides the arrival."""
+        """Return measures of `evaluation.rollout.Episodes` for docs/agents.md, besides the arrival."""
         return {}
 
     def check(self) -> None:
         """Raise ValueError where the parameters do not fit the task."""
 
     def check_start(self, state: Any) -> None:
-        """Raise ValueError for a start that the task cannot have; `state` goes by name and by index."""
+        """Raise ValueError for a start that the task cannot have; `state` goes by name or by index."""
 
     @property
     def fastest(self) -> float:
-        """Speed that field and drive give to what swings [rad/s]; 0 where nothing does."""
+        """The speed that field and drive can give to a swing [rad/s]; 0 if nothing swings."""
         return 0.0
 
     @property
@@ -300,7 +303,7 @@ class Task:
 
     @property
     def rest_action(self) -> Any:
-        """The action without control, or what is nearest to it; with it a person's hands are off."""
+        """The action without control, or the nearest to it: that of a person who does nothing."""
         return self.formulas.rest_action
 
     @property

@@ -18,6 +18,10 @@ from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIterati
 _PPO = {"gamma": 0.98, "gae_lambda": 0.95}
 _SAC = {"gamma": 0.98, "train_freq": 10, "gradient_steps": 20, "sde_sample_freq": 10}
 
+#: What is observed, with its unit.
+_ROLLING = {"theta": ("rad", "angle of the small cylinder's axis"), "theta_dot": ("rad/s", "its rate")}
+_SHELL = {**_ROLLING, "psi_dot": ("rad/s", "rate of the shell")}
+
 
 class _Shell(Task):
     """What the two tasks that turn the shell have in common."""
@@ -100,109 +104,54 @@ class Tilt(_Shell):
 
     ## Description
 
-    A solid cylinder rolls without slipping inside a larger hollow one, the shell, filled with a medium that
-    turns with the shell and drags. By turning the shell the small cylinder is to be brought to an angle and
-    kept there.
+    A solid cylinder rolls without slipping inside a larger hollow one, the shell. The shell is filled with a
+    medium that turns with it and drags. Turn the shell to bring the small cylinder to an angle and keep it
+    there.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | angular acceleration ψ'' of the shell, 15 times the action | rad/s² | -15 | 15 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
     It is cut back so that |ψ'| is at most 6 rad/s at the step's end.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | theta | angle of the small cylinder's axis | rad | -20.35 | 20.35 |
-    | 1 | theta_dot | its rate | rad/s | -386 | 386 |
-    | 2 | psi_dot | rate of the shell | rad/s | -6.000 | 6.000 |
-    | 3 | target | the angle θ* to hold | rad | -1.05 | 1.05 |
+    The bounds are proved for every start that is accepted.
 
     ## Rewards
 
-    exp(-((θ - θ*)/0.1)²) - 0.02 (u/15)² for each step, at its end; u is the control applied. For another
-    `dt` it is scaled by dt/0.05.
+    Each step pays exp(-((θ - θ*)/0.1)²) - 0.02 (u/15)², taken at its end; θ* is the angle to hold, u the
+    control that was applied. With another `dt` rewards are scaled by dt/0.05.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [theta, theta_dot, psi_dot], "target": theta*})`, inside the
-    limits.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | theta | rad | 0 | 0.1 |
-    | theta_dot | rad/s | 0 | 0.2 |
-    | psi_dot | rad/s | 0 | 0 |
-    | target | rad | 0 | 0.3 |
+    Near the bottom, the shell at rest. Given starts must lie inside the limits.
 
     ## Episode End
 
-    Termination: |θ| > 1.05 rad at a step's end. Truncation: after 200 steps (10 s).
+    Termination: |θ| > 1.05 rad at a step's end.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0.24 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
-    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
-    | target | None | rad | ±1.05 | an angle for every episode; None: random |
+    `control` must be "tilt". A target must lie within ±1.05 rad.
 
-    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
-    (2 √(k g/a) + (2 k I R/(mr²a) + 1) 6 rad/s) dt is at most 5,000 rad. Then every step is taken, and
-    observations stay within their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
-    drive torque in `info`.
+    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: (2
+    √(k g/a) + (2 k I R/(m r² a) + 1) 6 rad/s) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 +
+    I/(m r²)). Every step is then taken, and observations stay within their space. Anything else is an error
+    that names the value.
 
     ## Equations
 
-    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²):
-
-        θ'' = -(k g/a) sinθ + k (I/(mr²)) (R/a) ψ'' - β (θ' - ψ')
-            = -16.35 sinθ + 0.41667 ψ'' - 1.0 (θ' - ψ')     (default parameters)
-
-    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate
-    drags.
-
-    Held at θ*, the shell turns at ψ' = (k g/(a β)) sinθ*: 4.83 rad/s for 0.3 rad.
+    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate drags.
+    To hold the cylinder at 0.3 rad the shell must turn at 4.83 rad/s.
 
     ## Signs and Units
 
-    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped; so are ψ and its rate. The state
-    is float64: `env.unwrapped.state`.
+    SI units. θ = 0 is at the bottom. θ and ψ grow counter-clockwise and are not wrapped.
 
-    ## Numerical Accuracy
+    ## Known Returns
 
-    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
-    size (docs/numerics.md).
-
-    ## Optimal Value
-
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
-    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
-    feedback is
-
-        action = 30.3 (θ* - θ) - 3.77 θ' + 0.355 (16.35 sinθ* - ψ'), clipped to ±1
-
-    | Id | Random actions | Zero control | Feedback | Best known |
-    | -- | -------------- | ------------ | -------- | ---------- |
-    | CylinderInCylinderTilt-v0 | 42.26 ± 0.36 | 61.3 ± 1.1 | 197.602 ± 0.028 | 197.6714 ± 0.0033 |
+    The optimum is not known. docs/agents.md has what value iteration estimates of it.
 
     ## Version History
 
@@ -210,6 +159,7 @@ class Tilt(_Shell):
     """
 
     id = "CylinderInCylinderTilt-v0"
+    quantities = {**_SHELL, "target": ("rad", "the angle θ* to hold")}
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.24, "control": "tilt"}
     target = {"target": ("rad", 0.3)}
     largest, fastest_shell, largest_angle = 15.0, 6.0, 1.05
@@ -256,17 +206,15 @@ class Tilt(_Shell):
             "damping": [0.0, 0.24, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
         variants={"fixed target": {"target": -0.4}},
-        feedback="30.3 * (target - theta) - 3.77 * theta_dot + 0.355 * (16.35 * sin(target) - psi_dot)",
     )
     difficulty = (
         "The shell drags the cylinder along only while it turns, and to hold an angle it has to keep "
         "turning at one rate; the cylinder swings about that place with little damping."
     )
     note = """
-Best is iLQR; LQR, PD and the greedy policy of value iteration are hardly behind. Among the learners TD3 is
-better than PPO on most seeds, with far fewer steps. Both are nearly as soon at the target as the
-controllers; what they lose, they lose mostly afterwards, beside the target, where the controllers end on
-it.
+Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 is
+better than PPO on most seeds, with far fewer steps. Both reach the target nearly as soon as the controllers.
+Most of their loss comes afterwards: they stop beside the target, where the controllers end on it.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -313,104 +261,53 @@ class Pump(_Shell):
 
     ## Description
 
-    The scene of `Tilt` with a tenth of its drag and a weaker drive. The small cylinder's swing is to be
-    pumped to the energy of an amplitude of 0.9 rad, and kept at it. One push is not enough: the drive has
-    to follow the swing.
+    A solid cylinder rolls inside a shell, with little drag and a weak drive. Pump its swing to the energy of
+    an amplitude of 0.9 rad, and keep it at that. One push is not enough: the drive has to follow the swing.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | angular acceleration ψ'' of the shell, 4 times the action | rad/s² | -4 | 4 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
     It is cut back so that |ψ'| is at most 3 rad/s at the step's end.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | theta | angle of the small cylinder's axis | rad | -15.46 | 15.46 |
-    | 1 | theta_dot | its rate | rad/s | -283.2 | 283.2 |
-    | 2 | psi_dot | rate of the shell | rad/s | -3.000 | 3.000 |
+    The bounds are proved for every start that is accepted.
 
     ## Rewards
 
-    exp(-|E - E*|/(0.3 E*)) - 0.02 (u/4)² for each step, at its end; u is the control applied. E = θ'²/2 +
-    ω₀² (1 - cosθ) with ω₀² = k g/a is the energy per inertia, E* = 6.187/s² that of the amplitude. For
-    another `dt` it is scaled by dt/0.05.
+    Each step pays exp(-|E - E*|/(0.3 E*)) - 0.02 (u/4)², taken at its end; u is the control that was applied.
+    E = θ'²/2 + ω₀² (1 - cosθ) is the energy per inertia, where ω₀² = k g/a. E* = 6.187/s² is that of the
+    amplitude. With another `dt` rewards are scaled by dt/0.05.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [theta, theta_dot, psi_dot]})`, inside the limits.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | theta | rad | 0 | 0.1 |
-    | theta_dot | rad/s | 0 | 0.2 |
-    | psi_dot | rad/s | 0 | 0 |
+    Near the bottom, the shell at rest. Given starts must lie inside the limits.
 
     ## Episode End
 
-    Termination: |θ| > 1.3 rad at a step's end. Truncation: after 200 steps (10 s).
+    Termination: |θ| > 1.3 rad at a step's end.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0.024 | N m s | 0 to 1e9 | coefficient c of the drag -c(θ' - ψ') |
-    | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
-    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    `control` must be "tilt".
 
-    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
-    (2 √(k g/a) + (2 k I R/(mr²a) + 1) 3 rad/s) dt is at most 5,000 rad. Then every step is taken, and
-    observations stay within their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
-    drive torque in `info`.
+    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: (2
+    √(k g/a) + (2 k I R/(m r² a) + 1) 3 rad/s) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 +
+    I/(m r²)). Every step is then taken, and observations stay within their space. Anything else is an error
+    that names the value.
 
     ## Equations
 
-    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²):
-
-        θ'' = -(k g/a) sinθ + k (I/(mr²)) (R/a) ψ'' - β (θ' - ψ')
-            = -16.35 sinθ + 0.41667 ψ'' - 0.1 (θ' - ψ')     (default parameters)
-
-    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate
-    drags.
+    A round shell has no orientation: a static tilt does nothing, its acceleration drives, and its rate drags.
 
     ## Signs and Units
 
-    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped; so are ψ and its rate. The state
-    is float64: `env.unwrapped.state`.
+    SI units. θ = 0 is at the bottom. θ and ψ grow counter-clockwise and are not wrapped.
 
-    ## Numerical Accuracy
+    ## Known Returns
 
-    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 9.5 rad/s, whatever the control and the shell's rate; above that the step is divided, by the same
-    bound. Every step of whole episodes under random actions, against 40 digits: below 1e-15 of the state's
-    size (docs/numerics.md).
-
-    ## Optimal Value
-
-    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
-    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum,
-    tells docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
-    energy pump is
-
-        action = 1.78 (E* - E) θ' - 0.932 ψ' + 0.315 θ, clipped to ±1
-
-    | Id | Random actions | Zero control | Energy pump | Best known |
-    | -- | -------------- | ------------ | ----------- | ---------- |
-    | CylinderInCylinderPump-v0 | 6.2510 ± 0.0057 | 7.2179 ± 0.0010 | 142.055 ± 0.043 | 145.695 ± 0.013 |
+    The optimum is not known. docs/agents.md has what value iteration estimates of it.
 
     ## Version History
 
@@ -418,6 +315,7 @@ class Pump(_Shell):
     """
 
     id = "CylinderInCylinderPump-v0"
+    quantities = _SHELL
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "damping": 0.024, "control": "tilt"}
     usable = {"gravity": (1e-3, 1e6)}  # without a field no energy belongs to the amplitude
     largest, fastest_shell, largest_angle = 4.0, 3.0, 1.3
@@ -464,8 +362,6 @@ class Pump(_Shell):
             "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
             "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
-        feedback="1.78 * (6.187 - 0.5 * theta_dot**2 - 16.35 * (1 - cos(theta))) * theta_dot"
-        " - 0.932 * psi_dot + 0.315 * theta",
     )
     difficulty = (
         "The drive is weak: it has to push in time with the swing for many periods, and to stop pumping "
@@ -473,8 +369,9 @@ class Pump(_Shell):
     )
     note = """
 Best is the greedy policy of value iteration. Doing nothing is a trap: every action costs effort before it
-pays. All learners in the table have left it. TD3 gets to the wanted energy as soon as the energy pump, and
-then spends more on keeping it; PPO is later there, but for one seed, and keeps it at less expense than TD3.
+pays. All learners in the table have escaped it. TD3 reaches the wanted energy as soon as the energy pump
+does, and then spends more on keeping it. PPO gets there later, except for one seed, and keeps it at lower
+cost than TD3.
 """
 
     def energies(self, state: Any, xp: Any) -> tuple[Any, Any]:
@@ -517,104 +414,54 @@ class Damping(Task):
 
     ## Description
 
-    A solid cylinder rolls without slipping inside a fixed hollow one. A brake, a drag whose coefficient is
-    the control, takes energy out; kicks put it back. The cylinder is to rest at the bottom. Braking as hard
-    as possible is not the best: it makes the cylinder creep.
+    A solid cylinder rolls without slipping inside a fixed hollow one. The control is a brake: the coefficient
+    of a drag that takes energy out. Kicks put energy back. Bring the cylinder to rest at the bottom. Braking
+    as hard as possible is not best: it makes the cylinder creep.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | drag coefficient c, 1.2 (1 + action) | N m s | 0 | 2.4 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step. The action -1
+    is no brake.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted, at worst a kick in every step.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | theta | angle of the small cylinder's axis | rad | -18635 | 18635 |
-    | 1 | theta_dot | its rate | rad/s | -1763.5 | 1763.5 |
+    The bounds are proved for every start that is accepted, even with a kick in every step.
 
     ## Rewards
 
-    exp(-√(θ² + θ'²/ω₀²)/0.1) for each step, at its end and before a kick, with ω₀ = √(k g/a) = 4.0435/s.
-    For another `dt` it is scaled by dt/0.02.
+    Each step pays exp(-√(θ² + θ'²/ω₀²)/0.1), taken at its end and before a kick, with ω₀ = √(k g/a) =
+    4.0435/s. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [theta, theta_dot]})`, where there is contact and |θ| is at most
-    1,000 rad.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | theta | rad | 0 | 0.8 |
-    | theta_dot | rad/s | 0 | 1 |
+    Well up the wall, moving. Given starts must have contact and |θ| at most 1,000 rad.
 
     After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by -3,
     -1.5, 1.5 or 3 rad/s, each equally likely.
 
     ## Episode End
 
-    Termination: contact is lost, N = m (a θ'² + g cosθ) < 0 at a step's end. Truncation: after 500 steps
-    (10 s).
+    Termination: contact is lost, N = m (a θ'² + g cosθ) < 0 at a step's end.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 1 | kg | 1e-6 to 1e6 | mass m of the small cylinder |
-    | shell_radius | 0.5 | m | 1e-9 to 1e9 | inner radius R of the shell |
-    | radius | 0.1 | m | 1e-9 to 1e9 | radius r of the small cylinder, below `shell_radius` |
-    | inertia | 0.005 | kg m² | 0 to 1e27 | its moment of inertia I about its axis; None: solid, mr²/2 |
-    | damping | 0 | N m s | 0 to 1e9 | constant drag; adds to the brake |
-    | gravity | 9.81 | m/s² | 1e-3 to 1e6 | field g, downward |
-    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    `control` must be "damping"; `damping` is a constant drag that adds to the brake.
 
-    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
-    2 √(k g/a) dt is at most 5,000 rad. Then every step is taken, and observations stay within their space.
-    Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
-    `info`.
+    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    √(k g/a) dt must be at most 5,000 rad, with a = R - r and k = 1/(1 + I/(m r²)). Every step is then taken,
+    and observations stay within their space. Anything else is an error that names the value.
 
     ## Equations
 
-    With a = R - r, k = 1/(1 + I/(mr²)) = 2/3 and β = c k/(m a²), at most 10/s:
-
-        θ'' = -(k g/a) sinθ - β θ' = -16.35 sinθ - β θ'     (default parameters)
-
-    Overdamped from β = 2 ω₀ = 8.1/s.
+    The motion is overdamped where the drag slows it at a rate of 2 ω₀ = 8.1/s or more.
 
     ## Signs and Units
 
-    SI units. θ = 0 at the bottom, positive counter-clockwise, not wrapped. The state is float64:
-    `env.unwrapped.state`.
+    SI units. θ = 0 is at the bottom; θ grows counter-clockwise and is not wrapped.
 
-    ## Numerical Accuracy
+    ## Known Returns
 
-    Taylor series of order 20. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 22.8 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
-    (docs/numerics.md).
-
-    ## Optimal Value
-
-    Not known. The best policy known is the greedy one of finite-horizon value iteration (`python -m
-    agents.scale` measures it, in episodes of its own); what value iteration estimates of the optimum,
-    tells docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
-    switching line is
-
-        full brake away from the bottom; towards it action = 14.6 (|θ'| - 6.94 |θ|), clipped to ±1
-
-    | Id | Random actions | Zero control | Switching line | Best known |
-    | -- | -------------- | ------------ | -------------- | ---------- |
-    | CylinderInCylinderDamping-v0 | 294.34 ± 0.99 | 13.19 ± 0.37 | 363.77 ± 0.73 | 367.053 ± 0.063 |
-
-    Zero control is the action -1, no brake.
+    The optimum is not known. docs/agents.md has what value iteration estimates of it.
 
     ## Version History
 
@@ -622,6 +469,7 @@ class Damping(Task):
     """
 
     id = "CylinderInCylinderDamping-v0"
+    quantities = _ROLLING
     scene: Any = CylinderInCylinder
     defaults = {"mass": 1.0, "shell_radius": 0.5, "radius": 0.1, "control": "damping"}
     usable = {"gravity": (1e-3, 1e6)}  # without a field nothing holds the cylinder in the shell
@@ -666,17 +514,16 @@ class Damping(Task):
             "gravity": [9.81, 1.6, 100.0, 1e3, 9.81, 9.81, 9.81],
             "damping": [0.0, 0.2, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
-        feedback="where(theta * theta_dot >= 0, 1, 14.6 * (abs(theta_dot) - 6.94 * abs(theta)))",
     )
     difficulty = (
         "Too little drag lets the cylinder swing on, too much makes it creep, and too much speed makes it "
         "leave the shell: the best brake changes with the motion."
     )
     note = """
-Best is the greedy policy of value iteration, and the switching line is as good within what these episodes
-tell: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time as
-the line, but close to it for less: its network does not resolve that corner. TD3, with its one seed, ended
-with the action that lets go all the time.
+Best is the greedy policy of value iteration. The switching line is as good within the uncertainty of these
+episodes: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time
+as the line, but close to it for less, because its network does not resolve the corner of the switching line.
+TD3, with its one seed, ended with the action that never brakes.
 """
 
     def check(self) -> None:

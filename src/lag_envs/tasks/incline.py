@@ -33,105 +33,60 @@ class Tilt(Task):
 
     ## Description
 
-    A solid cylinder rolls without slipping on a plane that turns about its middle. It is to be brought to a
-    mark and kept there, the plane's rate of turning being the control. The plane carries the cylinder, so
+    A solid cylinder rolls without slipping on a plane that turns about its middle. Bring it to a mark and
+    keep it there. The control is the rate at which the plane turns. The plane carries the cylinder, so
     turning it also pushes.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | rate φ' of the tilt, 0.3 times the action | rad/s | -0.3 | 0.3 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
     The rate is cut back so that |φ| is at most 0.1 rad at the step's end. With `control="tilt"` the control
-    is the tilt itself, 0.1 rad times the action, and each step is one of a plane at rest at that tilt.
+    is the tilt itself, 0.1 rad times the action, and each step is that of a plane at rest at that tilt.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted. With `control="tilt"` row 1 is
-    x_dot and row 2 is missing.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | x | place along the plane | m | -5.895 | 5.895 |
-    | 1 | w | x' + R φ', the speed that the momentum goes with | m/s | -107.9 | 107.9 |
-    | 2 | phi | tilt | rad | -0.1 | 0.1 |
-    | 3 | target | the mark x* | m | -0.5 | 0.5 |
+    The bounds are proved for every start that is accepted. With `control="tilt"` there is x_dot in place of
+    w, and no phi.
 
     ## Rewards
 
-    exp(-((x - x*)/0.1)²) - 0.02 (u/U)² for each step, at its end; u is the control applied and U its limit.
-    For another `dt` it is scaled by dt/0.05.
+    Each step pays exp(-((x - x*)/0.1)²) - 0.02 (u/U)², taken at its end; x* is the mark, u the control that
+    was applied, U its limit. With another `dt` rewards are scaled by dt/0.05.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [x, w, phi], "target": x*})`, inside the limits.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | x | m | 0 | 0.4 |
-    | w | m/s | 0 | 0.3 |
-    | phi | rad | 0 | 0.05 |
-    | target | m | 0 | 0.3 |
+    Anywhere near the middle, slowly rolling. Given starts must lie inside the limits.
 
     ## Episode End
 
-    Termination: |x| > 0.5 m at a step's end. Truncation: after 200 steps (10 s).
+    Termination: |x| > 0.5 m at a step's end.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
-    | radius | 0.05 | m | 1e-9 to 1e9 | rolling radius R |
-    | inertia | 0.00125 | kg m² | 0 to 1e27 | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0.03 | N s/m | 0 to 1e9 | coefficient c of the drag -cx' at the axis |
-    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
-    | control | tilt_rate | - | - | what the control is: "tilt_rate", or "tilt" |
-    | dt | 0.05 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
-    | target | None | m | ±0.5 | a mark for every episode; None: random |
+    `control` is "tilt_rate" or "tilt". A target must lie within ±0.5 m.
 
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
-    their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for normal force, friction, needed friction coefficient and
-    drive torque in `info`.
+    Any combination of values in these ranges is allowed: every step is taken, and observations stay within
+    their space. Anything else is an error that names the value.
 
     ## Equations
 
-    With k = 1/(1 + I/(mR²)) = 2/3, and φ' held:
-
-        w' = k (g sinφ + x φ'²) - (c k/m) x',   x' = w - R φ'
-
-    No φ'' appears, and w stays continuous when the rate is switched, whereas x' jumps by -R times the
-    switch. With `control="tilt"`: x'' = k g sinφ - (c k/m) x'.
+    While the rate is held, φ̈ = 0. When it is switched, x' jumps by -R times the switch. The speed w = x' + R
+    φ', which is proportional to the momentum, does not jump, so w is in the state.
 
     ## Signs and Units
 
-    SI units. x is positive down the slope and 0 at the point about which the plane turns; φ is positive
-    when the plane falls to the side of positive x. The state is float64: `env.unwrapped.state`.
+    SI units. x is positive down the slope and 0 at the point about which the plane turns. φ is positive when
+    the plane falls towards positive x.
 
     ## Numerical Accuracy
 
-    The equation is linear while the rate is held, and is stepped by its own Taylor series, summed to
-    rounding (with `control="tilt"` by its closed form). Every step of whole episodes under random actions,
-    against 40 digits: below 1e-15 of the state's size (docs/numerics.md).
+    The equation is linear while the rate is held. It is stepped by its own Taylor series, summed to rounding;
+    with `control="tilt"` by its closed form.
 
-    ## Optimal Value
+    ## Known Returns
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
-    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
-    cascade is
-
-        φ_wanted = -1.45 (x - x*) - 1.28 w, clipped to ±0.1, and action = 43.4 (φ_wanted - φ), clipped to ±1
-
-    | Id | Random actions | Zero control | Cascade | Best known |
-    | -- | -------------- | ------------ | ------- | ---------- |
-    | InclineTilt-v0 | 9.46 ± 0.18 | 11.29 ± 0.23 | 179.88 ± 0.28 | 181.562 ± 0.025 |
+    The optimum is not known. docs/agents.md has what value iteration estimates of it.
 
     ## Version History
 
@@ -139,6 +94,12 @@ class Tilt(Task):
     """
 
     id = "InclineTilt-v0"
+    quantities = {
+        "x": ("m", "place along the plane"),
+        "w": ("m/s", "x' + R φ', the speed that the momentum goes with"),
+        "phi": ("rad", "tilt"),
+        "target": ("m", "the mark x*"),
+    }
     scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "damping": 0.03, "control": "tilt_rate"}
     interval, steps = 0.05, 200
@@ -182,15 +143,15 @@ class Tilt(Task):
             "target": [0.1, -0.1, 0.0, 0.5, -0.5, 0.2, 0.3],
         },
         variants={"quasi-static": {"control": "tilt"}, "fixed target": {"target": 0.2}},
-        feedback="43.4 * (clip(-1.45 * (x - target) - 1.28 * w, -0.1, 0.1) - phi)",
     )
     difficulty = (
         "Tilting moves the cylinder twice: by the slope and by the plane that carries it, one against the "
         "other. Whoever tilts too far cannot turn the plane back in time to stop."
     )
     note = """
-Best is iLQR, before the greedy policy of value iteration, whose values are interpolated between targets, and
-the cascade. PPO is later at the mark than the cascade, and stops beside it where the cascade ends on it.
+Best is iLQR, ahead of the cascade and of the greedy policy of value iteration, whose values are interpolated
+between targets. PPO reaches the mark later than the cascade, and stops beside it where the cascade ends on
+it.
 """
 
     def check(self) -> None:
@@ -322,99 +283,53 @@ class Brake(Task):
 
     ## Description
 
-    A solid cylinder rolls without slipping down a slope of 15°. A brake, a drag whose coefficient is the
-    control, slows it. It is to cross a line soon, at 0.5 m/s or less: time and excess of speed both cost.
+    A solid cylinder rolls without slipping down a slope of 15°. The control is a brake: the coefficient of a
+    drag. Let the cylinder cross a line soon, at 0.5 m/s or less. Time costs, and so does excess speed.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | drag coefficient c, 3 (1 + action) | N s/m | 0 | 6 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted (at most 1,000 m before the
-    line).
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | distance | distance to the line, -x | m | -2169 | 2169 |
-    | 1 | v | speed x' down the slope | m/s | -116.9 | 116.9 |
+    The bounds are proved for every start that is accepted, at most 1,000 m before the line.
 
     ## Rewards
 
-    Minus the seconds that the step takes: -0.02. In the step that crosses the line, minus the time to the
-    crossing, and minus 5 (v - 0.5) where the speed v there is above 0.5 m/s. Both are those of the exact
-    crossing, not of the step's end.
+    Each step costs its 0.02 s. The step that crosses the line costs the time to the crossing, and 5 (v - 0.5)
+    where the speed v there is above 0.5 m/s. Both are those of the exact crossing, not of the step's end.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [x, x_dot]})`, before the line and not moving uphill. The line is
-    at x = 0.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | x | m | -2 | 1 |
-    | x_dot | m/s | 0.5 | 0.5 |
+    Before the line, which is at x = 0, and not moving uphill.
 
     ## Episode End
 
-    Termination: the line is crossed. Truncation: after 500 steps (10 s).
+    Termination: the line is crossed.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 1 | kg | 1e-6 to 1e6 | mass m |
-    | radius | 0.05 | m | 1e-9 to 1e9 | rolling radius R |
-    | inertia | 0.00125 | kg m² | 0 to 1e27 | moment of inertia I about the axis; None: solid, mR²/2 |
-    | damping | 0 | N s/m | 0 to 1e9 | constant drag; adds to the brake |
-    | tilt | 0.261799 | rad | 0 to 1.57 | the slope φ |
-    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
-    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
-
-    Each may lie anywhere in its range, whatever the others: every step is taken, and observations stay within
-    their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for normal force, friction and needed friction coefficient in
-    `info`.
+    Any combination of values in these ranges is allowed: every step is taken, and observations stay within
+    their space. Anything else is an error that names the value.
 
     ## Equations
 
-    With k = 1/(1 + I/(mR²)) = 2/3 and β = c k/m, at most 4/s:
-
-        x'' = k g sinφ - β x' = 1.6927 - β x'     (default parameters)
-
-    Fully braked, the speed settles at 0.423 m/s.
+    With the brake fully on, the speed settles at 0.423 m/s.
 
     ## Signs and Units
 
-    SI units. x is positive down the slope, 0 at the line. The state is float64: `env.unwrapped.state`.
+    SI units. x is positive down the slope and 0 at the line.
 
     ## Numerical Accuracy
 
-    Stepped in closed form, written so that nothing cancels for any drag. Every step of whole episodes under
-    random actions, against 40 digits: below 1e-15 of the state's size (docs/numerics.md). The crossing time
-    is solved for by Newton's method on the closed form, started close below it.
+    Stepped in closed form, written so that nothing cancels for any drag. The crossing time is found by
+    Newton's method on the closed form, started just below it.
 
-    ## Optimal Value
+    ## Known Returns
 
-    Known: roll freely, then brake fully, from the best moment on. `lag_envs.controllers.optimal_return`
-    is what that returns from any start; no policy exceeds it. The best policy known, which acts at
-    intervals, misses it by 0.0002 in the mean (`python -m agents.scale` measures both, in episodes of
-    their own). Mean returns ± standard errors, of the other policies over 4,096 episodes; the switching
-    line is
-
-        action = 14.6 (v - 0.149 - 2.33 distance), clipped to ±1
-
-    | Id | Random actions | Zero control | Switching line | Best known |
-    | -- | -------------- | ------------ | -------------- | ---------- |
-    | InclineBrake-v0 | -4.318 ± 0.012 | -11.975 ± 0.033 | -1.7435 ± 0.0049 | -1.7241 ± 0.0004 |
-
-    Zero control is the action -1, no brake.
+    The optimum is known: roll freely, then brake fully, from the best moment on. No policy exceeds it.
+    `lag_envs.controllers.optimal_return` returns it for any start. The best policy known acts at intervals
+    and so misses it by a little.
 
     ## Version History
 
@@ -422,6 +337,10 @@ class Brake(Task):
     """
 
     id = "InclineBrake-v0"
+    quantities = {
+        "distance": ("m", "distance to the line, -x"),
+        "v": ("m/s", "speed x' down the slope"),
+    }
     scene: Any = Incline
     defaults = {"mass": 1.0, "radius": 0.05, "tilt": math.radians(15.0), "control": "damping"}
     usable = {"tilt": (0.0, math.pi / 2)}  # elsewhere the cylinder would not roll down
@@ -468,17 +387,16 @@ class Brake(Task):
             "tilt": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 1.5],
             "damping": [0.0, 0.03, 5.0, 500.0, 1e5, 0.0, 0.1],
         },
-        feedback="14.6 * (v - 0.149 - 2.33 * distance)",
     )
     difficulty = (
         "Braking early wastes time, braking late crosses too fast: the best policy switches once, and "
         "where it does depends on the speed at the start."
     )
     note = """
-Best is the switching line: roll freely, then brake fully along the curve that ends at the line at the right
-speed. It is a hair below the optimum, which may switch in the midst of a step. It beats the greedy policy of
-value iteration, whose grid smears the moment of switching. PPO has found the same, but crosses most often a
-little sooner and too fast, and what that costs is more than the time it saves.
+Best is the switching line: roll freely, then brake fully along the curve that meets the line at the right
+speed. It is slightly below the optimum, which may switch in the middle of a step. It beats the greedy policy
+of value iteration, whose grid smears the moment of switching. PPO has found the same strategy, but usually
+crosses a little too early and too fast, which costs more than the time it saves.
 """
 
     def check(self) -> None:

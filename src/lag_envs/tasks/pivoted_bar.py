@@ -52,111 +52,61 @@ class SwingUp(_Bar):
 
     ## Description
 
-    A uniform bar hangs from a support. The support is accelerated to and fro; the bar is to be swung up and
-    kept upright. With a track (`PivotedBar-v0`) the support has half a metre to either side; without one
-    (`PivotedBarFree-v0`, the same class with `track=None`) its place and speed are no part of the task.
+    A uniform bar hangs from a support. Move the support to and fro to swing the bar up, then keep it upright.
+    With a track (`PivotedBar-v0`) the support can travel half a metre to either side. Without one
+    (`PivotedBarFree-v0`, the same class with `track=None`) its place and speed are not part of the task.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | acceleration u = s'' of the support, 5 times the action | m/s² | -5 | 5 |
-
-    With a track, the control applied is the one nearest to 5 times the action from which the support can
-    still stop inside the track by braking at 5 m/s²; read it as `env.unwrapped.control`.
+    With a track the support must be able to stop inside it, braking at 5 m/s². Where the wanted acceleration
+    would make that impossible, the nearest one that does not is applied. `env.unwrapped.control` tells which.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted. Without a track the first two
-    rows are missing.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | s/S | place of the support over S = 0.5 m | 1 | -1.000 | 1.000 |
-    | 1 | s_dot/2 | speed of the support, halved | m/s | -1.118 | 1.118 |
-    | 2 | cos(theta) | cosine of the bar's angle | 1 | -1 | 1 |
-    | 3 | sin(theta) | sine of it | 1 | -1 | 1 |
-    | 4 | theta_dot/8 | angular velocity, over 8 | rad/s | -58.78 | 58.78 |
+    The bounds are proved for every start that is accepted.
 
     ## Rewards
 
-    h² - 0.02 (u/5)² for each step, where h = (1 - cosθ)/2 is 0 hanging and 1 upright, taken at the step's
-    end, and u is the control applied. The square keeps a spinning bar from paying (3/8 of the optimum). For
-    another `dt` it is scaled by dt/0.02, so that a second is worth the same.
+    Each step pays h² - 0.02 (u/5)². The height h = (1 - cosθ)/2 is 0 hanging and 1 upright, taken at the
+    step's end; u is the acceleration that was applied. Because of the square, a bar that only spins earns 3/8
+    of the optimum. With another `dt` rewards are scaled by dt/0.02, so a second is always worth the same.
 
     ## Starting State
 
-    Uniform, hanging nearly at rest; or `reset(options={"state": [s, s_dot, theta, theta_dot]})` (without a
-    track `[theta, theta_dot]`). A start from which the support cannot stop inside the track is refused.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | s | m | 0 | 0.05 |
-    | s_dot | m/s | 0 | 0.02 |
-    | theta | rad | 0 | 0.1 |
-    | theta_dot | rad/s | 0 | 0.1 |
-
-    The half width of s is a tenth of the track's.
+    The bar hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused. The
+    half width of s is a tenth of the track's.
 
     ## Episode End
 
-    Termination: never; the track's ends are guarded, see above. Truncation: after 500 steps (10 s).
+    Termination: never. The ends of the track are guarded, as described above.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
-    | com_distance | 0.3 | m | 1e-9 to 1e9 | distance L from pivot to centre of mass, half of the length |
-    | inertia | 0.006 | kg m² | 0 to 1e27 | moment of inertia I about the centre of mass; None: mL²/3 |
-    | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
-    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; `math.inf`: no end (S = 0.5 m); None: none |
-    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    `track=math.inf` is a track without an end (the observation then divides s by 0.5 m), `track=None` is no
+    track.
 
-    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
-    2 √((g + 5 m/s²) m L/J) dt is at most 5,000 rad. Then every step is taken, and observations stay within
-    their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
+    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    √((g + 5 m/s²) m L/(m L² + I)) dt must be at most 5,000 rad. Every step is then taken, and observations
+    stay within their space. Anything else is an error that names the value.
 
     ## Equations
 
-    With J = mL² + I:
-
-        θ'' = -(m L (u cosθ + g sinθ) + b θ')/J = -24.525 sinθ - 2.5 u cosθ - 0.041667 θ'
-        s'' = u
-
-    The numbers are those of the default parameters. The support is moved by a drive that is strong enough:
-    the bar does not act back on it.
+    The drive is strong enough to move the support as commanded: the bar does not act back on it.
 
     ## Signs and Units
 
-    SI units. θ = 0 hangs straight down, θ = π stands; positive counter-clockwise, not wrapped. s is
-    positive to the right, 0 in the middle of the track. The state is float64: `env.unwrapped.state`.
+    SI units. θ = 0 hangs straight down and θ = π stands; θ grows counter-clockwise and is not wrapped. s is
+    positive to the right and 0 in the middle of the track.
 
     ## Numerical Accuracy
 
-    Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
-    (docs/numerics.md). s and s' are exact to rounding.
+    s and s' are exact to rounding.
 
-    ## Optimal Value
+    ## Known Returns
 
-    Not known. The best policy known is a plan by iLQR on the exact model (`python -m agents.scale`
-    measures it, in episodes of its own); what value iteration estimates of the optimum, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes:
-
-    | Id | Random actions | Zero control | Best known |
-    | -- | -------------- | ------------ | ---------- |
-    | PivotedBar-v0 | -0.779 ± 0.072 | 0.0002 ± 0.0000 | 418.987 ± 0.012 |
-    | PivotedBarFree-v0 | -2.426 ± 0.025 | 0.0002 ± 0.0000 | 422.490 ± 0.013 |
-
-    `make demo` trains an agent and shows what it and a classical controller reach.
+    The optimum is not known. docs/agents.md has what value iteration estimates of it.
 
     ## Version History
 
@@ -164,6 +114,13 @@ class SwingUp(_Bar):
     """
 
     id = "PivotedBar-v0"
+    quantities = {
+        "s/S": ("1", "place of the support, divided by the track's half length S"),
+        "s_dot/2": ("m/s", "speed of the support, halved"),
+        "cos(theta)": ("1", "cosine of the bar's angle"),
+        "sin(theta)": ("1", "its sine"),
+        "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
+    }
     scene: Any = PivotedBar
     defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
     usable = {"track": (1e-3, 1e9)}
@@ -206,10 +163,11 @@ class SwingUp(_Bar):
         "one."
     )
     note = """
-Best is iLQR, which plans on the exact model from two sides and leaves the hold to the LQR. Energy shaping
-pumps to the energy of upright and waits for the bar to get there. PPO's seeds are nearly as good, but for one
-that misses the catch from some starts and swings on. What value iteration estimates is for the bar without a
-track, so nobody knows whether the difference can be had. The other learners catch the bar now and then only.
+Best is iLQR. It plans on the exact model, from both ends, and hands over to the LQR for the hold. Energy
+shaping pumps until the energy is that of upright, then waits for the bar to get there. PPO's seeds are nearly
+as good, except one that misses the catch from some starts and keeps swinging. The estimate by value iteration
+is for the bar without a track, so nobody knows whether the difference can be gained. The other learners catch
+the bar only now and then.
 """
 
     def check(self) -> None:
@@ -304,7 +262,7 @@ track, so nobody knows whether the difference can be had. The other learners cat
 
 
 class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
-    __doc__ = SwingUp.__doc__
+    __doc__ = (SwingUp.__doc__ or "").replace("its support,", "its support, without a track,", 1)
     id = "PivotedBarFree-v0"
     defaults = {**SwingUp.defaults, "track": None}
 
@@ -338,9 +296,9 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
         "swings, and the unstable upright rest caught at the right speed."
     )
     note = """
-Best is iLQR, and it beats the greedy policy of value iteration, whose moments of switching are smeared over a
-cell of the grid. PPO's seeds differ by how soon the bar is up. Energy shaping holds back once the energy is
-right, which is too careful without a track to mind.
+Best is iLQR. It beats the greedy policy of value iteration, whose switching times are smeared over a cell of
+the grid. PPO's seeds differ in how soon the bar is up. Energy shaping stops pumping once the energy is right,
+which is too cautious without a track to watch.
 """
 
 
@@ -349,107 +307,58 @@ class Balance(_Bar):
 
     ## Description
 
-    The bar of `SwingUp` starts nearly upright. It is to be kept there, near the middle of the track, while
-    random kicks knock it off balance. Without kicks the task would be trivial.
+    The bar starts nearly upright. Keep it there, near the middle of the track, while random kicks knock it
+    off balance. Without kicks the task would be trivial.
 
     ## Action Space
 
-    `Box(-1, 1, (1,), float32)`; finite values outside are clipped. The control is held for one step.
-
-    | Num | Control | Unit | At -1 | At 1 |
-    | --- | ------- | ---- | ----- | ---- |
-    | 0 | acceleration u = s'' of the support, 3 times the action | m/s² | -3 | 3 |
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
 
     ## Observation Space
 
-    `Box` of float32. The bounds are proved for every start that is accepted, at worst a kick in every step.
-
-    | Num | Observation | Quantity | Unit | Min | Max |
-    | --- | ----------- | -------- | ---- | --- | --- |
-    | 0 | s | place of the support | m | -3.1 | 3.1 |
-    | 1 | s_dot | its speed | m/s | -130 | 130 |
-    | 2 | e | angle from upright, θ - π | rad | -18.76 | 18.76 |
-    | 3 | theta_dot | angular velocity | rad/s | -920.3 | 920.3 |
+    The bounds are proved for every start that is accepted, even with a kick in every step.
 
     ## Rewards
 
-    1 - (e/0.35)²/2 - (s/S)²/2 for each step, at its end and before a kick, with S = 0.5 m: between 0 and 1
-    inside the limits. For another `dt` it is scaled by dt/0.02.
+    Each step pays 1 - (e/0.35)²/2 - (s/S)²/2, taken at its end and before a kick; S = 0.5 m is half the
+    track. Inside the limits that lies between 0 and 1. With another `dt` rewards are scaled by dt/0.02.
 
     ## Starting State
 
-    Uniform; or `reset(options={"state": [s, s_dot, theta, theta_dot]})`, inside the limits below.
-
-    | State | Unit | Centre | To either side |
-    | ----- | ---- | ------ | -------------- |
-    | s | m | 0 | 0.2 |
-    | s_dot | m/s | 0 | 0.2 |
-    | theta | rad | 3.14159 | 0.15 |
-    | theta_dot | rad/s | 0 | 0.3 |
+    The bar is nearly upright. Given starts must lie inside the limits below.
 
     After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes θ' by a
-    uniform amount in ±1 rad/s.
+    uniform amount within ±1 rad/s.
 
     ## Episode End
 
-    Termination: |e| > 0.35 rad or |s| > 0.5 m at a step's end; that step still pays. Truncation: after 500
-    steps (10 s).
+    Termination: |e| > 0.35 rad or |s| > 0.5 m at a step's end. That step still pays.
 
     ## Arguments
 
-    | Keyword | Default | Unit | Range | Meaning |
-    | ------- | ------- | ---- | ----- | ------- |
-    | mass | 0.2 | kg | 1e-6 to 1e6 | mass m |
-    | com_distance | 0.3 | m | 1e-9 to 1e9 | distance L from pivot to centre of mass, half of the length |
-    | inertia | 0.006 | kg m² | 0 to 1e27 | moment of inertia I about the centre of mass; None: mL²/3 |
-    | damping | 0.001 | N m s | 0 to 1e9 | coefficient b of the pivot's torque -bθ' |
-    | gravity | 9.81 | m/s² | 0 to 1e6 | field g, downward |
-    | track | 0.5 | m | 1e-3 to 1e9 | travel S to either side; finite here |
-    | dt | 0.02 | s | 1e-6 to 1 | control interval; the episode keeps its seconds |
-    | duration | 10 | s | dt or more | length of an episode, `math.inf` for one without an end |
+    The track must be finite here.
 
-    Each may lie anywhere in its range, whatever the others, as long as a step is not too long for the swing:
-    2 √((g + 3 m/s²) m L/J) dt is at most 5,000 rad. Then every step is taken, and observations stay within
-    their space. Outside, an error names it.
-
-    Also `render_mode`, and `diagnostics=True` for support forces and energy in `info`.
+    Any combination of values in these ranges is allowed as long as a step is not too long for the swing: 2
+    √((g + 3 m/s²) m L/(m L² + I)) dt must be at most 5,000 rad. Every step is then taken, and observations
+    stay within their space. Anything else is an error that names the value.
 
     ## Equations
 
-    With J = mL² + I:
-
-        θ'' = -(m L (u cosθ + g sinθ) + b θ')/J
-        s'' = u
-
-    Upright, without control, a deviation grows e-fold in √(J/(mgL)) = 0.2 s.
+    Upright and without control, a deviation grows e-fold in √((m L² + I)/(m g L)) = 0.2 s.
 
     ## Signs and Units
 
-    SI units. θ = 0 hangs straight down, θ = π stands; positive counter-clockwise, not wrapped: θ = -π is
-    another angle and outside the limits. s is positive to the right. The state is float64:
-    `env.unwrapped.state`.
+    SI units. θ = 0 hangs straight down and θ = π stands; θ grows counter-clockwise and is not wrapped, so θ =
+    -π is another angle and outside the limits. s is positive to the right.
 
     ## Numerical Accuracy
 
-    Taylor series of order 14. One series is certified to leave out at most 1e-12 rad/s while |θ'| is at
-    most 13.2 rad/s, whatever the control; above that the step is divided, by the same bound. Every step of
-    whole episodes under random actions, against 40 digits: below 1e-15 of the state's size
-    (docs/numerics.md). s and s' are exact to rounding.
+    s and s' are exact to rounding.
 
-    ## Optimal Value
+    ## Known Returns
 
-    Not known. The best policy known is a linear-quadratic regulator (`python -m agents.scale` measures
-    it, in episodes of its own); what value iteration estimates of a far easier task, tells
-    docs/agents.md. Mean returns ± standard errors, of the other policies over 4,096 episodes; the
-    linear feedback is
-
-        action = 1.83 s + 1.43 s' - 12.4 e - 1.84 θ', clipped to ±1
-
-    | Id | Random actions | Zero control | Linear feedback | Best known |
-    | -- | -------------- | ------------ | --------------- | ---------- |
-    | PivotedBarBalance-v0 | 21.25 ± 0.15 | 21.78 ± 0.16 | 445.7 ± 1.7 | 452.70 ± 0.14 |
-
-    Kicks that no control survives keep the optimum below 500.
+    The optimum is not known. Some kicks cannot be survived, so it lies below 500. docs/agents.md has what
+    value iteration estimates of a far easier task.
 
     ## Version History
 
@@ -457,6 +366,12 @@ class Balance(_Bar):
     """
 
     id = "PivotedBarBalance-v0"
+    quantities = {
+        "s": ("m", "place of the support"),
+        "s_dot": ("m/s", "its speed"),
+        "e": ("rad", "angle from upright, θ - π"),
+        "theta_dot": ("rad/s", "angular velocity"),
+    }
     scene: Any = PivotedBar
     defaults = {"mass": 0.2, "com_distance": 0.3, "damping": 0.001}
     usable = {"track": (1e-3, 1e9)}
@@ -495,16 +410,15 @@ class Balance(_Bar):
             "damping": [0.0, 0.001, 0.5, 50.0, 1e4, 0.0, 0.02],
             "track": [0.5, 0.6, 1.0, 0.5, 0.3, 0.5, 0.5],
         },
-        feedback="1.83 * s + 1.43 * s_dot - 12.4 * e - 1.84 * theta_dot",
     )
     difficulty = (
         "The upright rest is unstable, kicks come at random, and to push the bar back the support must "
         "first move the wrong way: what saves the bar uses up the track."
     )
     note = """
-Best is the LQR whose weights were tuned for the kicks, and PPO is as good within what these episodes tell.
-They are unlucky ones: in many more the LQR gets what is called best known here. Both lose the bar in about as
-many episodes.
+Best is the LQR, with weights tuned for the kicks; PPO is as good within the uncertainty of these episodes.
+The episodes are unlucky ones: over many more the LQR's return is the one called best known here. Both lose
+the bar in about as many episodes.
 """
 
     def check(self) -> None:

@@ -1,7 +1,7 @@
-"""What people decide about a task beside its formulas, as data.
+"""The data of a task beside its formulas: goal, controllers, hyperparameters, grids, examples.
 
-A task's class holds these under the names of `lag_envs.tasks.Task`. Code is named, "module:function", and
-resolved where it is used: a task imports no controller, learner or leaderboard.
+A task's class holds them as the attributes that `lag_envs.tasks.Task` lists. Code is named,
+"module:function", and resolved where it is used, so a task imports no controller, learner or leaderboard.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Goal:
-    """When an episode counts as a success; `Task.reached` says where the goal holds. It makes a board.
+    """When an episode counts as a success. `Task.reached` decides where the goal holds. A goal makes a board.
 
     Parameters
     ----------
     text : str
         Success and time, in words.
     hold : float or None
-        Seconds before the episode's end from which on the goal must hold without a break. None: it need not.
+        The goal must hold without a break during this many seconds at the episode's end. None: it need not.
     terminated : bool or None
-        Whether the episode must have terminated. None: must not, and reaching the goal does not matter.
+        Whether the episode must have terminated. None: it must not, and reaching the goal does not matter.
     arrival : str
-        What is reached then, in a word or two: docs/agents.md tells when it is, and what is lost by then.
-        Empty: it does not.
+        What is reached then, in a word or two. docs/agents.md reports when that is, and what is lost by then;
+        with an empty string it does not.
     """
 
     text: str
@@ -43,11 +43,11 @@ class Controller:
     place : str
         Where it is made from the task, "module:function".
     numbers : mapping
-        Keywords that it is made with.
+        Its keyword arguments.
     tune : mapping
-        Keywords that ``python -m agents.tune`` finds, and between which values it looks for them.
+        Keywords that ``python -m agents.tune`` optimises, and the range of each.
     plans : bool
-        Whether it plans for seconds before each episode.
+        Whether it plans for some seconds before each episode.
     """
 
     place: str
@@ -63,9 +63,9 @@ class Optimum:
     Parameters
     ----------
     place : str
-        What returns it from the task and the entries of the states, "module:function".
+        Function of the task and the entries of the states that returns it, "module:function".
     text : str
-        Of which policy, in words.
+        The optimal policy, in words.
     """
 
     place: str
@@ -74,20 +74,21 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of a grid: its range, and where its nodes lie densely.
+    """One axis of a grid: its range, and where its nodes are dense.
 
     Parameters
     ----------
     label : str
         Name with unit, for figures.
     low, high : float
-        The range. States outside are taken to be as good as the nearest one on the edge.
+        The range. A state outside gets the value of the nearest one on the edge.
     cells : int
         Cells at level 1, even; twice as many at level 2.
     scale : float, optional
-        Within this distance of the centre the nodes lie evenly, farther out ever wider; None: all evenly.
+        Within this distance of the centre the nodes are evenly spaced, farther out ever wider. None: all
+        even.
     centre : float or "target"
-        The dense place.
+        Where nodes are densest.
     periodic : bool
         Whether the range is one period.
     level : float
@@ -113,24 +114,24 @@ class ValueIteration:
     axes : tuple of Axis
         The grid.
     options : mapping
-        Parameters of the task that is solved in place of this one, an easier one: a relaxation. There is no
-        policy then.
+        Parameters of an easier task that is solved in place of this one, a relaxation. There is no policy
+        then.
     keep : tuple of int
-        Which entries of the scene's state are on the grid; the others are 0 there. Empty: all.
+        Indices of the state's entries that are on the grid; the others are 0 there. Empty: all.
     targets : tuple of float
-        Targets, from 0 on, to solve for; others are interpolated, negative ones mirrored. Empty: none.
+        Targets, from 0 on, to solve for. Others are interpolated, negative ones mirrored. Empty: none.
     pushes : int
-        Sizes of a kick that its expectation takes: midpoints of as many parts of its random number.
+        Number of kick sizes in the expectation: midpoints of as many parts of its random number.
     actions : int
-        Number of actions, evenly from -1 to 1.
+        Number of actions, evenly spaced from -1 to 1.
     levels : tuple of float
-        How fine the grids are, each twice as fine as the one before.
+        Fineness of the grids, each twice as fine as the one before.
     lost : float
-        Share of the grid in which so much is lost that figures need not tell one place from another.
+        Share of the grid whose values are so low that figures need not distinguish them.
     mirror : str
-        Entry of the state, or ``"target"``, on whose sign the submitted table is mirrored; empty: on none.
+        Entry of the state, or ``"target"``, by whose sign the submitted table is mirrored. Empty: none.
     relaxed : str
-        Id whose solution bounds this task from above, in place of a grid of its own; it is looked up at the
+        Id whose solution bounds this task from above, in place of its own grid. It is looked up at the
         entries `keep` of the state.
     """
 
@@ -148,28 +149,26 @@ class ValueIteration:
 
 @dataclass(frozen=True)
 class Examples:
-    """Cases of a task that tests, pictures and docs take.
+    """Cases of a task for tests, pictures and docs.
 
     Parameters
     ----------
     start : mapping
         Options of a reset: a ``state`` in mid-task, and a ``target`` where there is one.
     moving : sequence of float, optional
-        A faster state, for rollouts that are kept; by default that of `start`.
+        A faster state, for the recorded rollouts of the tests; by default that of `start`.
     refused : sequence of mapping
         Options of resets that the task must refuse.
     ending : tuple, optional
         A state and an action that soon terminate the episode.
     reach : float
-        Rate of the angle that episodes come to [rad/s].
+        Largest rate of the angle in episodes [rad/s].
     rest : sequence of float, optional
         A state of rest, with the action 0.
     batch : mapping
-        Parameters, one for each environment of a batch, mild and extreme ones side by side.
+        Parameters, one for each environment of a batch, mild and extreme ones.
     variants : mapping
-        By name, keywords of the environment that are more than numbers.
-    feedback : str
-        The feedback law that the docstring states, in the names of the observation.
+        By name, keywords of the environment that are not just numbers.
     """
 
     start: Mapping[str, Any] = field(default_factory=dict)
@@ -180,4 +179,3 @@ class Examples:
     rest: Sequence[float] | None = None
     batch: Mapping[str, Sequence[float]] = field(default_factory=dict)
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    feedback: str = ""

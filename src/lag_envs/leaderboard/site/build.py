@@ -110,8 +110,13 @@ def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     store.write(out / MANIFEST, json.dumps({"files": sorted(wanted)}, indent=0))
 
 
-def render(data: Mapping[str, Any], url: str = "") -> tuple[dict[str, str], dict[str, str | bytes]]:
-    """Return the pages, the overview last, and the files they refer to: content by path."""
+def render(
+    data: Mapping[str, Any], url: str = "", site: Sequence[tuple[str, str]] = ()
+) -> tuple[dict[str, str], dict[str, str | bytes]]:
+    """Return the pages, the overview last, and the files they refer to: content by path.
+
+    Where the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
+    """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
     files: dict[str, str | bytes] = {}
@@ -161,7 +166,7 @@ def render(data: Mapping[str, Any], url: str = "") -> tuple[dict[str, str], dict
         "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
         "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
         "embed": _embedded, "url": url and url.rstrip("/") + "/",
-        "preview": next((b["preview"] for b in boards), None),
+        "site": site, "preview": next((b["preview"] for b in boards), None),
     }  # fmt: skip
     drawn = ("picture", "poster", "optimum")
     summary = [{key: b[key] for key in drawn} | {"rows": _scores(b["rows"])} for b in boards]

@@ -1,0 +1,133 @@
+"""The first picture of docs/accuracy.md: error against run time, ours and the rivals'.
+
+It is drawn from ``docs/accuracy.json`` alone, so it can be drawn again without measuring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from lag_envs.report.diagrams import DARK, STYLES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: A scene with a step of its own, a system for the general series, and how both are stepped.
+SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
+#: Columns of the general table that are not rivals, and names by which they are drawn.
+RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
+OURS = "lag_envs"
+Points = list[tuple[float, float]]
+
+
+def draw(accuracy: dict[str, Any]) -> Figure:
+    """Draw the picture.
+
+    Parameters
+    ----------
+    accuracy : dict
+        What ``docs/accuracy.json`` holds.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    _panel(left, "A bar on a moving support: a step of its own", *own_step(accuracy))
+    _panel(right, "A driven double pendulum: the general series", *general(accuracy))
+    left.set_ylabel("largest error of one control step, relative")
+    shown = {
+        label: line
+        for ax in (left, right)
+        for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    first = f"{OURS}, with a proved bound"
+    names = [first, *sorted(set(shown) - {first})]
+    figure.legend([shown[name] for name in names], names, loc="outside lower center", ncols=5, fontsize=8)
+    left.annotate("lower left is better", (0.02, 0.03), xycoords="axes fraction", fontsize=8, color="#555555")
+    return figure
+
+
+def own_step(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
+    """Return (time [ns], error) of ours and of the rivals that take less than 10 times as long."""
+    (row,) = _rows(accuracy, "work_precision", "work_precision", scene=SCENE, mode=MODE)
+    ours = [(row["ns"], float(row["error"]))]
+    rivals: dict[str, Points] = {}
+    for near in _rows(accuracy, "work_precision", "work_precision_near", scene=SCENE, mode=MODE):
+        name = near["rival"].removesuffix(", carried").removesuffix(" Taylor")
+        for column, ratio in near.items():
+            if column.startswith("to ") and ratio is not None:
+                rivals.setdefault(name, []).append((ratio * row["ns"], float(column[3:])))
+    # Of each the faster form.
+    best = {name: _fastest(points) for name, points in rivals.items()}
+    return ours, {name: points for name, points in best.items() if len(points) > 1}
+
+
+def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
+    """Return the same of a system that is stepped by the general series."""
+    ours: Points = []
+    rivals: dict[str, Points] = {}
+    for row in _rows(accuracy, "general", "general-times-single", system=SYSTEM):
+        ours.append((row[OURS], float(row["error"])))
+        for name in RIVALS:
+            if row[name] is not None:
+                rivals.setdefault(name.removesuffix(", compiled"), []).append(
+                    (row[name], float(row["error"]))
+                )
+    return ours, rivals
+
+
+def findings(accuracy: dict[str, Any]) -> list[str]:
+    """Return sentences on how often somebody is faster at an error, and on what a general simulator takes."""
+    own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
+    modes = ("general-times-single", "general-times-batch")
+    systems = [row for name in modes for row in _rows(accuracy, "general", name)]
+    texts = []
+    for error in dict.fromkeys(float(row["error"]) for row in systems):
+        faster = [
+            sum(row[ratio] is not None and row[ratio] < 1.0 for row in rows if float(row["error"]) == error)
+            for rows, ratio in ((own, "other / ours"), (systems, "quickest other / ours"))
+        ]
+        counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
+        texts.append(
+            f"To an error of {error:g}, a rival is faster in {faster[0]} of {counts[0]} comparisons on the "
+            f"package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies (alone "
+            "and in a batch)."
+        )
+    row = list(_rows(accuracy, "general", modes[0], system=SYSTEM))[-1]
+    if row["MuJoCo"] is not None:
+        texts.append(
+            f"A general simulator pays for its generality: at {float(row['error']):g} MuJoCo takes "
+            f"{row['MuJoCo'] / row[OURS]:,.0f} times as long as ours on the right."
+        )
+    return texts
+
+
+def _fastest(points: Points) -> Points:
+    best: dict[float, float] = {}
+    for time, error in points:
+        best[error] = min(time, best.get(error, time))
+    return [(time, error) for error, time in sorted(best.items(), reverse=True)]
+
+
+def _rows(accuracy: dict[str, Any], section: str, table: str, **wanted: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table as dicts by column, of those that have given entries."""
+    parts = next(part for part in accuracy["sections"] if part["name"] == section)
+    found = next(one for one in parts["tables"] if one["name"] == table)
+    for cells in found["rows"]:
+        row = dict(zip(found["columns"], cells, strict=True))
+        if all(row[key] == value for key, value in wanted.items()):
+            yield row
+
+
+def _panel(ax: Axes, title: str, ours: Points, rivals: dict[str, Points]) -> None:
+    for name, points in rivals.items():
+        known = STYLES.get(name) or STYLES.get(f"{name} Taylor") or STYLES.get(f"{name} RK4")
+        colour, marker, line = known or ("#666666", "h", "--")
+        ax.plot(*zip(*points, strict=True), marker + line, color=colour, markersize=5, label=name)
+    ax.plot(*zip(*ours, strict=True), "*-", color=DARK, markersize=13, label=f"{OURS}, with a proved bound")
+    ax.set(xscale="log", yscale="log", xlabel="time of a control step [ns]", ylim=(2e-17, 3e-3))
+    ax.set_title(title, fontsize=10)
+    ax.grid(color="#e5e5e5")
+    ax.set_axisbelow(True)

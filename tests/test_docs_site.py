@@ -1,0 +1,173 @@
+"""The documentation's site: it builds, asks no other host for anything, and none of its links is broken."""
+
+import os
+import re
+import shutil
+import warnings
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+import yaml
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+from playwright.sync_api import sync_playwright
+from test_site import CHROMIUM, MISSING
+
+from lag_envs.scenes import SCENES
+from lag_envs.tasks import TASKS
+from tools.docs import equations
+
+ROOT = Path(__file__).parents[1]
+#: Attributes by which a page loads something; other elements with an address only link to it.
+LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "link": "href"}
+#: Relations of a `link` that load nothing.
+NAMED = {"canonical", "next", "prev", "alternate"}
+
+pytestmark = [
+    pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM"),
+    # MkDocs and its plugins are others' code.
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]
+
+
+class Page(HTMLParser):
+    """What a page loads, what it links to, and its anchors."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.loads, self.links, self.anchors = [], [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.anchors |= {found[key] for key in ("id", "name") if found.get(key)}
+        address = found.get(LOADED.get(tag, ""))
+        if address and not NAMED & set(found.get("rel", "").split()):
+            self.loads.append(address)
+        if tag == "a" and found.get("href"):
+            self.links.append(found["href"])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Build the site as `make docs` does."""
+    folder = tmp_path_factory.mktemp("docs")
+    os.environ["NO_MKDOCS_2_WARNING"] = "1"
+    config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(folder), strict=True)
+    config.plugins.on_startup(command="build", dirty=False)
+    build(config)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    found = {path.relative_to(site).as_posix(): path for path in site.rglob("*.html")}
+    del found["404.html"]  # its addresses are the host's
+    return {name: Page(path.read_text("utf-8")) for name, path in found.items()}
+
+
+def test_every_page_is_there(site, pages):
+    for env_id in TASKS:
+        assert {f"environments/{env_id}.html", f"board/{env_id}.html"} <= set(pages)
+    assert {"index.html", "scenes.html", "api/scenes.html", "board/index.html", "changelog.html"} <= set(
+        pages
+    )
+    scenes = (site / "scenes.html").read_text("utf-8")
+    assert all(f'id="{kind.__name__.lower()}"' in scenes and "<math" in scenes for kind in SCENES)
+    # Most of what is public has a docstring, and those stand in the reference.
+    reference = (site / "api" / "tasks.html").read_text("utf-8")
+    assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
+
+
+def test_one_navigation(pages):
+    """From each page to every section, and from the board back."""
+    sections = [next(iter(entry)) for entry in yaml.safe_load(text_of("mkdocs.yml"))["nav"]]
+    assert "board/index.html" in pages["index.html"].links
+    back = [link for link in pages["board/index.html"].links if link.startswith("../")]
+    assert len(back) == len(sections)
+
+
+def text_of(name):
+    return re.sub(r"!!python\S+", "", (ROOT / name).read_text("utf-8"))
+
+
+def test_nothing_comes_from_another_host(site, pages):
+    for name, page in pages.items():
+        for address in page.loads:
+            assert not urlsplit(address).netloc, (name, address)
+    for path in site.rglob("*.css"):
+        for address in re.findall(r"url\(([^)]*)\)|@import\s+([^;]+)", path.read_text("utf-8")):
+            assert not re.match(r"[\"']?(https?:)?//", "".join(address)), (path.name, address)
+
+
+def test_links_lead_somewhere(site, pages):
+    for name, page in pages.items():
+        for link in [*page.links, *page.loads]:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (site / name).parent / unquote(parts.path) if parts.path else site / name
+            assert target.is_file(), (name, link)
+            place = target.resolve().relative_to(site.resolve()).as_posix()
+            if parts.fragment and place in pages and not place.startswith("board/"):
+                assert unquote(parts.fragment) in pages[place].anchors, (name, link)
+
+
+def test_what_is_bundled_is_noticed(site):
+    """Each script and style of others is covered by NOTICE.md."""
+    notice = (ROOT / "NOTICE.md").read_text("utf-8")
+    ours = {"docs.css"}
+    for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
+        place = path.relative_to(site)
+        if place.parts[0] in ("board", "search") or path.name in ours:
+            continue
+        assert place.parts[0] == "assets", place
+    for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons"):
+        assert name in notice
+    assert not list(site.rglob("*.woff*")) and not list(site.rglob("*.ttf"))
+
+
+def test_symbols_are_those_of_the_docstrings():
+    for kind in SCENES:
+        symbols = [equations.symbol(kind, name) for name in kind()._numbers()]
+        assert len(set(symbols)) == len(symbols), kind
+        assert not any("mathrm" in symbol for symbol in symbols), kind
+
+
+def test_pages_are_published_only_when_switched_on():
+    jobs = yaml.safe_load(text_of(".github/workflows/pages.yml"))["jobs"]
+    assert jobs["publish"]["if"] == "vars.PAGES == 'true'" and jobs["publish"]["needs"] == "build"
+
+
+# --- in a browser, from files, without a server ---
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None or not shutil.which(CHROMIUM):
+        warnings.warn(MISSING, stacklevel=1)
+        pytest.skip(MISSING)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM)
+        yield browser
+        browser.close()
+
+
+def test_in_a_browser(site, browser):
+    """No page asks for anything beyond its folder, search works offline, and pages fit a narrow screen."""
+    asked = []
+    page = browser.new_page(viewport={"width": 360, "height": 800})
+    page.on("request", lambda r: asked.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+    page.on("pageerror", lambda error: asked.append(str(error)))
+    env_id = next(iter(TASKS))
+    for name in ("index", f"environments/{env_id}", "scenes", "accuracy", "api/scenes"):
+        page.goto(f"{site.as_uri()}/{name}.html")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360, name
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.goto(f"{site.as_uri()}/index.html")
+    page.get_by_role("textbox", name="Search").fill("truncation bound")
+    page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
+    assert not asked

@@ -1,0 +1,49 @@
+"""Write what is generated from the environments' records into README and docs: ``python -m tools.docs``.
+
+``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
+leaderboard's best learned agents.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lag_envs.generated import replaced
+from lag_envs.store import write
+from lag_envs.tasks import TASKS
+from tools.docs.environments import ROOT, overview
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the generated texts of this checkout."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.docs", description="Write what follows from records."
+    )
+    parser.add_argument("--pictures", action="store_true", help="draw the moving pictures too")
+    args = parser.parse_args(arguments)
+    for path, text in generated(ROOT).items():
+        write(path, text)
+    if args.pictures:
+        from tools.docs.pictures import draw
+
+        draw(ROOT / "leaderboard", ROOT / "docs" / "images" / "moving")
+    return 0
+
+
+def generated(root: Path) -> dict[Path, str]:
+    """Return the generated files, as they ought to be."""
+    readme = root / "README.md"
+    text = replaced(readme.read_text(encoding="utf-8"), "environments", overview(source))
+    return {readme: text}
+
+
+def source(env_id: str) -> str:
+    """Return where an environment's record is, for who reads README without the site."""
+    return f"src/{TASKS[env_id].__module__.replace('.', '/')}.py"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,363 @@
+"""An environment's page, generated from its record: what people decided, what was measured, what follows.
+
+Headings are Gymnasium's. Prose is the docstring's, section by section; every table, number and formula comes
+from the task, from ``measured.json``, from the board and from the accuracy report.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lag_envs.envs.actions import Actions
+from lag_envs.envs.single import observation_space
+from lag_envs.leaderboard.docs import plain
+from lag_envs.scenes import Scene
+from lag_envs.scenes.declaring import complete
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.measured import measured
+from tools.docs import equations
+from tools.docs.markdown import cell, described, number, plus_minus, sections, table
+
+ROOT = Path(__file__).parents[2]
+HEADINGS = (
+    "Description",
+    "Action Space",
+    "Observation Space",
+    "Rewards",
+    "Starting State",
+    "Episode End",
+    "Arguments",
+    "Equations",
+    "Signs and Units",
+    "Numerical Accuracy",
+    "Known Returns",
+    "Agents",
+    "Version History",
+)
+#: Rows of the board that a page shows.
+TOP = 3
+
+
+def page(
+    env_id: str, board: Mapping[str, Any] | None = None, accuracy: Mapping[str, Any] | None = None
+) -> str:
+    """Return the page of an environment.
+
+    Parameters
+    ----------
+    env_id : str
+        Its id.
+    board : mapping, optional
+        The environment's part of `lag_envs.leaderboard.board.board_data`.
+    accuracy : mapping, optional
+        What ``docs/accuracy.json`` holds.
+    """
+    task: Task = TASKS[env_id]()
+    prose = {name: _linked(text) for name, text in sections(type(task)).items()}
+    parts: dict[str, list[str]] = {name: [prose.get(name, "")] for name in HEADINGS}
+    parts["Description"].append(" ".join(task.difficulty.split()))
+    parts["Action Space"].append(_actions(task))
+    parts["Observation Space"].append(_observation(task))
+    parts["Starting State"].append(_start(task))
+    parts["Episode End"].append(_end(task))
+    parts["Arguments"] = [arguments(task), prose.get("Arguments", "")]
+    parts["Equations"].insert(0, _equations(task))
+    parts["Signs and Units"].append(_state(task))
+    parts["Numerical Accuracy"].append(_accuracy(env_id, task, accuracy))
+    parts["Known Returns"].append(_returns(env_id))
+    parts["Agents"].append(_agents(env_id, task, board))
+    lines = [f"# {env_id}", prose[""], _picture(env_id), _summary(env_id, task)]
+    for heading, texts in parts.items():
+        if any(texts):
+            lines += [f"## {heading}", *filter(None, texts)]
+    return "\n\n".join(filter(None, lines)) + "\n"
+
+
+def _linked(text: str) -> str:
+    """Return a docstring's text with links to the pages that it names."""
+    return re.sub(r"docs/(\w+)\.md", lambda name: f"[{name[1].capitalize()}](../{name[0][5:]})", text)
+
+
+def index() -> str:
+    """Return the page of all environments."""
+    return f"""# Environments
+
+{overview("{}.md".format)}
+
+Mean return ± standard error of random actions and of the best policy known, as `python -m agents.scale`
+measured them.
+
+Every episode lasts 10 s at most. Actions lie in [-1, 1] and are scaled to the control. Observations are
+float32, the state behind them float64. [Usage](../usage.md#keywords-of-every-environment) has the keywords
+that all of them take.
+"""
+
+
+def overview(link: Callable[[str], str]) -> str:
+    """Return the table of all environments; `link` tells where an id's page is."""
+    rows = []
+    for env_id in TASKS:
+        task = TASKS[env_id]()
+        found = measured(env_id).get("measured", {})
+        best = measured(env_id).get("scale", {}).get("policy", "")
+        rows.append(
+            [
+                f"[{env_id}]({link(env_id)})",
+                _first(type(task)),
+                "; ".join(_range(task, acting) for acting in task.formulas.acting),
+                *(
+                    plus_minus(row["mean"], row["error"]) if row else ""
+                    for row in map(found.get, ("random", best))
+                ),
+            ]
+        )
+    return table(["environment", "what to do", "control", "random", "best known"], rows)
+
+
+def _first(kind: type) -> str:
+    return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
+
+
+def _range(task: Task, acting: Any) -> str:
+    """Return a control's values in words."""
+    unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
+    if acting.values:
+        return f"`{acting.control}` {', '.join(map(number, acting.values))} {unit}"
+    if acting.low == -acting.high:
+        return f"`{acting.control}` ±{number(acting.high)} {unit}"
+    return f"`{acting.control}` {number(acting.low)} to {number(acting.high)} {unit}"
+
+
+# --- parts of a page ----------------------------------------------------------------------------------------
+
+
+def _picture(env_id: str) -> str:
+    if not (ROOT / "docs" / "images" / "moving" / f"{env_id}.webp").exists():
+        return ""
+    return f"![{env_id}: a trained agent at work](../images/moving/{env_id}.webp)"
+
+
+def _summary(env_id: str, task: Task) -> str:
+    spaces = Actions(task.formulas.actions, task.formulas.choices).space, observation_space([task])
+    shown = [str(space) if not hasattr(space, "low") else _box(space) for space in spaces]
+    rows = [
+        ["Make it", f'`gym.make("{env_id}")`, `gym.make_vec("{env_id}", num_envs=64)`'],
+        ["Action space", f"`{shown[0]}`"],
+        ["Observation space", f"`{shown[1]}`"],
+        ["Step, episode", f"{number(task.dt)} s, {number(task.limit)} steps"],
+    ]
+    return table(rows[0], rows[1:])
+
+
+def _box(space: Any) -> str:
+    """Return a box without its bounds where they differ; the table below has them."""
+    ends = {float(x) for x in space.low}, {float(x) for x in space.high}
+    if all(len(end) == 1 for end in ends):
+        return f"Box({number(ends[0].pop())}, {number(ends[1].pop())}, {space.shape}, {space.dtype})"
+    return f"Box({space.shape}, {space.dtype})"
+
+
+def _actions(task: Task) -> str:
+    units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
+    rows = []
+    for i, acting in enumerate(task.formulas.acting):
+        ends = acting.values or (acting.low, acting.high)
+        values = [", ".join(map(number, ends)), ""] if acting.values else [*map(number, ends)]
+        rows.append([str(i), f"`{acting.control}`", units[acting.control], *values])
+    listed = any(acting.values for acting in task.formulas.acting)
+    head = ["Num", "Control", "Unit", *(("Values, by action", "") if listed else ("At -1", "At 1"))]
+    return table(head, rows)
+
+
+def _observation(task: Task) -> str:
+    space = observation_space([task])
+    known = dict(zip(task.scene.state_names, task.scene.state_units, strict=True))
+    known |= {target.name: target.unit for target in task.formulas.target_boxes}
+    rows = []
+    for i, (name, low, high) in enumerate(zip(task.observation, space.low, space.high, strict=True)):
+        unit, meaning = task.quantities.get(name, (known.get(name, ""), ""))
+        rows.append([str(i), f"`{name}`", meaning, unit, _bound(low), _bound(high)])
+    return table(["Num", "Observation", "Meaning", "Unit", "Min", "Max"], rows)
+
+
+def _bound(value: Any) -> str:
+    """Return a bound with four digits; the largest float32 stands for none."""
+    if abs(value) >= np.finfo(np.float32).max:
+        return "-∞" if value < 0 else "∞"
+    return f"{float(value):.4g}"
+
+
+def _start(task: Task) -> str:
+    names = zip(task.scene.state_names, task.scene.state_units, task.centre, task.half_widths, strict=True)
+    rows = [[f"`{name}`", unit, number(centre), number(half)] for name, unit, centre, half in names]
+    targets = task.formulas.target_boxes
+    rows += [[f"`{t.name}` (target)", t.unit, number(t.centre), number(t.half)] for t in targets]
+    given = f'"state": [{", ".join(task.scene.state_names)}]'
+    if targets:
+        given += ', "target": ' + (
+            targets[0].name if len(targets) == 1 else f"[{', '.join(t.name for t in targets)}]"
+        )
+    text = f"Each entry is drawn uniformly. `reset(options={{{given}}})` sets them."
+    return f"{text}\n\n{table(['Entry', 'Unit', 'Centre', 'To either side'], rows)}"
+
+
+def _end(task: Task) -> str:
+    return f"Truncation: after {number(task.limit)} steps ({number(task.duration)} s)."
+
+
+def arguments(task: Task) -> str:
+    """Return the table of an environment's keywords."""
+    kind = type(task.scene)
+    words = described(kind)
+    rows = []
+    for field in parameters(kind):
+        unit = field.metadata.get("unit", "")
+        low, high = task.usable_ranges().get(field.name, (None, None))
+        within = "" if low is None else f"{number(low)} to {number(high)}"
+        default = cell(getattr(task.scene, field.name))
+        rows.append([f"`{field.name}`", default, unit, within, words.get(field.name, "")])
+    rows += [
+        ["`dt`", number(task.dt), "s", "1e-6 to 1", "Control interval. The episode keeps its seconds."],
+        [
+            "`duration`",
+            number(task.duration),
+            "s",
+            "`dt` or more",
+            "Length of an episode; `math.inf` for no end.",
+        ],
+    ]
+    if task.formulas.target_boxes:
+        unit = ", ".join(dict.fromkeys(t.unit for t in task.formulas.target_boxes))
+        rows.append(["`target`", "None", unit, "", "A fixed target for every episode; None: a random one."])
+    also = (
+        'Also `render_mode` ("human" or "rgb_array"), and `diagnostics=True`, which puts controls, forces '
+        "and energy into `info`."
+    )
+    return f"{table(['Keyword', 'Default', 'Unit', 'Range', 'Meaning'], rows)}\n\n{also}"
+
+
+def parameters(kind: type[Scene]) -> list[Any]:
+    """Return the fields that are keywords of a scene."""
+    complete(kind)
+    return [field for field in dataclasses.fields(kind) if field.init]  # type: ignore[arg-type]
+
+
+@cache
+def _derived(kind: type[Scene], choices: tuple[tuple[str, Any], ...]) -> tuple[str, ...]:
+    scene = kind(**dict(choices))
+    return equations.lagrangian(scene), *equations.equations(scene)
+
+
+def derivation(scene: Scene) -> str:
+    """Return a scene's Lagrangian and the equations of motion that follow from it."""
+    kind, symbols = type(scene), scene._numbers()
+    choices = ((f.name, getattr(scene, f.name)) for f in parameters(kind) if f.name not in symbols)
+    lagrangian, *motion = map(equations.mathml, _derived(kind, tuple(choices)))
+    return "\n\n".join(["The Lagrangian, T - V:", lagrangian, "and what follows from it:", *motion])
+
+
+def _equations(task: Task) -> str:
+    text = derivation(task.scene)
+    if len(task.scene._layout.free) == 1:
+        numbers = equations.mathml(equations.with_numbers(task.scene))
+        text += f"\n\nWith the default parameters, in SI units:\n\n{numbers}"
+    return text
+
+
+def _state(task: Task) -> str:
+    pairs = zip(task.scene.state_names, task.scene.state_units, strict=True)
+    listed = ", ".join(f"`{name}` [{unit}]" for name, unit in pairs)
+    return f"State, float64, `env.unwrapped.state`: {listed}."
+
+
+def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> str:
+    speed, texts = task.certified_speed(), []
+    if speed is not None and speed >= 0.0:
+        order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
+        rate = f"{task.scene._layout.free[0]}_dot"
+        texts.append(
+            f"Stepped by a Taylor series of order {order}. One series per step is certified to leave out "
+            f"at most 1e-12 rad/s as long as |`{rate}`| is at most {math.floor(10.0 * speed) / 10.0:.1f} "
+            "rad/s, whatever the control. Above that the step is divided, by the same bound."
+        )
+    for row in _summary_rows(accuracy, "environments"):
+        if row["environment"] == env_id:
+            texts.append(
+                "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
+                f"error of a single step is {row['one step']:.1e} of the state's size, that of an episode "
+                f"{row['whole episode']:.1e}, which is {number(row['over rounding'])} times what one "
+                "rounding of the start grows to by itself. See [Accuracy](../accuracy.md)."
+            )
+    return "\n\n".join(texts)
+
+
+def _summary_rows(accuracy: Mapping[str, Any] | None, section: str) -> list[dict[str, Any]]:
+    for part in (accuracy or {}).get("sections", ()):
+        if part["name"] == section:
+            return [
+                dict(zip(part["summary"]["columns"], row, strict=True)) for row in part["summary"]["rows"]
+            ]
+    return []
+
+
+def _returns(env_id: str) -> str:
+    found = measured(env_id)
+    if not found:
+        return ""
+    best = found["scale"]["policy"]
+    names = {"random": "random actions", "zero": "zero control", best: f"{best}, the best policy known"}
+    names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
+    rows = [
+        [text, plus_minus(row["mean"], row["error"]), f"{row['episodes']:,}" if "episodes" in row else ""]
+        for name, text in names.items()
+        if (row := found["measured"].get(name))
+    ]
+    text = "Mean return ± standard error, as `python -m agents.scale` measured them:"
+    return f"{text}\n\n{table(['Policy', 'Return', 'Episodes'], rows)}"
+
+
+def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
+    texts = [task.note.strip()] if task.note else []
+    if board and board["rows"]:
+        ranked = [row for row in board["rows"] if row["rank"] is not None][:TOP]
+        rows = [
+            [str(row["rank"]), plain(row["name"]), row["kind"], f"{row['score']:.4f}", _interval(row)]
+            for row in ranked
+        ]
+        texts += [
+            "The top of the leaderboard (0 is random actions, 1 the best policy known when the protocol "
+            "began):",
+            table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
+            f"[Watch them, and see the whole ranking](../board/{env_id}.html). [Agents](../agents.md#"
+            f"{env_id.lower()}) has their robustness and learning curves.",
+        ]
+    return "\n\n".join(texts)
+
+
+def _interval(row: Mapping[str, Any]) -> str:
+    low, high = row["interval"]
+    return f"{low:.4f} to {high:.4f}"
+
+
+# --- what pages are made from -------------------------------------------------------------------------------
+
+
+def pages(root: Path = ROOT) -> dict[str, str]:
+    """Return the pages of all environments by id, from a checkout."""
+    from lag_envs.leaderboard.board import Board, board_data
+
+    accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
+    data = board_data(Board(root / "leaderboard"))
+    boards = {one["id"]: one for one in data["environments"] if not one["frozen"]}
+    return {env_id: page(env_id, boards.get(env_id), accuracy) for env_id in TASKS}

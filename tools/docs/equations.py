@@ -1,0 +1,124 @@
+"""A scene's formulas as LaTeX, derived by SymPy from its Lagrangian, and LaTeX as MathML.
+
+Browsers draw MathML themselves, so a page needs neither a script nor a font for its formulas.
+"""
+
+from __future__ import annotations
+
+import re
+from html import escape
+from typing import Any
+
+import sympy
+from latex2mathml.converter import convert
+
+from lag_envs.scenes import Scene, symbolic
+from tools.docs.markdown import described, groups
+
+#: A letter by itself, which is the symbol that a docstring gives a parameter: "Mass m of the bar."
+LETTER = re.compile(r"(?<![\w'/=])[A-Zb-zα-ωΑ-Ω](?![\w'/(=²])")
+
+
+def symbol(scene: type[Scene], name: str) -> str:
+    r"""Return a parameter's symbol in LaTeX: the letter in its description, or its name.
+
+    Examples
+    --------
+    >>> from lag_envs.scenes import Acrobot, PivotedBar
+    >>> symbol(PivotedBar, "com_distance"), symbol(Acrobot, "mass_1")
+    ('L', 'm_{1}')
+    """
+    found = LETTER.search(described(scene).get(name, ""))
+    if not found:
+        return _word(name)
+    together = [one.split("_") for one in groups(scene)[name]]
+    own = [part for part in name.split("_") if not all(part in parts for parts in together)]
+    letter = sympy.latex(sympy.Symbol(found[0]))
+    return f"{letter}_{{{','.join(own)}}}" if own else letter
+
+
+def lagrangian(scene: Scene) -> str:
+    """Return T - V."""
+    return rf"\mathcal{{L}} = {_latex(scene, symbolic.lagrangian(scene))}"
+
+
+def equations(scene: Scene) -> list[str]:
+    """Return the equations of motion: Lagrange's, one for each free coordinate, without denominators."""
+    found = []
+    for name in scene._layout.free:
+        equation = sympy.simplify(symbolic.euler_lagrange(scene, name))
+        numerator = sympy.expand(sympy.fraction(sympy.together(equation))[0])
+        common = sympy.Mul(*(f for f in sympy.Mul.make_args(sympy.factor_terms(numerator)) if not f.is_Add))
+        tidy = sympy.collect(sympy.expand(numerator / common), _accelerations(scene), _short)
+        found.append(f"{_latex(scene, tidy)} = 0")
+    return found
+
+
+def with_numbers(scene: Scene) -> str:
+    """Return the acceleration of the only free coordinate with the scene's numbers in place of symbols."""
+    (name,) = scene._layout.free
+    acceleration = sympy.Function(name, real=True)(symbolic.t).diff(symbolic.t, 2)
+    equation = sympy.simplify(symbolic.euler_lagrange(scene, name))
+    numbers = {s: getattr(scene, s.name) for s in equation.free_symbols if s.name in scene._numbers()}
+    equation = sympy.expand(equation.xreplace({s: sympy.Rational(repr(x)) for s, x in numbers.items()}))
+    factor = sympy.simplify(equation.diff(acceleration))
+    rest = sympy.expand(acceleration - equation / factor)
+    return f"{_latex(scene, acceleration)} = {_latex(scene, rest.evalf(5))}"
+
+
+def _short(coefficient: Any) -> Any:
+    return sympy.factor(sympy.simplify(coefficient)) if not coefficient.atoms(sympy.Function) else coefficient
+
+
+def _accelerations(scene: Scene) -> list[Any]:
+    return [sympy.Function(q, real=True)(symbolic.t).diff(symbolic.t, 2) for q in scene._layout.names]
+
+
+def _latex(scene: Scene, expression: Any) -> str:
+    """Print an expression: dots for derivatives in time, and the letters of the scene's docstring.
+
+    The symbols' names put factors into an order: parameters as they are declared, then the motion.
+    """
+    t, steps, shown = symbolic.t, [{}, {}, {}, {}], {}
+
+    def take(step: int, what: Any, name: str, latex: str) -> None:
+        steps[step][what] = symbol = sympy.Symbol(name)
+        shown[symbol] = latex
+
+    for i, name in enumerate(scene._layout.names):
+        place, letter = sympy.Function(name, real=True)(t), sympy.latex(sympy.Symbol(name))
+        head, index, rest = letter.partition("_")
+        take(0, place.diff(t, 2), f"x{i}", rf"\ddot{{{head}}}{index}{rest}")
+        take(1, place.diff(t), f"w{i}", rf"\dot{{{head}}}{index}{rest}")
+        take(2, place, f"v{i}", letter)
+    for i, name in enumerate(scene._layout.controls):
+        take(2, sympy.Function(name, real=True)(t), f"u{i}", _word(name))
+    order = {name: i for i, name in enumerate(scene._numbers())}
+    for known in expression.free_symbols:
+        if known.name in order:
+            take(3, known, f"a{order[known.name]:02}", symbol(type(scene), known.name))
+    for step in steps:  # derivatives before what they are of
+        expression = expression.xreplace(step)
+    latex = sympy.latex(expression, symbol_names=shown, fold_func_brackets=True)
+    return latex.replace(r"\left", "").replace(r"\right", "")
+
+
+def _word(name: str) -> str:
+    return rf"\mathrm{{{name}}}".replace("_", r"\ ")
+
+
+def mathml(latex: str, block: bool = True) -> str:
+    """Return a formula as MathML that carries its LaTeX; as a block it can be scrolled sideways."""
+    element = convert(latex, display="block" if block else "inline")
+    head, body = re.fullmatch(r"(<math[^>]*>)(.*)</math>", element, re.DOTALL).groups()  # type: ignore[union-attr]
+    # A letter after the other, upright, is a word.
+    body = re.sub(
+        r'(?:<mi mathvariant="normal">[a-z]</mi>|<mtext>&#x000A0;</mtext>){2,}',
+        lambda word: "<mtext>" + re.sub(r"<[^>]+>", "", word[0]) + "</mtext>",
+        body,
+    )
+    space = '<mspace width="0.17em"></mspace>'
+    body = re.sub(r"<mi>(sin|cos|tan|atan)</mi>", rf"{space}\g<0>{space}", body)
+    source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
+    whole = f"{head}<semantics><mrow>{body}</mrow>{source}</semantics></math>"
+    return f'<div class="equation" tabindex="0">{whole}</div>' if block else whole

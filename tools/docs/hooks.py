@@ -1,0 +1,108 @@
+"""What MkDocs calls while it builds the site: it adds generated pages, the root's files and the board."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.nav import Link, Navigation
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT / "src"), str(ROOT)]
+
+#: Files of the checkout that are pages of the site too.
+ROOT_FILES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "NOTICE.md": "notice.md"}
+SOURCE = "https://github.com/lag-envs/lag-envs/blob/main/"
+#: Where the leaderboard's page is, and the folder of the environments' pages.
+BOARD, ENVIRONMENTS = "board", "environments"
+
+
+@cache
+def board() -> dict[str, Any]:
+    """Return what the leaderboard's page is made from."""
+    from lag_envs.leaderboard.board import Board, board_data
+
+    return board_data(Board(ROOT / "leaderboard"))
+
+
+@cache
+def generated() -> dict[str, str]:
+    """Return the pages that are generated, by their place in the site."""
+    from tools.docs import environments, scenes
+
+    found = {f"{ENVIRONMENTS}/{env_id}.md": text for env_id, text in environments.pages(ROOT).items()}
+    found[f"{ENVIRONMENTS}/index.md"] = environments.index()
+    found["scenes.md"] = scenes.page()
+    return found
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """List the environments in the navigation."""
+    from lag_envs.tasks import TASKS
+
+    for entry in config.nav or ():
+        if "Environments" in entry:
+            entry["Environments"] += [{env_id: f"{ENVIRONMENTS}/{env_id}.md"} for env_id in TASKS]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages, and those of the root."""
+    texts = generated() | {
+        place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
+    }
+    for place, content in (texts | board_pages(config)).items():
+        files.append(File.generated(config, place, content=content))
+    return files
+
+
+def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
+    """Return the files of the board's page, with the site's sections in its head."""
+    from lag_envs.leaderboard.site.build import render
+
+    sections = []
+    for entry in config.nav or ():
+        ((title, pages),) = entry.items()
+        first = pages[0] if isinstance(pages[0], str) else next(iter(pages[0].values()))
+        sections.append((title, "../" + first.removesuffix("md") + "html"))
+    pages, files = render(board(), f"{config.site_url}{BOARD}/", sections)
+    return {f"{BOARD}/{name}": content for name, content in (pages | files).items()}
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Point links that leave the folder docs, and those of the root's files, to the site or to the source."""
+    at_root = {place: name for name, place in ROOT_FILES.items()}
+    here = at_root.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+
+    def link(found: re.Match) -> str:
+        target, mark, anchor = found[1].partition("#")
+        if re.match(r"[a-z]+:", target) or not target:
+            return found[0]
+        place = posixpath.normpath(posixpath.join(posixpath.dirname(here), target))
+        if (place, anchor) == ("README.md", ENVIRONMENTS):
+            place, mark, anchor = f"{ENVIRONMENTS}/index.md", "", ""
+        elif place in ROOT_FILES:
+            place = ROOT_FILES[place]
+        elif place.startswith("docs/"):
+            place = place.removeprefix("docs/")
+        elif (ROOT / place).exists():
+            return f"]({SOURCE}{place}{mark}{anchor})"
+        back = posixpath.relpath(place, posixpath.dirname(page.file.src_uri) or ".")
+        return f"]({back}{mark}{anchor})"
+
+    return re.sub(r"\]\(([^)\s]+)\)", link, markdown)
+
+
+def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
+    """Add the board, which is built beside the pages."""
+    for section in nav.items:
+        if section.title == "Leaderboard" and section.children is not None:
+            section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
+    return nav

@@ -1,0 +1,84 @@
+"""Small parts of Markdown pages: tables, docstrings cut at their headings, numbers."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    r"""Return a table.
+
+    Examples
+    --------
+    >>> print(table(["a", "b"], [["1", "x | y"]]))
+    | a | b |
+    | --- | --- |
+    | 1 | x \| y |
+    """
+    lines = [list(head), ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def sections(kind: type) -> dict[str, str]:
+    """Return a docstring's text by its ``##`` headings; what comes before them goes by the empty heading."""
+    parts = re.split(r"^## (.+)$", inspect.getdoc(kind) or "", flags=re.MULTILINE)
+    return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
+
+
+def number(value: float) -> str:
+    """Return a number as a reader writes it.
+
+    Examples
+    --------
+    >>> [number(x) for x in (0.02, 1e-06, 100000.0, 1e9, 3.14159265, math.inf, -0.0)]
+    ['0.02', '1e-6', '100000', '1e9', '3.1416', '∞', '0']
+    """
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "-∞"
+    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value + 0.0:.5g}").replace(
+        "1e5", "100000"
+    )
+
+
+def plus_minus(mean: float, error: float) -> str:
+    """Return a mean with its standard error, which decides the digits.
+
+    Examples
+    --------
+    >>> plus_minus(418.987, 0.0117), plus_minus(0.000165, 0.0)
+    ('418.987 ± 0.012', '0.0002 ± 0.0000')
+    """
+    digits = 4 if error <= 0.0 else max(0, 1 - math.floor(math.log10(error)))
+    return f"{mean:.{min(digits, 6)}f} ± {error:.{min(digits, 6)}f}"
+
+
+def described(kind: type) -> dict[str, str]:
+    """Return what a numpydoc docstring says of each of its parameters."""
+    text = inspect.getdoc(kind) or ""
+    block = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
+    found: dict[str, str] = {}
+    for names, body in re.findall(
+        r"^(\w[\w, ]*) : [^\n]*\n((?:    [^\n]*\n?|\n)+)", block[1] if block else "", re.MULTILINE
+    ):
+        words = " ".join(body.split())
+        found |= dict.fromkeys(re.split(r", *", names), words)
+    return found
+
+
+def groups(kind: type) -> dict[str, list[str]]:
+    """Return, for each documented parameter, the names that share its entry."""
+    text = inspect.getdoc(kind) or ""
+    found: dict[str, list[str]] = {}
+    for names in re.findall(r"^(\w[\w, ]*) : ", text, re.MULTILINE):
+        listed = re.split(r", *", names)
+        found |= dict.fromkeys(listed, listed)
+    return found
+
+
+def cell(value: Any) -> str:
+    """Return a default value as a reader types it."""
+    return number(value) if isinstance(value, float) else repr(value)

@@ -1,0 +1,63 @@
+"""Moving pictures of the environments: a recorded episode of the board's best learned agent, as WebP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from lag_envs.envs.rendering import Viewer
+from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.tasks import TASKS
+
+#: Pictures a second, and the largest file [bytes].
+RATE, LARGEST = 15, 300_000
+#: Widths [pixels], qualities, and which pictures are kept; the first that makes a file small enough is taken.
+CHOICES = ((480, 60, 1), (480, 40, 1), (400, 40, 1), (360, 30, 1), (360, 30, 2), (320, 20, 3))
+
+
+def draw(board: Path, folder: Path) -> None:
+    """Draw every environment of a board that has a learned agent, or else its best one."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for found in board_data(Board(board))["environments"]:
+        rows = [row for row in found["rows"] if row["replays"] and row["rank"] is not None]
+        learned = [row for row in rows if row["kind"] == "learned"]
+        if not found["frozen"] and rows and found["id"] in TASKS:
+            row = (learned or rows)[0]
+            path = folder / f"{found['id']}.webp"
+            write(path, *frames(found["id"], row["replays"][0]))
+            print(f"{path.name}: {row['name']}, {path.stat().st_size:,} bytes")
+
+
+def frames(env_id: str, replay: Mapping[str, Any]) -> tuple[list[Image.Image], float]:
+    """Return pictures of a recorded episode, and the seconds between them."""
+    task = TASKS[env_id]()
+    viewer = Viewer(task, "rgb_array")
+    controls = task.wanted(replay["actions"])
+    every = max(1, round(1.0 / (RATE * task.dt)))
+    target = replay.get("target")
+    pictures = []
+    for i, state in enumerate(replay["states"]):
+        control = controls[min(i, len(controls) - 1)]
+        picture = viewer.draw(
+            np.array(state, np.float64), control if len(control) > 1 else float(control[0]), target
+        )
+        if i % every == 0 and picture is not None:
+            pictures.append(Image.fromarray(picture))
+    return pictures, every * task.dt
+
+
+def write(path: Path, pictures: list[Image.Image], seconds: float) -> None:
+    """Write an animation that loops, in the best quality that is not too large."""
+    for width, quality, every in CHOICES:
+        size = width, round(pictures[0].height * width / pictures[0].width)
+        first, *rest = (picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures[::every])
+        first.save(
+            path, save_all=True, append_images=rest, duration=round(1000 * seconds * every), loop=0,
+            quality=quality, method=3,
+        )  # fmt: skip
+        if path.stat().st_size <= LARGEST:
+            return

@@ -1,0 +1,75 @@
+"""The page of all scenes, generated from their classes."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+
+from lag_envs.scenes import SCENES, Scene
+from tools.docs.environments import derivation, parameters
+from tools.docs.equations import mathml, symbol
+from tools.docs.markdown import cell, described, table
+
+
+def page() -> str:
+    """Return the page."""
+    parts = [
+        "# Scenes",
+        "A scene states its kinetic and potential energy, its drag and its applied forces. Everything on "
+        "this page follows from them: SymPy derives the formulas below from the energies that are "
+        "stepped. [Physics](physics.md) says more about the first three, [the tutorial](tutorial.md) how "
+        "to write one.",
+        table(["scene", "", "state", "control"], [_row(kind) for kind in SCENES]),
+    ]
+    for kind in SCENES:
+        parts += [f"## {kind.__name__}", *_scene(kind)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _row(kind: type[Scene]) -> list[str]:
+    scene = kind()
+    return [
+        f"[{kind.__name__}](#{kind.__name__.lower()})",
+        _summary(kind),
+        ", ".join(f"`{name}`" for name in scene.state_names),
+        ", ".join(f"`{name}`" for name in scene.control_names),
+    ]
+
+
+def _summary(kind: type[Scene]) -> str:
+    return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
+
+
+def _scene(kind: type[Scene]) -> list[str]:
+    scene, words = kind(), described(kind)
+    rows = []
+    for field in parameters(kind):
+        letter = mathml(symbol(kind, field.name), block=False) if field.name in scene._numbers() else ""
+        default = cell(getattr(scene, field.name))
+        rows.append(
+            [f"`{field.name}`", letter, default, field.metadata.get("unit", ""), words.get(field.name, "")]
+        )
+    units = zip(scene.control_names, scene.control_units, strict=True)
+    return [
+        f"{_summary(kind)}.",
+        f"```text\n{_drawing(kind)}\n```",
+        _notes(kind),
+        f"Controls: {', '.join(f'`{name}` [{unit}]' for name, unit in units)}.",
+        table(["parameter", "symbol", "default", "unit", "meaning"], rows),
+        derivation(scene),
+        f"[API](api/scenes.md#lag_envs.scenes.{kind.__name__})",
+    ]
+
+
+def _drawing(kind: type[Scene]) -> str:
+    """Return the drawing at the head of the scene's file."""
+    text = sys.modules[kind.__module__].__doc__ or ""
+    drawing = re.search(r"^::\n\n((?:[ ]{4}[^\n]*\n|\n)+)", text, re.MULTILINE)
+    return inspect.cleandoc("\n" + drawing[1]) if drawing else ""
+
+
+def _notes(kind: type[Scene]) -> str:
+    text = inspect.getdoc(kind) or ""
+    notes = re.search(r"^Notes\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
+    return notes[1].strip().replace("``", "`") if notes else ""
