@@ -59,7 +59,7 @@ def page(
     env_id : str
         Its id.
     board : mapping, optional
-        The environment's part of `lag_envs.leaderboard.board.board_data`.
+        The environment's part of `lag_envs.leaderboard.standings.board_data`.
     accuracy : mapping, optional
         What ``docs/accuracy.json`` holds.
     """
@@ -355,7 +355,8 @@ def _interval(row: Mapping[str, Any]) -> str:
 
 def pages(root: Path = ROOT) -> dict[str, str]:
     """Return the pages of all environments by id, from a checkout."""
-    from lag_envs.leaderboard.board import Board, board_data
+    from lag_envs.leaderboard.board import Board
+    from lag_envs.leaderboard.standings import board_data
 
     accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
     data = board_data(Board(root / "leaderboard"))

@@ -27,9 +27,10 @@ BOARD, ENVIRONMENTS = "board", "environments"
 @cache
 def board() -> dict[str, Any]:
     """Return what the leaderboard's page is made from."""
-    from lag_envs.leaderboard.board import Board, board_data
+    from lag_envs.leaderboard.board import Board
+    from lag_envs.leaderboard.standings import page_data
 
-    return board_data(Board(ROOT / "leaderboard"))
+    return page_data(Board(ROOT / "leaderboard"))
 
 
 @cache

@@ -10,7 +10,8 @@ import numpy as np
 from PIL import Image
 
 from lag_envs.envs.rendering import Viewer
-from lag_envs.leaderboard.board import Board, board_data
+from lag_envs.leaderboard.board import Board
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.tasks import TASKS
 
 #: Pictures a second, and the largest file [bytes].

@@ -351,6 +351,8 @@ class Table(Architecture):
             if minus:
                 row[-2] = -1.0
         self.mirror = self.axes.index(mirror) if mirror else None
+        #: Of an action in the mirror image; a control that is zero at an end of its range has no sign.
+        self.sign = 1.0 if abs(self.task.rest_action) == 1.0 else -1.0
         self.arrays = {f"axis_{j}": (f"n{j}",) for j in range(len(self.axes))}
         self.arrays["table"] = tuple(f"n{j}" for j in range(len(self.axes)))
 
@@ -410,12 +412,10 @@ class _LookUp(Clocked):
     def __init__(self, task: Task, grid: _Grid) -> None:
         super().__init__(task)
         self.grid = grid
-        # A control that is zero at an end of its range, such as a drag, has no sign.
-        self.sign = 1.0 if abs(task.rest_action) == 1.0 else -1.0
 
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
         found, mirrored = self.grid.look_up(states, targets, taken)
-        return np.where(mirrored, self.sign * found, found)
+        return np.where(mirrored, self.grid.about.sign * found, found)
 
 
 # --- controllers --------------------------------------------------------------------------------------------

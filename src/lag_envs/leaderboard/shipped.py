@@ -80,8 +80,8 @@ class Candidate(NamedTuple):
 def candidates(board: Any) -> list[Candidate]:
     """Return the verified policies of a board that have arrays."""
     from lag_envs.leaderboard.protocol import reference
-    from lag_envs.leaderboard.ranking import corrected, normalised
-    from lag_envs.scores import known_returns
+    from lag_envs.leaderboard.ranking import corrected
+    from lag_envs.scores import known_returns, normalised
     from lag_envs.tasks import TASKS
 
     found = []

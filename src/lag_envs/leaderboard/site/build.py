@@ -81,7 +81,7 @@ def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     Parameters
     ----------
     data : Mapping
-        What `lag_envs.leaderboard.board.board_data` returns.
+        What `lag_envs.leaderboard.standings.page_data` returns.
     out : Path
         Folder of the page; made if it does not exist.
     url : str, optional

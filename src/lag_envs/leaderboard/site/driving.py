@@ -191,7 +191,7 @@ def agent(policy: Policy) -> dict[str, Any] | None:
             "sums": made.sums.tolist(),
             "axes": list(made.axes),
             "mirror": made.mirror,
-            "sign": agent.sign,
+            "sign": made.sign,
             "actions": made.actions,
             "wrapped": agent.read.wrapped,
             "interval": made.task.interval,
