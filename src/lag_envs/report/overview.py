@@ -92,9 +92,9 @@ def findings(accuracy: dict[str, Any]) -> list[str]:
         ]
         counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
         texts.append(
-            f"To an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons on the "
-            f"package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies (alone "
-            "and in a batch)."
+            f"To an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons "
+            f"on the package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies "
+            "(alone and in a batch)."
         )
     row = list(_rows(accuracy, "general", modes[0], system=SYSTEM))[-1]
     if row["MuJoCo"] is not None:
