@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from rollouts import IDS, make
+from rollouts import IDS, RENDERS, make
 
 from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
@@ -300,6 +300,17 @@ def test_moving_pictures_are_small_and_move():
         assert path.stat().st_size <= pictures.LARGEST
         with Image.open(path) as picture:
             assert picture.n_frames > 20
+
+
+@pytest.mark.skipif(not RENDERS, reason="pygame is not installed")
+def test_a_replay_becomes_a_moving_picture(tmp_path):
+    env_id = pivoted_bar.SwingUp.id
+    states = [[0.0, 0.0, 0.1 * i, 0.5] for i in range(13)]
+    replay = {"states": states, "actions": [[0.5]] * 12, "target": None}
+    frames, seconds = pictures.frames(env_id, replay)
+    pictures.write(tmp_path / "a.webp", frames, seconds)
+    with Image.open(tmp_path / "a.webp") as picture:
+        assert picture.n_frames == len(frames) == 5 and picture.width == pictures.CHOICES[0][0]
 
 
 #: Pages for readers of the repository; the site has more (`test_docs_site.py`), and its home links to them.

@@ -7,6 +7,7 @@ import warnings
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
+from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -128,6 +129,19 @@ def test_what_is_bundled_is_noticed(site):
     for name in ("Material for MkDocs", "iframe-worker", "lunr", "RxJS", "clipboard.js", "Icons"):
         assert name in notice
     assert not list(site.rglob("*.woff*")) and not list(site.rglob("*.ttf"))
+
+
+def test_formulas_are_whole(site):
+    """Each element has the number of parts that it asks for, and each formula carries its LaTeX."""
+    parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "msubsup": 3}
+    found = []
+    for name in ("scenes.html", *(f"environments/{env_id}.html" for env_id in TASKS)):
+        found += re.findall(r"<math.*?</math>", (site / name).read_text("utf-8"), re.DOTALL)
+    assert len(found) > 3 * len(TASKS)
+    for formula in map(ElementTree.fromstring, found):
+        elements = [(element.tag.rpartition("}")[2], element) for element in formula.iter()]
+        assert all(len(element) == parts.get(tag, len(element)) for tag, element in elements)
+        assert [element.text for tag, element in elements if tag == "annotation"]
 
 
 def test_symbols_are_those_of_the_docstrings():

@@ -239,6 +239,12 @@ def test_compact_form(written, tmp_path, monkeypatch):
     assert (tmp_path / "docs" / "accuracy.md").read_text(encoding="utf-8") == page
 
 
+def test_without_a_report_or_its_compact_form(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert docs.main([]) == 2
+    assert "docs/accuracy.json is not there; name a report's folder" in capsys.readouterr().err
+
+
 def test_broken_off_report_is_not_taken_over(written, tmp_path, capsys):
     found = json.loads((written / "report.json").read_text(encoding="utf-8")) | {"complete": False}
     (tmp_path / "report.json").write_text(json.dumps(found))

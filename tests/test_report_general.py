@@ -189,7 +189,7 @@ def test_what_is_missing_is_said_and_no_error(monkeypatch):
         )
     )
     assert [row["problem"] for row in rows] == ["heyoka is not installed"]
-    assert "Not taken part: heyoka is not installed." in general_results.content(rows, []).text
+    assert "Not compared: heyoka is not installed." in general_results.content(rows, []).text
 
 
 def test_certificates_of_a_scene():

@@ -118,7 +118,7 @@ def mathml(latex: str, block: bool = True) -> str:
         body,
     )
     space = '<mspace width="0.17em"></mspace>'
-    body = re.sub(r"<mi>(sin|cos|tan|atan)</mi>", rf"{space}\g<0>{space}", body)
+    body = re.sub(r"<mi>(sin|cos|tan|atan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
     source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
     whole = f"{head}<semantics><mrow>{body}</mrow>{source}</semantics></math>"
     return f'<div class="equation" tabindex="0">{whole}</div>' if block else whole

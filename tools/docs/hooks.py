@@ -102,8 +102,9 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
-    """Add the board, which is built beside the pages."""
+    """Add the board, which is built beside the pages, and the guide to it."""
     for section in nav.items:
         if section.title == "Leaderboard" and section.children is not None:
             section.children.insert(0, Link("Board", f"{BOARD}/index.html"))
+            section.children.append(Link("How to submit", "contributing.html#submit-to-the-leaderboard"))
     return nav

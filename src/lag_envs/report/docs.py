@@ -114,6 +114,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     args = parser.parse_args(arguments)
     if args.report is None:
+        stored = args.project / "docs" / "accuracy.json"
+        if not stored.is_file():
+            print(f"{stored} is not there; name a report's folder", file=sys.stderr)
+            return 2
         update(args.project)
         return 0
     found = json.loads((args.report / FILE).read_text(encoding="utf-8"))

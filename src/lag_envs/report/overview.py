@@ -5,6 +5,7 @@ It is drawn from ``docs/accuracy.json`` alone, so it can be drawn again without 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -91,17 +92,21 @@ def findings(accuracy: dict[str, Any]) -> list[str]:
         ]
         counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
         texts.append(
-            f"To an error of {error:g}, a rival is faster in {faster[0]} of {counts[0]} comparisons on the "
-            f"package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies (alone "
-            "and in a batch)."
+            f"To an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons "
+            f"on the package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies "
+            "(alone and in a batch)."
         )
     row = list(_rows(accuracy, "general", modes[0], system=SYSTEM))[-1]
     if row["MuJoCo"] is not None:
         texts.append(
-            f"A general simulator pays for its generality: at {float(row['error']):g} MuJoCo takes "
+            f"A general simulator pays for its generality: at {_power(row['error'])} MuJoCo takes "
             f"{row['MuJoCo'] / row[OURS]:,.0f} times as long as ours on the right."
         )
     return texts
+
+
+def _power(error: float | str) -> str:
+    return f"1e{round(math.log10(float(error)))}"
 
 
 def _fastest(points: Points) -> Points:
