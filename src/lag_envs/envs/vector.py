@@ -148,9 +148,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._over = 0
         #: Steps and sums of rewards of the episodes, where they are to be seen.
         self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
-        self._seen = render_mode is not None and bool(
-            show_readout or show_trail or self.scene._layout.left_out
-        )
+        self._seen = render_mode is not None and bool(show_readout or show_trail)
 
     def _compile(self) -> None:
         first = self._constants[0]
