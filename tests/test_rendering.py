@@ -597,6 +597,12 @@ def test_a_trail_is_of_the_seconds_that_are_asked_for_and_of_one_episode():
     env.reset(seed=1)
     env.render()
     assert len(env._viewer._trail) == 1
+    for _ in range(2):  # also where pictures are taken late
+        env.reset()
+        for _ in range(30):
+            env.step(np.ones(1, np.float32))
+        env.render()
+        assert len(env._viewer._trail) == 1
     # A bar's tip, a cylinder's axis.
     assert rendering.tips(env._viewer._picture)[env._viewer._picture.frames.index("bar")] == pytest.approx(
         (0.0, -0.621), abs=0.03

@@ -413,7 +413,9 @@ def run_watch(args: argparse.Namespace) -> int:
 
     id, task = _shown(args)
     board = Path("leaderboard") if args.board is None else args.board
-    if args.board is None and not (board / "board.jsonl").is_file():
+    if not (board / "board.jsonl").is_file():
+        if args.board is not None:
+            raise UserError(f"--board: there is no board in {args.board}")
         board = None
     try:
         name, agent = watch.load(id, task, args.agent, board)
@@ -421,6 +423,8 @@ def run_watch(args: argparse.Namespace) -> int:
         print(f"{id}: {name}", flush=True)
         limits = {"episodes": args.episodes, "steps": args.steps, "video": args.video}
         watch.watch(id, agent, seed=seed, **limits, **_look(args))
+        if args.video is not None:
+            print(f"{args.video} is written")
     except ValueError as error:
         raise UserError(str(error)) from error
     except Error as error:

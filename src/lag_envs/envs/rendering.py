@@ -157,7 +157,7 @@ class Viewer:
         self._trail: deque[list[Point]] = deque(maxlen=max(2, round(self._look.trail / task.dt) + 1))
         self._turned: Any = 0.0
         self._before: tuple[list[float], NDArray[np.float64]] | None = None
-        self._steps = 0
+        self._steps, self._episode = 0, 0
         self._human = mode == "human"
         self._due = self._shown = -math.inf
         if self._human or self._look.readout:
@@ -172,6 +172,7 @@ class Viewer:
         target: Any,
         steps: int = 0,
         total: float = 0.0,
+        episode: int = 0,
     ) -> NDArray[np.uint8] | None:
         """Paint a state.
 
@@ -184,9 +185,11 @@ class Viewer:
         target : float, sequence of float or None
             The episode's targets.
         steps : int
-            Steps of the episode so far; where they are fewer than before another one has begun.
+            Steps of the episode so far.
         total : float
             Sum of its rewards so far.
+        episode : int
+            A number that another episode has not.
 
         Returns
         -------
@@ -195,10 +198,11 @@ class Viewer:
         """
         if self._human and self not in _desk:
             return None
-        if steps < self._steps:
+        if episode != self._episode or steps < self._steps:
             self._turned, self._before = 0.0, None
             self._trail.clear()
-        again, self._steps = steps == self._steps and self._before is not None, steps
+        again = steps == self._steps and self._before is not None
+        self._episode, self._steps = episode, steps
         values = state.tolist()
         self._turn(values)
         now = Frame(values, control, self._task.share(control), target, self._turned)

@@ -216,7 +216,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
             self._viewer = Viewer(self.task, self.render_mode, self._look)
         steps = int(self._rows[self._row["n"]])
-        return self._viewer.draw(self.state, self.control, self.target, steps, self._total)
+        episode = int(self._ids[2])
+        return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode)
 
     def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
         """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""

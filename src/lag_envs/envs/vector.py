@@ -148,9 +148,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._over = 0
         #: Steps and sums of rewards of the episodes, where they are to be seen.
         self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
-        self._seen = render_mode is not None and bool(
-            show_readout or show_trail or self.scene._layout.left_out
-        )
+        self._seen = render_mode is not None and bool(show_readout or show_trail)
 
     def _compile(self) -> None:
         first = self._constants[0]
@@ -301,8 +299,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._viewers:
             self._viewers = self._make_viewers()
         targets = self.target if self.target is not None else [None] * self.num_envs
-        shown = zip(self._viewers, self.state, self.control, targets, self._steps, self._totals, strict=False)
-        pictures = tuple(v.draw(s, u, g, int(n), float(r)) for v, s, u, g, n, r in shown)
+        of_each = (self.state, self.control, targets, self._steps.tolist(), self._totals.tolist())
+        episodes = self._ids[2 * self.num_envs :].tolist()
+        pictures = tuple(
+            viewer.draw(*now) for viewer, *now in zip(self._viewers, *of_each, episodes, strict=False)
+        )
         if self._tiles is None:
             return pictures
         from lag_envs.envs.rendering import columns_of, tiled
