@@ -1,5 +1,9 @@
 """The unfused step: against the fused one, and against the other ways to carry it out."""
 
+import os
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -9,6 +13,7 @@ from own_tasks import TASKS as OWN
 import lag_envs
 from lag_envs.envs.unfused import Unfused
 from lag_envs.scenes import StepRefused
+from lag_envs.scenes.shapes import Circle
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import LARGEST, Script
 from lag_envs.tasks import TASKS
@@ -139,3 +144,34 @@ def test_names_do_not_meet_when_changed_at_once():
     script = Script()
     with pytest.raises(AssertionError, match="would be overwritten"):
         script.loop(0, 3, [1.0, 2.0], lambda k, carried: carried[::-1])
+
+
+class Odd(OWN[2]):
+    """Its arrow is placed by what is no arithmetic on the state."""
+
+    id = "OwnOdd-v0"
+
+    def bodies(self):
+        return {"arrow": [Circle((0.0, 0.0), 1.0)]}
+
+    def indicators(self, now, xp):
+        return {"arrow": (float(now.q.theta), 0.0)}
+
+
+def test_a_picture_that_cannot_be_printed_is_left_out():
+    env = Unfused(Odd())
+    env.reset(1)
+    env.step([])
+    assert env.poses() == [] and env.program.frames == []
+
+
+def test_scripts_do_not_depend_on_the_process():
+    code = "from lag_envs.envs.unfused import UnfusedProgram as U; from lag_envs.tasks import TASKS as T;"
+    code += "print(*(U(T[id]()).digest for id in sorted(T)))"
+    seen = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, stdout=-1, check=True
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert len(seen) == 1

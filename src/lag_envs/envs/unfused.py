@@ -317,11 +317,15 @@ class UnfusedProgram:
             return [x for pose in found.values() for x in pose]
 
         given = [self._read(t, part) for part in (slice(0, n), rows.g, rows.u, rows.turned)]
-        try:
-            found = self._run(t, partial(poses, True), *given)
-        except (TypeError, FormulaError):  # something else than arithmetic is done with the parameters
-            found = self._run(t, partial(poses, False), *given)
-        self._write(t, 0, found, "p")
+        # Where something else than arithmetic is done with the parameters, they stay as they are; where it is
+        # done with the state, there is no picture.
+        for own in (True, False):
+            try:
+                self._write(t, 0, self._run(t, partial(poses, own), *given), "p")
+                return
+            except (AttributeError, TypeError, ValueError, FormulaError):
+                pass
+        self.frames = []
 
 
 class _Numbers:
