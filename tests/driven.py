@@ -1,10 +1,22 @@
 """Actions for episodes of the unfused step."""
 
+import math
+
 import numpy as np
+from own_tasks import Switched
 
 from lag_envs.controllers import build as make
 from lag_envs.controllers import controllers
 from lag_envs.envs.actions import Actions
+
+
+class Six(Switched):
+    """A chain so long that its script is cut into several functions."""
+
+    id = "OwnSix-v0"
+    defaults = {"bars": 6, "mass": 0.1, "length": 0.2}
+    steps = 20
+    start = {f"theta_{i}": (math.pi, 0.3) for i in range(1, 7)}
 
 
 def at_random(task, seed):

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import until
-from driven import at_random, by_agent
+from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
 from lag_envs import cli, replay
@@ -67,7 +67,7 @@ def bare(tmp_path_factory):
     """A folder with a page for every environment, without agents, and the files that drive users' tasks."""
     folder = tmp_path_factory.mktemp("bare")
     build(board_pages.data(tuple(TASKS), agents=()), folder)
-    for task in OWN:
+    for task in (*OWN, Six):
         (folder / "assets" / f"{task.id}.js").write_text(script_of(task))
     return folder
 
@@ -96,9 +96,9 @@ def test_the_pages_step_has_pythons_bits(browsing, bare, id):
     check_bits(page, bare, task, id, [(7, at_random(task, 1)), (2**63 + 11, by_agent(task))])
 
 
-@pytest.mark.parametrize("kind", OWN, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*OWN, Six], ids=lambda kind: kind.__name__)
 def test_so_it_has_on_users_tasks(browsing, bare, kind):
-    """Two controls, ranges, targets, kicks, choices, a last reward, a chain, nothing that acts."""
+    """Two controls, ranges, targets, kicks, choices, a last reward, chains, nothing that acts."""
     page = browsing.open(f"{bare.as_uri()}/InclineTilt-v0.html", bare.as_uri())
     task = kind()
     check_bits(page, bare, task, kind.id, [(seed, at_random(task, seed)) for seed in (3, 2**64 - 1)])

@@ -1,15 +1,21 @@
 """The unfused step: against the fused one, and against the other ways to carry it out."""
 
+import os
+import subprocess
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
-from driven import at_random, by_agent
+from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
 import lag_envs
 from lag_envs.envs.unfused import Unfused
 from lag_envs.scenes import StepRefused
+from lag_envs.scenes.shapes import Circle
 from lag_envs.stepping.general import stepper_of
+from lag_envs.stepping.script import LARGEST, Script
 from lag_envs.tasks import TASKS
 
 REGISTERED = sorted(TASKS)
@@ -76,7 +82,7 @@ def check_against_fused(env, seeds):
         assert np.max(error / condition) <= 1e-15
 
 
-@pytest.mark.parametrize("task", OWN, ids=lambda task: task.__name__)
+@pytest.mark.parametrize("task", [*OWN, Six], ids=lambda task: task.__name__)
 def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     outer = made(task)
     scene = outer.scene
@@ -90,7 +96,7 @@ def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     env.reset(3)
     task = env.task
     act = at_random(task, 4)
-    for i in range(30):
+    for i in range(20):
         before = env.state
         env.step(act(env, i))
         if task.draws:
@@ -125,3 +131,47 @@ def test_seeds_of_any_size():
         unfused.reset(seed)
         assert np.allclose(unfused.state, env.state, rtol=1e-15)
         assert np.allclose(unfused.target, env.target, rtol=1e-15)
+
+
+def test_long_functions_are_cut():
+    program = Unfused(Six()).program
+    lengths = [len(part.split("\n")) for part in program.javascript.split("\nfunction ")]
+    assert len(lengths) > 12 and max(lengths) < 2 * LARGEST
+    assert "function move_1(f, a, k)" in program.javascript
+
+
+def test_names_do_not_meet_when_changed_at_once():
+    script = Script()
+    with pytest.raises(AssertionError, match="would be overwritten"):
+        script.loop(0, 3, [1.0, 2.0], lambda k, carried: carried[::-1])
+
+
+class Odd(OWN[2]):
+    """Its arrow is placed by what is no arithmetic on the state."""
+
+    id = "OwnOdd-v0"
+
+    def bodies(self):
+        return {"arrow": [Circle((0.0, 0.0), 1.0)]}
+
+    def indicators(self, now, xp):
+        return {"arrow": (float(now.q.theta), 0.0)}
+
+
+def test_a_picture_that_cannot_be_printed_is_left_out():
+    env = Unfused(Odd())
+    env.reset(1)
+    env.step([])
+    assert env.poses() == [] and env.program.frames == []
+
+
+def test_scripts_do_not_depend_on_the_process():
+    code = "from lag_envs.envs.unfused import UnfusedProgram as U; from lag_envs.tasks import TASKS as T;"
+    code += "print(*(U(T[id]()).digest for id in sorted(T)))"
+    seen = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, stdout=-1, check=True
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert len(seen) == 1

@@ -41,7 +41,7 @@ from lag_envs.scenes.shapes import Frame
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import usual_order
-from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Language, Script, motion, run_python
+from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
 from lag_envs.tasks.base import Task
 
 
@@ -139,12 +139,12 @@ class UnfusedProgram:
     @cached_property
     def python(self) -> str:
         """The script in Python."""
-        return self.script(PYTHON)
+        return self.script.text(PYTHON)
 
     @cached_property
     def javascript(self) -> str:
         """The script in JavaScript."""
-        return self.script(JAVASCRIPT)
+        return self.script.text(JAVASCRIPT)
 
     @cached_property
     def digest(self) -> str:
@@ -152,9 +152,10 @@ class UnfusedProgram:
         numbers = repr(self.constants)
         return hashlib.sha256(f"{self.python.partition('def poses(')[0]}{numbers}".encode()).hexdigest()[:8]
 
-    def script(self, language: Language) -> str:
-        """Return the functions of the module's docstring in a language."""
-        t = Script(language)
+    @cached_property
+    def script(self) -> Script:
+        """The functions of the module's docstring."""
+        t = Script()
         t.function("derive", "k", lambda: self._derive(t))
         t.function("start", "f, d, k", lambda: self._start(t))
         t.function("lift", "f, k", lambda: self._write_state(t, self._read(t, self.rows.y)[: self.states]))
@@ -162,7 +163,7 @@ class UnfusedProgram:
         t.function("kick", "f, d, k", lambda: self._kick(t))
         t.function("observe", "f, k", lambda: self._observe(t))
         t.function("poses", "f, p, k", lambda: self._poses(t))
-        return t.text()
+        return t
 
     def _read(self, t: Script, rows: slice, array: str = "f") -> list[str]:
         return [t.put("read", array, i) for i in range(rows.start, rows.stop)]
@@ -170,7 +171,7 @@ class UnfusedProgram:
     def _write(self, t: Script, rows: slice | int, values: Sequence, array: str = "f") -> None:
         first = rows if isinstance(rows, int) else rows.start
         for i, value in enumerate(values):
-            t.say("write", array, first + i, t.literal(value))
+            t.say("write", array, first + i, value)
 
     def _write_state(self, t: Script, y: Sequence) -> None:
         """Write a state, and cosine and sine of its angle."""
@@ -316,11 +317,15 @@ class UnfusedProgram:
             return [x for pose in found.values() for x in pose]
 
         given = [self._read(t, part) for part in (slice(0, n), rows.g, rows.u, rows.turned)]
-        try:
-            found = self._run(t, partial(poses, True), *given)
-        except (TypeError, FormulaError):  # something else than arithmetic is done with the parameters
-            found = self._run(t, partial(poses, False), *given)
-        self._write(t, 0, found, "p")
+        # Where something else than arithmetic is done with the parameters, they stay as they are; where it is
+        # done with the state, there is no picture.
+        for own in (True, False):
+            try:
+                self._write(t, 0, self._run(t, partial(poses, own), *given), "p")
+                return
+            except (AttributeError, TypeError, ValueError, FormulaError):
+                pass
+        self.frames = []
 
 
 class _Numbers:

@@ -8,7 +8,9 @@ loops, over the order of the series among them, are printed as loops.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
@@ -51,6 +53,7 @@ STATEMENTS: Mapping[str, tuple[str, str]] = {
     "leave": ("if not {}: break", "if (!{}) break;"),
     "function": ("def {}({}):", "function {}({}) {{"),
     "return": ("return {}", "return {};"),
+    "call": ("{}({})", "{}({});"),
     "nothing": ("pass", ""),
     "end": ("", "}}"),
 }
@@ -143,89 +146,100 @@ class Formulas(ElementaryTrace):
         return self._function("tanh", a)
 
 
-class Script:
-    """The target that writes a language's text: numbers are names or literals; see `series.Target`.
+class Term(NamedTuple):
+    """An operation of `OPERATIONS` on names and numbers, or a call of an elementary function."""
 
-    Parameters
-    ----------
-    language : Language
-        The language.
+    op: str
+    args: tuple[Any, ...]
+
+
+class Statement(NamedTuple):
+    """A statement of `STATEMENTS`, with its block if it has one."""
+
+    kind: str
+    parts: tuple[Any, ...]
+    body: tuple[Statement, ...] = ()
+
+
+class Script:
+    """The target that writes source text: numbers are names or literals; see `series.Target`.
+
+    Examples
+    --------
+    >>> script = Script()
+    >>> script.function("norm", "a, b", lambda: script.sqrt(script.fma("a", "a", script.mul("b", "b"))))
+    >>> print(script.text(JAVASCRIPT).partition("function norm")[2])
+    (a, b) {
+     const x1 = b * b;
+     const x2 = a * a;
+     const x3 = x2 + x1;
+     const x4 = Math.sqrt(x3);
+     return x4;
+    }
+    <BLANKLINE>
     """
 
-    def __init__(self, language: Language) -> None:
-        self._language = language
-        self._lines: list[str] = []
-        self._depth = self._count = self._memory = 0
-        self._functions: dict[str, str] = {}
+    def __init__(self) -> None:
+        self._block: list[Statement] = []
+        self._functions: list[Statement] = []
+        self._elementary: dict[str, Statement] = {}
+        self._count = self._memory = self._spilled = 0
 
     # --- text ----------------------------------------------------------------------------------------------
 
-    def text(self) -> str:
-        """Return all that was written, and before it what it is made of."""
-        parts = [self._language.head, *self._functions.values()]
-        if self._memory:
-            parts.insert(1, self._said("let", "m", self._language.memory.format(self._memory)) + "\n")
-        return "".join([*parts, *(line + "\n" for line in self._lines)])
+    def text(self, language: Language) -> str:
+        """Return all that was written, in a language."""
+        arrays = [("m", self._memory), ("s", self._spilled)]
+        made = [Statement("let", (name, language.memory.format(n))) for name, n in arrays if n]
+        lines = _lines([*made, *self._elementary.values(), *self._functions], language)
+        return language.head + "".join(line + "\n" for line in lines)
 
-    def _said(self, statement: str, *parts: Any) -> str:
-        return STATEMENTS[statement][self._language.column].format(*parts)
-
-    def say(self, statement: str, *parts: Any) -> None:
+    def say(self, kind: str, *parts: Any, body: Sequence[Statement] = ()) -> None:
         """Write a statement of `STATEMENTS`."""
-        line = self._said(statement, *parts)
-        if line:
-            self._lines.append(" " * self._depth + line)
+        self._block.append(Statement(kind, parts, tuple(body)))
 
     def _new(self, letter: str = "x") -> str:
         self._count += 1
         return f"{letter}{self._count}"
 
-    def put(self, op: str, *args: Any, statement: str = "let") -> str:
+    def put(self, op: str, *args: Any) -> str:
         """Write an operation; return the name of its result."""
         name = self._new()
-        self.say(statement, name, OPERATIONS[op][self._language.column].format(*map(self.literal, args)))
+        self.say("let", name, Term(op, args))
         return name
 
-    def literal(self, value: Any) -> str:
-        """Return a number as this language writes it; a name as it is."""
-        if isinstance(value, str):
-            return value
-        known = self._language.words.get(str(value))
-        text = known or repr(value)
-        return f"({text})" if text.startswith("-") else text
-
-    def _block(self, body: Callable[[], Any]) -> Any:
-        """Write the lines of a body, indented, to its end."""
-        self._depth += 1
-        before = len(self._lines)
-        result = body()
-        if len(self._lines) == before:
-            self.say("nothing")
-        self._depth -= 1
-        self.say("end")
-        return result
+    def _inside(self, write: Callable[[], Any]) -> tuple[Statement, ...]:
+        """Return the statements that are written meanwhile."""
+        outer, self._block = self._block, []
+        write()
+        written, self._block = self._block, outer
+        return tuple(written) or (Statement("nothing", ()),)
 
     def function(self, name: str, arguments: str, body: Callable[[], Any]) -> None:
-        """Write a function whose body returns what it returns, or None."""
+        """Write a function whose body returns what it returns, or None.
 
+        Long ones are cut: a browser runs functions of more than some 60 kB of its own code much slower.
+        """
+        made = _without_unused(self._function(name, arguments, body))
+        parts, spilled = _cut(made)
+        self._spilled = max(self._spilled, spilled)
+        self._functions += parts
+
+    def _function(self, name: str, arguments: str, body: Callable[[], Any]) -> Statement:
         def inside() -> None:
             result = body()
             if result is not None:
-                self.say("return", self.literal(result))
+                self.say("return", result)
 
         self._count = 0
-        self.say("function", name, arguments)
-        self._block(inside)
+        return Statement("function", (name, arguments), self._inside(inside))
 
     def emit(self, operations: Iterable[Operation], values: Mapping[str, Any]) -> dict[str, Any]:
         """Write recorded operations; return what all names stand for."""
         known = dict(values)
         for name, op, args in operations:
             given = [known[a] if isinstance(a, str) else a for a in args]
-            if op in OPERATIONS:
-                known[name] = self.put(op, *given)
-            else:
-                known[name] = self.elementary(op, *given)
+            known[name] = self.put(op, *given) if op in OPERATIONS else self.elementary(op, *given)
         return known
 
     def formula(self, formula: Callable, inputs: Mapping[str, Value]) -> list[Any]:
@@ -318,63 +332,53 @@ class Script:
         return self.put("read", "m", self._at(slot, k))
 
     def store(self, slot: int, k: Any, value: Any) -> None:
-        self.say("write", "m", self._at(slot, k), self.literal(value))
+        self.say("write", "m", self._at(slot, k), value)
 
     def loop(self, first: Any, end: Any, carried: Sequence, body: Callable, step: int = 1) -> list:
-        names = self._vary(carried)
-        k = self._new("k")
-        self.say("for", k, first, end, step)
-        self._block(lambda: self._change(names, body(k, list(names))))
+        names, k = self._vary(carried), self._new("k")
+        written = self._inside(lambda: self._change(names, body(k, list(names))))
+        self.say("for", k, first, end, step, body=written)
         return names
 
     def repeat(self, times: int, carried: Sequence, body: Callable) -> list:
-        names = self._vary(carried)
-        k = self._new("k")
+        names, k = self._vary(carried), self._new("k")
 
         def inside() -> None:
             going, values = body(k, list(names))
             self._change(names, values)
-            self.say("leave", self.literal(going))
+            self.say("leave", going)
 
-        self.say("for", k, 0, times, 1)
-        self._block(inside)
+        self.say("for", k, 0, times, 1, body=self._inside(inside))
         return names
 
     def when(self, condition: Any, body: Callable, otherwise: Sequence) -> list:
         names = self._vary(otherwise)
-        self.say("if", condition)
-        self._block(lambda: self._change(names, body()))
+        self.say("if", condition, body=self._inside(lambda: self._change(names, body())))
         return names
 
     def _vary(self, values: Sequence) -> list[str]:
         names = [self._new("y") for _ in values]
         for name, value in zip(names, values, strict=True):
-            self.say("vary", name, self.literal(value))
+            self.say("vary", name, value)
         return names
 
     def _change(self, names: Sequence[str], values: Sequence) -> None:
         """Give variables their next values, all at once."""
         changed: set[str] = set()
-        kept = []
         for name, value in zip(names, values, strict=True):
-            if value in changed:  # it would be overwritten before it is used
-                raise AssertionError(f"{value} is carried on under another name")
+            assert value not in changed, f"{value} would be overwritten before it is used"
             if value != name:
-                kept.append((name, value))
+                self.say("set", name, value)
                 changed.add(name)
-        for name, value in kept:
-            self.say("set", name, self.literal(value))
 
     def elementary(self, name: str, x: Any) -> str:
         called = name.replace(" ", "_")
-        if called not in self._functions:
+        if called not in self._elementary:
             operations, result = elementary(name, False)
-            script = Script(self._language)
-            script.function(called, "x", lambda: script.emit(operations, {"x": "x"})[result])
-            self._functions[called] = "".join(line + "\n" for line in script._lines)
-        result = self._new()
-        self.say("let", result, f"{called}({self.literal(x)})")
-        return result
+            other = Script()
+            made = other._function(called, "x", lambda: other.emit(operations, {"x": "x"})[result])
+            self._elementary[called] = made
+        return self.put(called, x)
 
     def scalars(self, record: SeriesRecord, inputs: dict[str, Any]) -> dict[str, Any]:
         return self.emit(record.scalars, inputs)
@@ -382,6 +386,161 @@ class Script:
 
 #: Numbers that are set aside for one series.
 STRIDE = LARGEST_ORDER + 3
+#: Statements of a function, beyond which it is cut.
+LARGEST = 1500
+_NAME = re.compile(r"\b[xyk][0-9]+\b")
+
+
+# --- statements as text -------------------------------------------------------------------------------------
+
+
+def _lines(block: Iterable[Statement], language: Language, depth: int = 0) -> Iterator[str]:
+    """Return the lines of a block."""
+    column = language.column
+
+    def text(value: Any) -> str:
+        if isinstance(value, Term):
+            form = OPERATIONS[value.op][column] if value.op in OPERATIONS else f"{value.op}({{}})"
+            return form.format(*map(text, value.args))
+        if isinstance(value, str):
+            return value
+        found = language.words.get(str(value)) or repr(value)
+        return f"({found})" if found.startswith("-") else found
+
+    for kind, parts, body in block:
+        line = STATEMENTS[kind][column].format(*map(text, parts))
+        if line:
+            yield " " * depth + line
+        if body:
+            yield from _lines(body, language, depth + 1)
+            if end := STATEMENTS["end"][column].format():
+                yield " " * depth + end
+
+
+# --- what is done with statements ---------------------------------------------------------------------------
+
+
+def _named(value: Any) -> Iterator[str]:
+    """Return the variables that occur in a part of a statement."""
+    if isinstance(value, str):
+        yield from _NAME.findall(value)
+    elif isinstance(value, Term):
+        for arg in value.args:
+            yield from _named(arg)
+
+
+def _all(block: Iterable[Statement]) -> Iterator[Statement]:
+    for statement in block:
+        yield statement
+        yield from _all(statement.body)
+
+
+def _without_unused(function: Statement) -> Statement:
+    """Leave out operations whose results nobody needs."""
+    makes = ("let", "vary", "set")
+    uses: Counter[str] = Counter()
+    made: dict[str, list[str]] = {}
+    for kind, parts, _ in _all(function.body):
+        needed = [name for part in parts[kind in makes :] for name in _named(part)]
+        uses.update(needed)
+        if kind in makes:
+            made.setdefault(parts[0], []).extend(needed)
+    pending = [name for name in made if not uses[name]]
+    unused = set(pending)
+    while pending:
+        for name in made[pending.pop()]:
+            uses[name] -= 1
+            if not uses[name] and name in made:
+                unused.add(name)
+                pending.append(name)
+
+    def kept(block: Sequence[Statement]) -> tuple[Statement, ...]:
+        found = (
+            statement._replace(body=kept(statement.body))
+            for statement in block
+            if statement.kind not in makes or statement.parts[0] not in unused
+        )
+        return tuple(found) or (Statement("nothing", ()),) * bool(block)
+
+    return function._replace(body=kept(function.body))
+
+
+def _cut(function: Statement) -> tuple[list[Statement], int]:
+    """Return a function as several where it is long, and how many numbers go from one to another."""
+    name, arguments = function.parts
+    found: list[Statement] = []
+
+    def size(block: Iterable[Statement]) -> int:
+        return sum(1 for _ in _all(block))
+
+    def shortened(block: Sequence[Statement]) -> tuple[Statement, ...]:
+        if size(block) <= LARGEST:
+            return tuple(block)
+        result: list[Statement] = []
+        group: list[Statement] = []
+        long = 0
+
+        def close() -> None:
+            if group:
+                part = f"{name}_{len(found)}"
+                found.append(Statement("function", (part, arguments), tuple(group)))
+                result.append(Statement("call", (part, arguments)))
+                group.clear()
+
+        for statement in block:
+            statement = statement._replace(body=shortened(statement.body))
+            if statement.kind in ("leave", "return"):
+                close()
+                long = 0
+                result.append(statement)
+                continue
+            more = size([statement])
+            if long + more > LARGEST:
+                close()
+                long = 0
+            long += more
+            group.append(statement)
+        close()
+        return tuple(result)
+
+    whole = function._replace(body=shortened(function.body))
+    if not found:
+        return [whole], 0
+    # What one function makes and another needs goes through the array s.
+    places: dict[str, set[int]] = {}
+    for i, part in enumerate([*found, whole]):
+        for statement in _all(part.body):
+            for variable in (v for p in statement.parts for v in _named(p)):
+                places.setdefault(variable, set()).add(i)
+    shared = {v: f"s[{j}]" for j, v in enumerate(v for v, where in places.items() if len(where) > 1)}
+    return [part._replace(body=_sharing(part.body, shared)) for part in [*found, whole]], len(shared)
+
+
+def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Statement, ...]:
+    """Return a block whose shared variables lie in an array."""
+
+    def put(value: Any, known: Mapping[str, str]) -> Any:
+        if isinstance(value, Term):
+            return Term(value.op, tuple(put(arg, known) for arg in value.args))
+        return _NAME.sub(lambda m: known.get(m[0], m[0]), value) if isinstance(value, str) else value
+
+    def changed(block: Sequence[Statement], known: Mapping[str, str]) -> Iterator[Statement]:
+        for kind, parts, body in block:
+            if kind in ("let", "vary", "set") and parts[0] in known:
+                at = known[parts[0]][2:-1]
+                yield Statement("write", ("s", at, put(parts[1], known)))
+            elif kind == "for" and parts[0] in known:
+                k, inside = parts[0], {v: place for v, place in known.items() if v != parts[0]}
+                keep = Statement("write", ("s", known[k][2:-1], k))
+                ends = tuple(put(part, known) for part in parts[1:])
+                yield Statement(kind, (k, *ends), (keep, *changed(body, inside)))
+            else:
+                yield Statement(kind, tuple(put(part, known) for part in parts), tuple(changed(body, known)))
+
+    return tuple(changed(block, shared))
+
+
+# --- the series' step, and running what was printed ---------------------------------------------------------
 
 
 def motion(

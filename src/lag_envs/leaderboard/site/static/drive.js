@@ -786,6 +786,7 @@
           : `The link is false: it claims a return of ${text(claim, 4)}${known ? `, score ${text(scoreOf(claim))}` : ""}; ` +
             (whole ? `its keys give ${text(episode.total, 4)}.` : "its episode ends before its keys do.");
         if (!whole) return;
+        if (!untouched()) reset.click();
         linked = told;
         seed = told.seed;
         watch.hidden = false;
@@ -872,10 +873,11 @@
     for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
       canvas.addEventListener(name, () => (hands.pointer = null));
     }
-    window.addEventListener("gamepadconnected", (event) => {
-      hands.pad = event.gamepad.index;
+    const take = (pad) => {
+      hands.pad = pad.index;
       tell("A gamepad is there: its stick drives.");
-    });
+    };
+    window.addEventListener("gamepadconnected", (event) => take(event.gamepad));
     window.addEventListener("gamepaddisconnected", () => hands.readPad());
     document.addEventListener("visibilitychange", () => document.hidden && running && pause());
 
@@ -935,6 +937,8 @@
     const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers tell how it moves.";
     tell(`${how ? `${how}; or the pointer, or a gamepad.` : "Nothing acts here: look on."} Space starts.${nothing}`);
     if (calm.matches) speed.value = "0.5";
+    const there = [...(navigator.getGamepads?.() ?? [])].find((pad) => pad?.connected);
+    if (there) take(there);
     followHash();
     return { show: () => show(1), get episode() { return me; } };
   }

@@ -319,7 +319,7 @@
       running = !running;
       show();
     });
-    load(board.film).then((replays) => {
+    episodes(board.film).then((replays) => {
       if (!replays[0]?.poses) return;
       [replay, button.hidden] = [replays[0], false];
       new IntersectionObserver(([entry]) => {
