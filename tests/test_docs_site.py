@@ -2,8 +2,6 @@
 
 import os
 import re
-import shutil
-import warnings
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -13,8 +11,6 @@ import pytest
 import yaml
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
-from playwright.sync_api import sync_playwright
-from test_site import CHROMIUM, MISSING
 
 from lag_envs.scenes import SCENES
 from lag_envs.tasks import TASKS
@@ -157,17 +153,6 @@ def test_pages_are_published_only_when_switched_on():
 
 
 # --- in a browser, from files, without a server ---
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None or not shutil.which(CHROMIUM):
-        warnings.warn(MISSING, stacklevel=1)
-        pytest.skip(MISSING)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM)
-        yield browser
-        browser.close()
 
 
 def test_in_a_browser(site, browser):

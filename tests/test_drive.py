@@ -14,7 +14,7 @@ from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.site.build import build
 from lag_envs.leaderboard.site.driving import agent, script_of
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
@@ -99,7 +99,7 @@ def test_the_pages_step_has_pythons_bits(browsing, bare, id):
 @pytest.mark.parametrize("kind", [*OWN, Six], ids=lambda kind: kind.__name__)
 def test_so_it_has_on_users_tasks(browsing, bare, kind):
     """Two controls, ranges, targets, kicks, choices, a last reward, chains, nothing that acts."""
-    page = browsing.open(f"{bare.as_uri()}/InclineTilt-v0.html", bare.as_uri())
+    page = browsing.open(f"{bare.as_uri()}/{incline.Tilt.id}.html", bare.as_uri())
     task = kind()
     check_bits(page, bare, task, kind.id, [(seed, at_random(task, seed)) for seed in (3, 2**64 - 1)])
 
@@ -160,7 +160,7 @@ def link_of(page):
 
 def test_by_keys_alone(drive, capsys):
     """Tab, arrows, Space, R and N; what was driven is true for the command."""
-    page = drive("InclineTilt-v0", hash="#seed=12")
+    page = drive(incline.Tilt.id, hash="#seed=12")
     assert "Space starts" in message(page)
     page.focus("main")
     for _ in range(40):
@@ -196,7 +196,7 @@ def test_by_keys_alone(drive, capsys):
 
 
 def test_a_link_is_recomputed_in_the_page(drive, bare):
-    task = TASKS["InclineTilt-v0"]()
+    task = TASKS[incline.Tilt.id]()
     env = Unfused(task)
     env.reset(77)
     keys, total, over = [], 0.0, False
@@ -237,7 +237,7 @@ def test_a_link_is_recomputed_in_the_page(drive, bare):
 
 
 def test_by_pointer_and_by_touch(drive, browsing):
-    page = drive("InclineTilt-v0", hash="#seed=3")
+    page = drive(incline.Tilt.id, hash="#seed=3")
     page.evaluate("document.querySelector('.stage').scrollIntoView()")
     box = page.evaluate(
         "(() => { const b = document.querySelector('.driver .scene').getBoundingClientRect();"
@@ -273,7 +273,7 @@ GAMEPAD = """() => {
 
 
 def test_a_gamepad_drives_and_may_leave(drive):
-    page = drive("InclineTilt-v0", hash="#seed=3")
+    page = drive(incline.Tilt.id, hash="#seed=3")
     page.evaluate(GAMEPAD)
     assert "gamepad is there" in message(page)
     page.click(".go")
@@ -390,7 +390,7 @@ def test_nothing_overflows(drive, width):
 def policies():
     """Return a policy of every kind that runs in the page, by name, with its environment."""
     rng = np.random.default_rng(0)
-    bar, tilt = "PivotedBarFree-v0", "CylinderInCylinderTilt-v0"
+    bar, tilt = pivoted_bar.SwingUpFree.id, cylinder_in_cylinder.Tilt.id
 
     def policy(id, table, arrays):
         made = architecture(id, table)
@@ -471,7 +471,7 @@ def test_planners_run_in_python_only():
 def haunted(tmp_path_factory):
     """A page with an agent that runs live, and one that is recorded at a seed."""
     folder = tmp_path_factory.mktemp("haunted")
-    data = board_pages.data(("CylinderInCylinderTilt-v0",), board_pages.AGENTS[:2])
+    data = board_pages.data((cylinder_in_cylinder.Tilt.id,), board_pages.AGENTS[:2])
     live, recorded = data["environments"][0]["rows"]
     (policy,) = (p for name, _, p in POLICIES if name == "linear")
     live |= {"agent": agent(policy)}
@@ -483,7 +483,7 @@ def haunted(tmp_path_factory):
 
 
 def test_ghosts_run_beside(drive, haunted):
-    page = drive("CylinderInCylinderTilt-v0", folder=haunted)
+    page = drive(cylinder_in_cylinder.Tilt.id, folder=haunted)
     ghosts = ".drive-controls select >> nth=1"
     page.select_option(ghosts, "live:0")
     page.focus(".stage")
@@ -504,17 +504,17 @@ def test_ghosts_run_beside(drive, haunted):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("id", ["PivotedBar-v0", "InclineBrake-v0", "CylinderInCylinderTilt-v0"])
+@pytest.mark.parametrize("id", ["PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id])
 def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     """With the processor throttled four times, a ghost beside that looks a step ahead where there is one."""
     data = board_pages.data((id,), board_pages.AGENTS[:1])
     table = {"architecture": "table", "axes": ["theta - target", "theta_dot"], "kind": "value"}
-    if id == "CylinderInCylinderTilt-v0":
+    if id == cylinder_in_cylinder.Tilt.id:
         axes = {"axis_0": np.linspace(-1, 1, 9), "axis_1": np.linspace(-2, 2, 9), "table": np.ones((9, 9))}
         data["environments"][0]["rows"][0]["agent"] = agent(Policy(architecture(id, table), axes))
     build(data, tmp_path)
     page = drive(id, folder=tmp_path)
-    if id == "CylinderInCylinderTilt-v0":
+    if id == cylinder_in_cylinder.Tilt.id:
         page.select_option(".drive-controls select >> nth=1", "live:0")
     cdp = page.context.new_cdp_session(page)
     cdp.send("Emulation.setCPUThrottlingRate", {"rate": 4})

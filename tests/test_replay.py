@@ -10,7 +10,7 @@ from lag_envs import cli, replay
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.drives import best_drives
 from lag_envs.leaderboard.log import BoardError
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, incline
 
 ID = "PivotedBarBalance-v0"
 
@@ -139,7 +139,7 @@ def test_the_command_on_an_environment_of_ones_own(tmp_path, capsys):
 def test_best_drives_are_recomputed_and_sorted(tmp_path):
     assert best_drives(tmp_path) == {}
     made = [driven(TASKS[ID](), seed=seed) for seed in (1, 2, 3)]
-    other = driven(TASKS["InclineTilt-v0"](), most=10_000)
+    other = driven(TASKS[incline.Tilt.id](), most=10_000)
     links = [replay.write_link(drive, "https://example.org/x.html") for drive in (*made, other)]
     text = "# by hand\n\n" + "".join(f"{link} Ada {i}\n" for i, link in enumerate(links))
     (tmp_path / "drives.txt").write_text(text)

@@ -16,7 +16,7 @@ from lag_envs.scenes import StepRefused
 from lag_envs.scenes.shapes import Circle
 from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import LARGEST, Script
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, pivoted_bar
 
 REGISTERED = sorted(TASKS)
 
@@ -115,7 +115,7 @@ def test_constants_are_those_of_the_scene():
 
 
 def test_a_step_that_is_refused_changes_nothing():
-    env = Unfused(TASKS["PivotedBarFree-v0"](damping=0.0))
+    env = Unfused(TASKS[pivoted_bar.SwingUpFree.id](damping=0.0))
     env.reset(1)
     env.state = [0.0, 1e9]
     with pytest.raises(StepRefused):
@@ -125,7 +125,7 @@ def test_a_step_that_is_refused_changes_nothing():
 
 def test_seeds_of_any_size():
     for seed in (0, 2**53 + 1, 2**63 + 5, 2**64 - 1, 2**70):
-        env = gym.make("CylinderInCylinderTilt-v0").unwrapped
+        env = gym.make(cylinder_in_cylinder.Tilt.id).unwrapped
         unfused = Unfused(env.task)
         env.reset(seed=seed)
         unfused.reset(seed)

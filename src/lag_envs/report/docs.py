@@ -222,7 +222,7 @@ def markdown(accuracy: dict[str, Any]) -> str:
             if picture["file"].startswith(part.pictures or ("-",)):
                 lines += ["", *_picture(picture)]
         if section["summary"]:
-            lines += ["", *_table(section["summary"])]
+            lines += ["", _table(section["summary"])]
         holding = sum(claim["holds"] is True for claim in section["claims"])
         lines += ["", f"{holding} of {len(section['claims'])} claims hold.", "", *_command(part.section)]
         lines += [f"[Method, all tables and figures]({DETAILS}#{_anchor(section['title'])})"]
