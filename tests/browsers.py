@@ -65,3 +65,11 @@ def until(page, expression, wait=60.0):
         assert time.monotonic() < end, expression
         page.wait_for_timeout(20)
     return value
+
+
+def serious(page):
+    """Return what axe finds that is serious: rule and place."""
+    from axe_playwright_python.sync_playwright import Axe
+
+    found = Axe().run(page, options={"preload": False}).response["violations"]
+    return [(v["id"], v["nodes"][0]["html"]) for v in found if v["impact"] in ("serious", "critical")]

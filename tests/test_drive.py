@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from browsers import until
+from browsers import serious, until
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -141,7 +141,7 @@ def reading(page, name):
 def drive(browsing, bare):
     """Open an environment's page, and its driver."""
 
-    def open_it(id="PivotedBarBalance-v0", hash="", folder=bare, **options):
+    def open_it(id=pivoted_bar.Balance.id, hash="", folder=bare, **options):
         page = browsing.open(f"{folder.as_uri()}/{id}.html{hash}", folder.as_uri(), **options)
         if not hash:
             page.click(".begin")
@@ -374,7 +374,20 @@ def test_names_for_those_who_do_not_see(drive):
     for node in nodes:
         if node["role"]["value"] in {"button", "combobox", "slider", "application", "textbox"}:
             assert node["name"]["value"].strip(), node
-    assert "Drive PivotedBarBalance-v0" in str(nodes)
+    assert f"Drive {pivoted_bar.Balance.id}" in str(nodes)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(drive, haunted, scheme):
+    page = drive(cylinder_in_cylinder.Tilt.id, folder=haunted, color_scheme=scheme, bypass_csp=True)
+    page.select_option(".drive-controls select >> nth=1", "stored:1")
+    page.click(".sliders summary")
+    page.focus(".stage")
+    for _ in range(2):
+        page.keyboard.press("Space")
+        page.wait_for_timeout(200)
+    until(page, "!document.querySelector('.share').hidden")
+    assert serious(page) == []
 
 
 @pytest.mark.parametrize("width", [320, 1920])

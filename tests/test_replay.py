@@ -10,9 +10,9 @@ from lag_envs import cli, replay
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.drives import best_drives
 from lag_envs.leaderboard.log import BoardError
-from lag_envs.tasks import TASKS, incline
+from lag_envs.tasks import TASKS, incline, pivoted_bar
 
-ID = "PivotedBarBalance-v0"
+ID = pivoted_bar.Balance.id
 
 
 def driven(task, seed=5, name=None, most=200):

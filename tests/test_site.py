@@ -15,8 +15,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from browsers import until
+from browsers import serious, until
 from toy_pendulum import Swing
 
 from lag_envs.leaderboard.board import Board
@@ -732,12 +731,6 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     assert not page.evaluate(moved)
     page.click(".film")
     assert page.evaluate(moved)
-
-
-def serious(page):
-    """Return what axe finds that is serious: rule and place."""
-    found = Axe().run(page).response["violations"]
-    return [(v["id"], v["nodes"][0]["html"]) for v in found if v["impact"] in ("serious", "critical")]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
