@@ -104,7 +104,7 @@ def _reading(data: Data) -> str:
         " learner is no match for one with more."
         " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
         " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
-        " a tenth; it shows what lives off the discretisation. *Worst*: the lowest result under changed"
+        " a tenth; it shows what exploits the discretisation. *Worst*: the lowest result under changed"
         " parameters, noise and delay. *Training*: time of one run."
     )
 

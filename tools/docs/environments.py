@@ -296,8 +296,8 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
             texts.append(
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
                 f"error of a single step is {row['one step']:.1e} of the state's size, that of an episode "
-                f"{row['whole episode']:.1e}, which is {number(row['over rounding'])} times what one "
-                "rounding of the start grows to by itself. See [Accuracy](../accuracy.md)."
+                f"{row['whole episode']:.1e}, which is {number(row['error / rounding floor'])} times what "
+                "one rounding of the start grows to by itself. See [Accuracy](../accuracy.md)."
             )
     return "\n\n".join(texts)
 

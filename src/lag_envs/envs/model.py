@@ -175,7 +175,7 @@ class Model:
             inner = np.concatenate([given[:, :width] - states.T, u - u[0]], axis=1)
             after = ends.T + np.einsum("nij,pjn->pin", by_both, inner)
             z = lifted(after)
-            reward, ended = formulas.judge(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
+            reward, ended = formulas.outcome(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
             if formulas.has_last:
                 last = formulas.last(np, y, z, list(np.moveaxis(u, 1, 0)), goals, k)
                 reward = np.where(ended, last, reward)

@@ -74,7 +74,15 @@ class Program:
         self.u = [f"u{i}" for i in range(formulas.controls)]
         self.g = [f"g{i}" for i in range(formulas.targets)]
         self._record(formulas, {name: 0.0 if name in absent else f"k_{name}" for name in names})
-        lines = [*self.control, *self.fast, *self.judge, *self.last, *self.kick, *self.observe, *self.sample]
+        lines = [
+            *self.control,
+            *self.fast,
+            *self.outcome,
+            *self.last,
+            *self.kick,
+            *self.observe,
+            *self.sample,
+        ]
         used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", " ".join(lines))}
         #: Names of the constants that are carried: those that are not zero, and that something uses.
         self.constants = [name for name in names if f"k_{name}" in used]
@@ -99,9 +107,9 @@ class Program:
             a, y, g, rest = split(values, actions, width, targets)
             return formulas.control(xp, a, y, g, k(rest))
 
-        def judge(xp: Any, *values: Any) -> list:
+        def outcome(xp: Any, *values: Any) -> list:
             u, g, y, z, rest = split(values, controls, targets, width, width)
-            reward, ended = formulas.judge(xp, y, z, u, g, k(rest))
+            reward, ended = formulas.outcome(xp, y, z, u, g, k(rest))
             return [reward, xp.where(ended, 1.0, 0.0)]
 
         def last(xp: Any, *values: Any) -> list:
@@ -137,7 +145,7 @@ class Program:
         self._x = constants["x"] if formulas.bounded else 0.0
         if formulas.bounded:
             self.fast.insert(0, f"x = {self._x}")
-        self.judge = lines(judge, step, ["r", "over"])
+        self.outcome = lines(outcome, step, ["r", "over"])
         self.last = lines(last, step, ["r"]) if formulas.has_last else []
         draws, kicked = [f"draw{i}" for i in range(formulas.draws)], [f"e{i}" for i in range(width)]
         self.kick = (
@@ -228,7 +236,7 @@ class Program:
             *(f"{g} = targets[i, {j}]" for j, g in enumerate(self.g)),
             *self.control, *self.fast,
             *(step if self.general else ["if not within:", *_indent(step)]),
-            *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
             *(f"ends[i, {j}] = z{j}" for j in range(n)),
             "rewards[i] = r", "ended[i] = over > 0.0",
         ]  # fmt: skip
@@ -259,7 +267,7 @@ class Program:
 
     def _finish_one(self) -> list[str]:
         return [
-            *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
             "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
             *self.observe, *_store(self._at_one, [*self.y, "n"]),
@@ -319,7 +327,7 @@ class Program:
         special = " and not over > 0.0" if self.last else ""
         main = [
             *inputs, *move,
-            "again = n < 0.0", *self.judge,
+            "again = n < 0.0", *self.outcome,
             f"plain = within{special}", "ordinary = select(again, 2.0, select(plain, 1.0, 0.0))",
             "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
@@ -335,7 +343,7 @@ class Program:
                 f"    {_at('over')} = 0.0",
                 "else:",
                 *_indent([
-                    *self.judge, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+                    *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
                     "n = n + 1.0",
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,

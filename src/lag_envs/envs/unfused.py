@@ -246,13 +246,13 @@ class UnfusedProgram:
         z, refused = self._advance(t, y[: self.states], u)
         z = self._lifted(t, z)
 
-        def judge(xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> list:
-            reward, ended = formulas.judge(xp, y, z, u, g, k)
+        def outcome(xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> list:
+            reward, ended = formulas.outcome(xp, y, z, u, g, k)
             if formulas.has_last:
                 reward = xp.where(ended, formulas.last(xp, y, z, u, g, k), reward)
             return [reward, xp.where(ended, 1.0, 0.0)]
 
-        judged = self._run(t, judge, y, z, u, g)
+        found = self._run(t, outcome, y, z, u, g)
 
         def turn(xp: Any, turned: Sequence, y: Sequence, z: Sequence, k: Any) -> list:
             rates = [picture.turning(scene, x) for x in (y, z)]
@@ -264,7 +264,7 @@ class UnfusedProgram:
         self._write(t, rows.y, z)
         self._write(t, rows.u, u)
         self._write(t, rows.turned, turned)
-        self._write(t, rows.reward, judged)
+        self._write(t, rows.reward, found)
         self._write(t, rows.refused, [t.select(refused, 1.0, 0.0)])
 
     def _advance(self, t: Script, y: Sequence, u: Sequence) -> tuple[list, str]:

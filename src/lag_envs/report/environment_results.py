@@ -209,7 +209,7 @@ def _summary(episodes: dict[str, list[Row]]) -> Table | None:
         "Error against the exact motion under the same controls, relative to the size of the state; the "
         "largest over random episodes. One step: the largest over all of their steps. Last column: over what "
         "one rounding of the start grows to by itself.",
-        ["environment", "integrator", "one step", "whole episode", "length [s]", "over rounding"],
+        ["environment", "integrator", "one step", "whole episode", "length [s]", "error / rounding floor"],
         lines,
     )
 

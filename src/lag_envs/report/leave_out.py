@@ -106,7 +106,7 @@ def carried(task: Task) -> Row:
     program = Program(task, absent)
     stepped = Stepped(scene, dt=task.dt)
     code = stepped.stepper()
-    lines = [*program.control, *program.fast, *program.judge, *program.last, *program.kick, *program.move]
+    lines = [*program.control, *program.fast, *program.outcome, *program.last, *program.kick, *program.move]
     lines += program.observe
     ends = [*program.moved, "r", "over", "within", *program.o]
     needed = live(lines, ends) | live(program.sample, [f"s{i}" for i in range(program.n_state)])

@@ -28,7 +28,7 @@ from lag_envs.report.stability_results import (
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.checks import StepRefused
 
-__all__ = ["cases", "cells", "content", "jobs", "judge", "march", "methods"]
+__all__ = ["cases", "cells", "content", "jobs", "march", "methods", "outcomes"]
 
 SECTION = "stability"
 PRECISIONS: dict[str, type[np.floating]] = {"float64": np.float64, "float32": np.float32}
@@ -71,7 +71,7 @@ def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[R
     ends = methods(found, dt)
     for i, (x, case) in enumerate(zip(values, found, strict=True)):
         row: Row = {"kind": "cell", "map": map, "name": name, "dt": dt, "x": x}
-        row |= judge(case, dt, {key: end[i] for key, end in ends.items()})
+        row |= outcomes(case, dt, {key: end[i] for key, end in ends.items()})
         error = row["errors"][OURS]
         if error == DIVERGED or (isinstance(error, float) and error > EXACT):
             row["substeps"] = extremes.substeps(case, dt)
@@ -100,13 +100,13 @@ def cases(names: Sequence[str]) -> Iterator[Row]:
                 dt = extremes.EXTREMES[name].dt
                 case = extremes.build(extremes.EXTREMES[name])
                 ends = methods([case], dt)
-                row["peers"] = judge(case, dt, {key: end[0] for key, end in ends.items()})["errors"]
+                row["peers"] = outcomes(case, dt, {key: end[0] for key, end in ends.items()})["errors"]
         except Exception as error:
             row |= {"problem": describe(error)}
         yield row
 
 
-def judge(case: Case, dt: float, ends: dict[str, Any]) -> Row:
+def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
     """Return the largest error of each end relative to the scales; where there is none, why."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)

@@ -662,7 +662,7 @@ class TaskFormulas:
                 )
         return list((wanted | dict(found)).values())
 
-    def judge(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
+    def outcome(self, xp: Any, y: Sequence, z: Sequence, u: Sequence, g: Sequence, k: Any) -> tuple:
         """Return the reward, and whether the episode is over."""
         ended = self._call("terminated", k, self._state(z), self._targets(g), self._known(xp, z))
         return self.reward(xp, y, z, u, g, k), ended
@@ -728,7 +728,7 @@ class TaskFormulas:
         u = [trace.inputs(f"u{i}")[0] for i in range(self.controls)]
         g = [trace.inputs(f"g{i}")[0] for i in range(self.targets)]
         self.control(trace, a, y, g, k)
-        self.judge(trace, y, z, u, g, k)
+        self.outcome(trace, y, z, u, g, k)
         if self.has_last:
             self.last(trace, y, z, u, g, k)
         if self.draws:
