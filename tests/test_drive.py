@@ -13,7 +13,7 @@ from lag_envs import cli, replay
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.site.build import build
-from lag_envs.leaderboard.site.driving import agent, script_of
+from lag_envs.leaderboard.site.driving import agent, script_of, sliders
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 from tests import board_pages
 
@@ -554,3 +554,17 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
     # What the first frames compile is not theirs alone; a busy machine takes its own time now and then.
     assert np.quantile(took[10:], 0.95) <= 8.0, np.sort(took)[-20:]
     print(id, len(took), np.quantile(took[10:], [0.5, 0.95, 1.0]))
+
+
+@pytest.mark.parametrize(
+    "kind, names",
+    [
+        (incline.Brake, ["mass", "radius", "tilt", "gravity"]),
+        (
+            cylinder_in_cylinder.Tilt,
+            ["mass", "shell_radius", "radius", "damping", "gravity", "control limit"],
+        ),
+    ],
+)
+def test_parameters_that_the_script_follows_have_sliders(kind, names):
+    assert [slider["name"] for slider in sliders(kind, Unfused(kind()))] == names

@@ -312,7 +312,10 @@ class UnfusedProgram:
         def poses(
             own: bool, xp: Any, y: Sequence, g: Sequence, u: Sequence, turned: Sequence, k: Any
         ) -> list:
-            of = self._formulas._self(k) if own else self.task
+            of = self.task
+            if own:
+                of = self._formulas._self(k)
+                of.formulas = self._formulas  # not those of recorded numbers
             found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
             return [x for pose in found.values() for x in pose]
 

@@ -398,8 +398,6 @@
   }
 
   /** Numbers of the same shape on the way from one to the other. */
-  const between = (a, b, share) => changed(a, [scaled(a, b, share)]);
-
   function scaled(a, b, share) {
     if (typeof a === "number") return a + (b - a) * share;
     if (!Array.isArray(a)) return a;
