@@ -1,5 +1,6 @@
 """Driving in the page: the page's step against Python's, bit for bit, and how it behaves in a browser."""
 
+import json
 import struct
 from itertools import pairwise
 
@@ -531,29 +532,20 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
         page.select_option(".drive-controls select >> nth=1", "live:0")
     cdp = page.context.new_cdp_session(page)
     cdp.send("Emulation.setCPUThrottlingRate", {"rate": 4})
-    page.evaluate(
-        """() => {
-            window.took = [];
-            const ask = window.requestAnimationFrame;
-            window.requestAnimationFrame = (body) => ask((time) => {
-                const start = performance.now();
-                body(time);
-                window.took.push(performance.now() - start);
-            });
-        }"""
-    )
     page.focus(".stage")
     page.keyboard.press("Space")
+    page.wait_for_timeout(500)  # what the first frames compile is not theirs alone
+    page.context.browser.start_tracing(page=page, categories=["devtools.timeline"])
     for i in range(8):
         key = ("ArrowLeft", "ArrowRight")[i % 2]
         page.keyboard.down(key)
         page.wait_for_timeout(400)
         page.keyboard.up(key)
-    took = np.array(page.evaluate("window.took"))
-    assert len(took) > 30
-    # What the first frames compile is not theirs alone; a busy machine takes its own time now and then.
-    assert np.quantile(took[10:], 0.95) <= 8.0, np.sort(took)[-20:]
-    print(id, len(took), np.quantile(took[10:], [0.5, 0.95, 1.0]))
+    events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
+    # The main thread's own time: the machine may have other things to do.
+    took = np.array([e["tdur"] / 1e3 for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e])
+    print(id, len(took), np.quantile(took, [0.5, 0.95, 1.0]))
+    assert len(took) > 30 and np.quantile(took, 0.95) <= 8.0
 
 
 @pytest.mark.parametrize(
