@@ -106,7 +106,7 @@ def oracle(case):
     [
         ("task", 6),
         ("damped", 6),
-        ("stiff", 24),
+        ("stiff", 8),
         *(pytest.param(kind, 120, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
     ],
 )
