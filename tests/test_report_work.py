@@ -15,10 +15,11 @@ from lag_envs.report import diagrams, peers, verdicts, work_precision
 from lag_envs.report.cases import VARIANTS, ensemble
 from lag_envs.report.equations import Equation, Problems
 from lag_envs.report.integrators import METHODS, comparison
+from lag_envs.report.points import MODES, Point
 from lag_envs.report.rivals import Compiled, Ours
 from lag_envs.report.runner import Result
 from lag_envs.report.timing import Kernels
-from lag_envs.report.verdicts import MODES, OURS, TARGETS, Point
+from lag_envs.report.verdicts import OURS, TARGETS
 from lag_envs.report.work_precision import Series
 
 BAR = VARIANTS["PivotedBar"].scene()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lag_envs.report.points import HORIZONS, MODES, Point
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from lag_envs.report.verdicts import Point
 
 #: Colours after Okabe and Ito; what our machinery compiles is drawn in full, libraries dashed.
 STYLES = {
@@ -44,8 +44,6 @@ LOWEST = 1e-17
 def draw(variant: str, points: Sequence[Point], floor: Mapping[tuple, float]) -> Figure:
     """Draw one variant: horizons side by side, alone above, a batch below."""
     from matplotlib.figure import Figure
-
-    from lag_envs.report.verdicts import HORIZONS, MODES
 
     figure = Figure(figsize=(10.5, 7.6), layout="constrained")
     here = [p for p in points if p.variant == variant]

@@ -21,11 +21,12 @@ from lag_envs.report import peers, reference
 from lag_envs.report.cases import VARIANTS, Case, ensemble, scales
 from lag_envs.report.equations import Array, Problems
 from lag_envs.report.integrators import METHODS, comparison, plain_series
+from lag_envs.report.points import MODES
 from lag_envs.report.rivals import Compiled, Ours, Rival
 from lag_envs.report.runner import Job, Row, describe
 from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import Kernels, Sample, interleaved
-from lag_envs.report.verdicts import MODES, ROUNDING, content
+from lag_envs.report.verdicts import ROUNDING, content
 from lag_envs.scenes.base import Scene
 from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow

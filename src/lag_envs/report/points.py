@@ -1,0 +1,85 @@
+"""Methods at their settings as points: errors and times, which verdicts compare and diagrams show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from lag_envs.report.runner import Row
+
+MODES = {"single": "alone", "batch": "in a batch"}
+HORIZONS = ("one step", "10 s", "1,000 s")
+LIBRARIES = {
+    "scipy": "SciPy",
+    "heyoka": "heyoka",
+    "diffrax": "diffrax",
+    "torchdiffeq": "torchdiffeq",
+    "mujoco": "MuJoCo",
+}
+
+
+class Point(NamedTuple):
+    """One method at one setting, in one form: its errors and its time."""
+
+    variant: str
+    horizon: str
+    mode: str
+    family: str
+    method: str
+    setting: float  #: substeps per control step, or a library's tolerance
+    error: float | None
+    median: float | None
+    errors: Sequence[float | None]
+    ns: float
+
+    @property
+    def ours(self) -> bool:
+        """Whether it is what the package ships."""
+        return self.family == "ours"
+
+    @property
+    def diverged(self) -> int:
+        """Number of members that were lost."""
+        return sum(error is None for error in self.errors)
+
+    @property
+    def worst(self) -> float:
+        """The largest error, infinite where a member is lost."""
+        return max((math.inf if error is None else error for error in self.errors), default=math.inf)
+
+    @property
+    def name(self) -> str:
+        """The method, with its library."""
+        return f"{LIBRARIES.get(self.family, '')} {self.method}".strip()
+
+    @property
+    def label(self) -> str:
+        """The method and its setting in words."""
+        if self.ours and self.setting == 1:
+            return self.method
+        if self.family in ("ours", "compiled", "mujoco") or self.method.endswith("fixed"):
+            if self.setting < 1.0:
+                return f"{self.name}, a step for {1.0 / self.setting:g}"
+            return f"{self.name}, {self.setting:g} substep{'s' if self.setting > 1 else ''}"
+        return f"{self.name}, {self.setting:g}"
+
+
+def gathered(rows: Sequence[Row]) -> list[Point]:
+    """Return the points, their times all in the same spell of the machine.
+
+    Each job has timed ours in turn with its own, as its clock. Times are multiplied by what the clock of the
+    first job, that of ours, has to theirs. A method without a batch is in the batch as it is alone.
+    """
+    measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]
+    clocks = {(r["variant"], r["horizon"], r["mode"]): r["clock"] for r in measured if r["family"] == "ours"}
+    found = []
+    for row in measured:
+        key = row["variant"], row["horizon"], row["mode"]
+        point = Point(
+            *key, row["family"], row["method"], row["setting"], row["error"], row["median"], row["errors"],
+            row["ns"] * clocks.get(key, row["clock"]) / row["clock"],
+        )  # fmt: skip
+        found.append(point)
+    alone = {(r["family"], r["method"]) for r in measured if not r["batched"]}
+    return found + [p._replace(mode="batch") for p in found if (p.family, p.method) in alone]
