@@ -127,7 +127,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "ids",
         metavar="ID",
         nargs="*",
-        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN}s",
+        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN}",
     )
     parser.add_argument(
         "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
