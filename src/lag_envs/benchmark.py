@@ -454,10 +454,11 @@ def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     """Return the seconds of each of `STAGES` of a process that takes one step."""
     load = "".join(f"from lag_envs.own_files import registered; registered({name!r})\n" for name in files)
     command = [sys.executable, "-P", "-c", COLD_START.format(id=id, load=load)]
+    # As with installed packages, what is imported is there as bytecode: what lacks it is written at first.
+    given = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    given["NUMBA_CACHE_DIR"] = cache
     start = time.perf_counter()
-    done = subprocess.run(
-        command, env=os.environ | {"NUMBA_CACHE_DIR": cache}, check=True, capture_output=True, text=True
-    )
+    done = subprocess.run(command, env=given, check=True, capture_output=True, text=True)
     total = time.perf_counter() - start
     stages = list(map(float, done.stdout.split()))
     return [total - sum(stages), *stages]
