@@ -138,7 +138,10 @@ HEAVY = {
 }
 
 
-@pytest.mark.parametrize("case", HEAVY)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * (case == "support driven")) for case in HEAVY],
+)
 def test_heavy_damping(case):
     name, given, state, control, dt = HEAVY[case]
     bar = {"mass": 0.2, "com_distance": 0.3, "gravity": 9.81, "track": math.inf}

@@ -319,9 +319,10 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     ]
 
 
-def test_stiff_parameters_are_counted(write):
+def test_stiff_parameters_are_counted(write, monkeypatch):
     from lag_envs.report import own
 
+    monkeypatch.setattr(own, "FACTORS", (1e-4, 1e4))
     path = write(SCENE)
     found = {row["case"]: row for row in own.stability(path, "", True, "Swing")}
     assert found["as it is"]["refused"] == 0 and found["as it is"]["balance"] < 1e-12

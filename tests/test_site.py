@@ -733,8 +733,15 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     assert page.evaluate(moved)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", ["index", "PivotedBar-v0", "PivotedBar-v0-00000002"])
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        ("index", "light"),
+        ("PivotedBar-v0", "light"),
+        ("PivotedBar-v0", "dark"),
+        ("PivotedBar-v0-00000002", "dark"),
+    ],
+)
 def test_axe_finds_nothing_serious(open_page, served, name, scheme):
     page = open_page(name, root=served, color_scheme=scheme, bypass_csp=True)
     assert serious(page) == []

@@ -424,8 +424,9 @@ def beside_the_example(monkeypatch):
     ("given", "env_id"),
     [
         (str(BALL), "BallOnBeam-v0"),
-        ("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0"),
-        (f"{SEVERAL}:Switched", "OwnSwitched-v0"),  # chooses among three actions
+        pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
+        # It chooses among three actions.
+        pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),
         (f"{SEVERAL}:Deliver", "OwnCrane-v0"),  # two controls, two targets
     ],
 )
