@@ -33,10 +33,9 @@ baselines: setup  ## compute, train and measure all agents (hours; can be interr
 	$(BIN)/python -m agents.bench --output agents/results/adapter.json
 	$(BIN)/python -m agents.results $(ARGS)
 
-# Three processes on two cores: some tests wait for a browser.
 test: setup  ## run the tests and doctests, all but the slow ones
 	@sh tools/browser
-	$(BIN)/python -m pytest -n 3 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'

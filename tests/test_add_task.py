@@ -129,6 +129,7 @@ def test_docs_page(task):
     assert "| 0 | `theta_1` |  | rad | -∞ | ∞ |" in page and page.count("<math") == 3
 
 
+@pytest.mark.slow
 def test_report(task, file, tmp_path, monkeypatch):
     monkeypatch.setattr("lag_envs.report.own.FEW", 2)
     monkeypatch.chdir(tmp_path)

@@ -105,6 +105,7 @@ def test_threads_give_the_same_bits():
     assert all(np.array_equal(found[0], found[i]) for i in range(4))
 
 
+@pytest.mark.slow
 def test_learner_with_workers_that_are_spawned():
     pytest.importorskip("stable_baselines3")
     from stable_baselines3 import PPO

@@ -235,6 +235,7 @@ def test_a_full_disk_loses_nothing_that_was_saved(tmp_path, monkeypatch):
 # --- the command ---
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side(command, config, tmp_path):
     """Two seeds train, a third one cannot."""
     folder = tmp_path / ENV / "ppo"
