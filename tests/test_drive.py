@@ -2,6 +2,7 @@
 
 import json
 import struct
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -138,6 +139,14 @@ def reading(page, name):
     )
 
 
+def shows(page, name, wanted):
+    """Wait until the read-out shows a text."""
+    end = time.monotonic() + 20.0
+    while reading(page, name) != wanted:
+        assert time.monotonic() < end, (name, reading(page, name), wanted)
+        page.wait_for_timeout(20)
+
+
 @pytest.fixture
 def drive(browsing, bare):
     """Open an environment's page, and its driver."""
@@ -251,14 +260,11 @@ def test_by_pointer_and_by_touch(drive, browsing):
         page,
         "document.querySelector('.driver .readout') && document.querySelector('.go').textContent === 'Pause'",
     )
-    page.wait_for_timeout(250)
-    assert reading(page, "φ\u0307") == "1.00"
+    shows(page, "φ\u0307", "1.00")
     page.mouse.move(box[0] + 0.29 * box[2], middle)
-    page.wait_for_timeout(250)
-    assert reading(page, "φ\u0307") == "−0.50"
+    shows(page, "φ\u0307", "−0.50")
     page.mouse.up()
-    page.wait_for_timeout(250)
-    assert reading(page, "φ\u0307") == "0.00"
+    shows(page, "φ\u0307", "0.00")
     page.keyboard.press("Space")
     assert cli.main(["replay", link_of(page)]) == 0
 
@@ -278,8 +284,7 @@ def test_a_gamepad_drives_and_may_leave(drive):
     page.evaluate(GAMEPAD)
     assert "gamepad is there" in message(page)
     page.click(".go")
-    page.wait_for_timeout(300)
-    assert reading(page, "φ\u0307") == "0.50"
+    shows(page, "φ\u0307", "0.50")
     page.evaluate("window.pad.connected = false")
     until(page, "document.querySelector('.message').textContent.startsWith('The gamepad has left')")
     assert page.evaluate("document.querySelector('.go').textContent") == "Go on"
@@ -327,8 +332,8 @@ def test_two_controls_without_a_picture(drive, owned):
     assert "← → push, ↓ ↑ pull" in message(page) and "nothing to draw" in message(page)
     for key in ("ArrowRight", "ArrowUp"):
         page.keyboard.down(key)
-    page.wait_for_timeout(400)
-    assert (reading(page, "push"), reading(page, "pull")) == ("1.00", "1.00")
+    shows(page, "push", "1.00")
+    shows(page, "pull", "1.00")
     assert reading(page, "Score so far") == "–"
     page.keyboard.up("ArrowUp")
     page.wait_for_timeout(300)
@@ -339,15 +344,12 @@ def test_two_controls_without_a_picture(drive, owned):
 def test_choices(drive, owned):
     page = drive("OwnSwitched-v0", folder=owned)
     page.keyboard.down("ArrowLeft")
-    page.wait_for_timeout(300)
-    assert reading(page, "s\u0308") == "−5.00 m/s²"
+    shows(page, "s\u0308", "−5.00 m/s²")
     page.keyboard.up("ArrowLeft")
     page.keyboard.down("3")
-    page.wait_for_timeout(300)
-    assert reading(page, "s\u0308") == "5.00 m/s²"
+    shows(page, "s\u0308", "5.00 m/s²")
     page.keyboard.up("3")
-    page.wait_for_timeout(300)
-    assert reading(page, "s\u0308") == "0.00 m/s²"
+    shows(page, "s\u0308", "0.00 m/s²")
 
 
 def test_nothing_acts(drive, owned):
