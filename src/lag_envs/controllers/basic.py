@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from types import SimpleNamespace
 from typing import Any
 
@@ -124,7 +125,7 @@ def at_random(task: Task, seed: int = 0) -> Random | Choice:
     return Random(seed, task.formulas.actions)
 
 
-class FeedbackController:
+class FeedbackController(ABC):
     """Base of the controllers without memory: a control for each state.
 
     A subclass defines `control`. Controls beyond the task's limit are clipped.
@@ -139,9 +140,9 @@ class FeedbackController:
         self.task = task
         self.read = ObservationDecoder(task)
 
+    @abstractmethod
     def control(self, state: Array, target: Array) -> Array:
         """Return the control [SI unit] for states (..., n_state) and targets (...)."""
-        raise NotImplementedError
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
