@@ -18,8 +18,7 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import Kernels, at_once, interleaved
 from lag_envs.scenes import CylinderInCylinder, Incline, PivotedBar
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.flows import Flow, pendulum_flow
+from lag_envs.stepping.flows import pendulum_flow
 from lag_envs.tasks.base import Task
 
 if TYPE_CHECKING:
@@ -117,25 +116,13 @@ def carried(task: Task) -> Row:
         "state": list(scene.state_names) + (["cos", "sin"] if stepped.angle is not None else []),
         "terms": [name for name, there in code.terms.items() if there],
         "left_out": [name for name, there in code.terms.items() if not there],
-        "stages": stages(stepped.flow),
+        "stages": stepped.flow.method,
         "constants": program.constants,
         "zero": sorted(absent),
         "operations": code.operations,
         "unused": [name.removeprefix("k_") for name in given if name not in needed],
         "idle": [name for line in lines for name in made(line) if name not in needed],
     }
-
-
-def stages(flow: Flow) -> str:
-    """Say how a step is taken."""
-    kind = flow.coefficients
-    if kind is pendulum.Coefficients:
-        return f"one Taylor series of order {flow.order}, no trigonometry"
-    return (
-        "closed form"
-        if kind is slope.FixedSlope
-        else f"series of order {slope.TURN_ORDER}, summed to rounding"
-    )
 
 
 def made(line: str) -> list[str]:

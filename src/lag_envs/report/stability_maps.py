@@ -10,7 +10,6 @@ import numpy as np
 from lag_envs.report.cases import VARIANTS, Case
 from lag_envs.report.stepped import Stepped
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping import pendulum
 
 #: Start (entries that float32 holds exactly) and control of the maps.
 STARTS: dict[str, tuple[tuple[float, ...], float]] = {
@@ -41,7 +40,7 @@ def _drag(scene: Scene) -> float:
     """Return the rate at which drag alone would slow the motion down, without control [1/s]."""
     stepped = Stepped(scene)
     found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
-    return float(found.gamma if isinstance(found, pendulum.Coefficients) else found.damping_rate)
+    return float(found.damping_rate)
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:

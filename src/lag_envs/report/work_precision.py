@@ -28,7 +28,6 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.report.timing import Kernels, Sample, interleaved
 from lag_envs.report.verdicts import ROUNDING, content
 from lag_envs.scenes.base import Scene
-from lag_envs.stepping import pendulum
 from lag_envs.stepping.flows import Flow
 
 __all__ = ["content", "errors", "jobs", "orders", "points"]
@@ -125,7 +124,8 @@ def problems(variant: str, horizon: str, cases: Sequence[Case]) -> list[Case]:
 
 
 def _undamped(scene: Scene) -> Scene:
-    if Stepped(scene).flow.coefficients is not pendulum.Coefficients:
+    """Return a scene whose motion has a closed form: what is stepped by series has none with damping."""
+    if not Stepped(scene).flow.order:
         return scene
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
 
@@ -356,7 +356,7 @@ class Series(NamedTuple):
 def series(scene: Scene, quick: bool = False) -> list[Series]:
     """Return all methods that have an order: the series of ours at several, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
-    if flow.coefficients is pendulum.Coefficients:
+    if flow.order:
         found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
     forms = {"": False, Compiled.CARRIED: True}
     found += [

@@ -31,8 +31,9 @@ class Flow(NamedTuple):
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
     makes the scalar function for any step. ``compile_tangent(present, by)`` makes the one that differentiates
-    steps, by the variables and by the coefficients that are named. ``order`` is that of the series, 0 for a
-    closed form; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
+    steps, by the variables and by the coefficients that are named. ``order`` is that of the certified series,
+    0 where there is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
+    ``method`` says in words how a step is taken.
     """
 
     size: int
@@ -42,6 +43,7 @@ class Flow(NamedTuple):
     within: Callable
     compile: Callable
     compile_tangent: Callable
+    method: str
     tolerance: float = pendulum.TOLERANCE
 
 
@@ -61,6 +63,7 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
         lambda present: pendulum.compile_flow(present, order, tolerance),
         lambda present, by: pendulum.compile_tangent(present, by, order, tolerance),
+        f"one Taylor series of order {order}, no trigonometry",
         tolerance,
     )
 
@@ -78,6 +81,7 @@ SLIDE = Flow(
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
     slope.compile_slide,
     slope.compile_slide_tangent,
+    "closed form",
 )
 TURN = Flow(
     4,
@@ -87,6 +91,7 @@ TURN = Flow(
     lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp),
     slope.compile_turn,
     slope.compile_turn_tangent,
+    f"series of order {slope.TURN_ORDER}, summed to rounding",
 )
 
 

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,20 +49,20 @@ class NormalForm:
 
     Attributes
     ----------
+    kind : type
+        The flow's coefficients.
     layout : Layout
         Names of coordinates, controls and state.
-    kind : type
-        `pendulum.Coefficients`, `slope.FixedSlope` or `slope.TurningSlope`.
     terms : mapping
-        For each coefficient of the kind its terms.
+        For each coefficient its terms.
     expressions : mapping
         For each constant what it is, times the inertia.
     inertia : Expr
         The free coordinate's entry of the mass matrix.
     """
 
+    kind: ClassVar[type[Any]]
     layout: Layout
-    kind: type[Any]
     terms: Mapping[str, tuple[Term, ...]]
     expressions: Mapping[str, Expr]
     inertia: Expr
@@ -75,10 +75,7 @@ class NormalForm:
     @property
     def angle(self) -> int | None:
         """Index of the state whose cosine and sine travel along, or None."""
-        if self.kind is slope.FixedSlope:
-            return None
-        moving = self.layout.free[0] if self.kind is pendulum.Coefficients else self.layout.at("rate")[0].name
-        return self._index(moving, "place")
+        return None
 
     @property
     def width(self) -> int:
@@ -91,19 +88,12 @@ class NormalForm:
         )
 
     def order(self, dt: float) -> int:
-        """Return the order of the pendulum's series for a control step; 0 where there is no such series.
-
-        With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
-        strong, call for order 20: with it one of 0.05 s is certified up to 9.5 rad/s, where 16 takes two.
-        """
-        if self.kind is not pendulum.Coefficients:
-            return 0
-        brakes = any(term.held.number is None for term in self.terms["gamma"])
-        return 20 if brakes or dt > 0.03 else 14
+        """Return the order of the flow's series for a control step; 0 where there is no such series."""
+        return 0
 
     def flow(self, dt: float) -> Flow:
         """Return the exact flow for control steps of this length."""
-        return self.stepper(dt).flow
+        raise NotImplementedError
 
     def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
         """Return the constants, each rounded once; `functions` has sine, cosine and the like."""
@@ -131,21 +121,21 @@ class NormalForm:
                 held = evaluate([term.held], values, xp)[0]
                 total = total + (constant if term.held.number == 1.0 else constant * held)
             found[name] = total
-        if self.kind is slope.TurningSlope:
-            found["rate"] = self._rate(u)
-        return self.kind(**found)
+        return self.kind(**found, **self._held(u))
 
-    def _rate(self, u: Sequence) -> Any:
-        """Return the rate that is held, of the turning slope."""
-        return u[self.layout.controls.index(self.layout.at("rate")[0].control or "")]
+    def _held(self, u: Sequence) -> Mapping[str, Any]:
+        """Return the coefficients that are controls."""
+        return {}
+
+    def _carried(self, u: Sequence, k: Any) -> Any:
+        """Return the part of the momentum that is no velocity of the free coordinate."""
+        return 0.0
 
     def unpack(self, y: Sequence, u: Sequence, k: Any) -> list:
         """Return the flow's variables: place and velocity, and cosine and sine of the angle."""
         free = self.layout.free[0]
         q, v = y[self._index(free, "place")], y[self._index(free, "velocity", "momentum")]
-        if self.kind is slope.TurningSlope:
-            v = v - k.shift * self._rate(u)
-        return [q, v, *y[len(self.layout.state) :]]
+        return [q, v - self._carried(u, k), *y[len(self.layout.state) :]]
 
     def pack(self, moved: Sequence, y: Sequence, u: Sequence, dt: Any, k: Any) -> list:
         """Return the lifted state at the step's end, from the moved variables."""
@@ -156,8 +146,7 @@ class NormalForm:
             if by is None and entry.kind == "place":
                 after.append(moved[0])
             elif by is None:
-                carried = k.shift * self._rate(u) if entry.kind == "momentum" else 0.0
-                after.append(moved[1] + carried)
+                after.append(moved[1] + (self._carried(u, k) if entry.kind == "momentum" else 0.0))
             elif entry.kind == "velocity" or by.level == "rate":
                 after.append(given[entry.name] + dt * given[by.control or ""])
             else:
@@ -208,19 +197,60 @@ class NormalForm:
         is below 0 where drive, drag or field are too strong for one series at any speed, and None for a form
         that is stepped to rounding.
         """
-        if self.kind is not pendulum.Coefficients:
-            return None
-        drive = pendulum.Coefficients(*map(float, self.coefficients(state, controls, constants)))
-        return pendulum.certified_speed(drive, dt, self.order(dt))
+        return None
 
     def step_bound(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> StepBound:
         """Return what is known of a step before it is taken; see `Scene.step_bound`."""
+        return StepBound(1, 0, dict.fromkeys(self.state_names, 0.0), "stepped to rounding")
+
+    def stepper(self, dt: float, absent: frozenset[str] = frozenset()) -> Stepper:
+        """Return the code of a control step; constants that are zero leave none."""
+        return _stepper(self, self.flow(dt), absent)
+
+
+@cache
+def _stepper(form: NormalForm, flow: Flow, absent: frozenset[str]) -> Stepper:
+    return Stepper(form, flow, absent)
+
+
+class DrivenPendulum(NormalForm):
+    """The driven pendulum: a certified Taylor series."""
+
+    kind = pendulum.Coefficients
+
+    @property
+    def angle(self) -> int:
+        """Index of the pendulum's angle."""
+        return self._index(self.layout.free[0], "place")
+
+    def order(self, dt: float) -> int:
+        """Return the order of the series for a control step.
+
+        With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
+        strong, call for order 20: with it one of 0.05 s is certified up to 9.5 rad/s, where 16 takes two.
+        """
+        brakes = any(term.held.number is None for term in self.terms["gamma"])
+        return 20 if brakes or dt > 0.03 else 14
+
+    def flow(self, dt: float) -> Flow:
+        """Return the exact flow for control steps of this length."""
+        return pendulum_flow(self.order(dt))
+
+    def certified_speed(
+        self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
+    ) -> float:
+        """Return the |q'| up to which one series per step is certified [rad/s]; see `NormalForm`."""
+        drive = self.kind(*map(float, self.coefficients(state, controls, constants)))
+        return pendulum.certified_speed(drive, dt, self.order(dt))
+
+    def step_bound(
+        self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
+    ) -> StepBound:
+        """Return the bound that is proved before the step."""
         bounds = dict.fromkeys(self.state_names, 0.0)
-        if self.kind is not pendulum.Coefficients:
-            return StepBound(1, 0, bounds, "stepped to rounding")
-        drive = pendulum.Coefficients(*map(float, self.coefficients(state, controls, constants)))
+        drive = self.kind(*map(float, self.coefficients(state, controls, constants)))
         free = self.layout.free[0]
         moving = [self._index(free, kind) for kind in ("place", "velocity")]
         found = pendulum.truncation_bound(float(np.asarray(state)[moving[1]]), drive, dt, self.order(dt))
@@ -228,15 +258,36 @@ class NormalForm:
             bounds[self.state_names[i]] = bound
         return StepBound(found.substeps, found.order, bounds, "proved before the step")
 
-    def stepper(self, dt: float, absent: frozenset[str] = frozenset()) -> Stepper:
-        """Return the code of a control step; constants that are zero leave none."""
-        return _stepper(self, self.order(dt), absent)
+
+class FixedSlope(NormalForm):
+    """The fixed slope: a closed form."""
+
+    kind = slope.FixedSlope
+
+    def flow(self, dt: float) -> Flow:
+        """Return the exact flow."""
+        return SLIDE
 
 
-@cache
-def _stepper(form: NormalForm, order: int, absent: frozenset[str]) -> Stepper:
-    flow = {slope.FixedSlope: SLIDE, slope.TurningSlope: TURN}.get(form.kind) or pendulum_flow(order)
-    return Stepper(form, flow, absent)
+class TurningSlope(NormalForm):
+    """The slope that turns at a rate that is held: a series summed to rounding."""
+
+    kind = slope.TurningSlope
+
+    @property
+    def angle(self) -> int:
+        """Index of the slope's angle."""
+        return self._index(self.layout.at("rate")[0].name, "place")
+
+    def flow(self, dt: float) -> Flow:
+        """Return the exact flow."""
+        return TURN
+
+    def _held(self, u: Sequence) -> Mapping[str, Any]:
+        return {"rate": u[self.layout.controls.index(self.layout.at("rate")[0].control or "")]}
+
+    def _carried(self, u: Sequence, k: Any) -> Any:
+        return k.shift * self._held(u)["rate"]
 
 
 def _float(x: Any, divisor: Any) -> float:
@@ -279,7 +330,7 @@ def _recognised(m: Mechanics) -> NormalForm | None:
         return _turning(m, parts)
     if parts.keys() <= {"", "gamma"}:
         terms = {"acceleration": parts.get("", {}), "damping_rate": _negative(parts.get("gamma", {}))}
-        return _form(m, slope.FixedSlope, terms)
+        return _form(m, FixedSlope, terms)
     if not parts.keys() & {"alpha", "beta"}:
         return None
     delta, ramp = dict(parts.get("", {})), {}
@@ -290,7 +341,7 @@ def _recognised(m: Mechanics) -> NormalForm | None:
             delta[Expr.of(velocity(p.name)).text] = Expr.of(velocity(p.name)), constant[1]
             ramp[Expr.of(control(p.control or "")).text] = Expr.of(control(p.control or "")), constant[1]
     terms = {name: _negative(parts.get(name, {})) for name in ("alpha", "beta", "gamma")}
-    return _form(m, pendulum.Coefficients, terms | {"delta": delta, "ramp": ramp})
+    return _form(m, DrivenPendulum, terms | {"delta": delta, "ramp": ramp})
 
 
 #: What is held, by its text, with the constant that multiplies it.
@@ -351,11 +402,14 @@ def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
         "gravity": parts.get("gravity", {}),
         "damping_rate": _negative(parts.get("gamma", {})),
     }
-    return _form(m, slope.TurningSlope, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
+    return _form(m, TurningSlope, terms, {"shift": m.coupling.get((0, rate.name), Expr({}))})
 
 
 def _form(
-    m: Mechanics, kind: type[Any], parts: Mapping[str, _Parts], others: Mapping[str, Expr] | None = None
+    m: Mechanics,
+    form: type[NormalForm],
+    parts: Mapping[str, _Parts],
+    others: Mapping[str, Expr] | None = None,
 ) -> NormalForm:
     """Give names to constants; equal ones share a name."""
     expressions: dict[str, Expr] = dict(others or {})
@@ -370,4 +424,4 @@ def _form(
                 expressions[name] = constant
             found.append(Term(names[constant.text], held))
         terms[coefficient] = tuple(found)
-    return NormalForm(m.layout, kind, terms, expressions, m.entry(0, 0))
+    return form(m.layout, terms, expressions, m.entry(0, 0))

@@ -56,6 +56,11 @@ class Coefficients(NamedTuple):
     delta: Any = 0.0  # [rad/s²]
     ramp: Any = 0.0  # [rad/s³]
 
+    @property
+    def damping_rate(self) -> Any:
+        """The rate at which drag alone slows the motion down [1/s]; every flow's coefficients have it."""
+        return self.gamma
+
 
 def acceleration(theta_dot: Any, c: Any, s: Any, coeffs: Coefficients) -> Any:
     """Return theta'' at the start of the step, where t = 0."""
