@@ -341,7 +341,9 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
         return {
             "s": ("m", "place of the support"),
             "s_dot": ("m/s", "its speed"),
-            **{name.replace("theta", "e"): ("rad", f"angle from upright, {name} - π") for name in self.angles},
+            **{
+                name.replace("theta", "e"): ("rad", f"angle from upright, {name} - π") for name in self.angles
+            },
             **{f"{name}_dot": ("rad/s", f"rate of {name}") for name in self.angles},
         }
 
@@ -398,7 +400,9 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
         if any(abs(angle - math.pi) > self.largest_angle for angle in angles) or (
             abs(state.s) > self.scene.track
         ):
-            given = ", ".join(f"{name}={angle:g} rad" for name, angle in zip(self.angles, angles, strict=True))
+            given = ", ".join(
+                f"{name}={angle:g} rad" for name, angle in zip(self.angles, angles, strict=True)
+            )
             raise ValueError(
                 f"the episode would be over at s={state.s:g} m, {given}: |theta - pi| must be at most "
                 f"{self.largest_angle} rad and |s| at most {self.scene.track:g} m"
