@@ -106,10 +106,7 @@ class ILQR:
                 getattr(plan, name)[fresh] = getattr(new, name)
             plan.step[fresh] = 0
         rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
-        off = x - plan.states[rows, now]
-        if self.read.wrapped is not None:  # a plan goes on beyond ±π
-            angle = off[:, self.read.wrapped]
-            off[:, self.read.wrapped] = angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
+        off = self.read.difference(x, plan.states[rows, now])  # a plan goes on beyond ±π
         action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
         memory = plan.memory
         if (plan.step >= self.steps).any():
