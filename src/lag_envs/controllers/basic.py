@@ -211,7 +211,7 @@ class ObservationDecoder:
         return state, lifted[..., self._width]
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return states (..., n_state) minus others, by the shorter way around where only that can be seen."""
+        """Return states (..., n_state) minus others, the shorter way around where only that is seen."""
         off = states - others
         for i in self.wrapped:
             off[..., i] -= 2.0 * np.pi * np.rint(off[..., i] / (2.0 * np.pi))

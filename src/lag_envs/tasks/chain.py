@@ -83,15 +83,15 @@ class SwingUp(GuardedTrack, _Chain):
 
     ## Rewards
 
-    Each step pays h⁴ - 0.02 (u/U)². The height h of the chain's end is 0 hanging and 1 upright, taken at the
-    step's end; u is the acceleration that was applied. A chain that spins, or one that stands on its upper bar
-    with the lower bars hanging, earns little because of the fourth power. With another `dt` rewards are scaled
-    by dt/0.02, so a second is always worth the same.
+    Each step pays h⁴ - 0.02 (u/U)². The height h of the chain's end is 0 hanging and 1 upright, taken at
+    the step's end; u is the acceleration that was applied. Because of the fourth power a chain that spins
+    earns little, and so does one whose upper bar stands while the lower one hangs. With another `dt` rewards
+    are scaled by dt/0.02, so a second is always worth the same.
 
     ## Starting State
 
-    The chain hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused. The
-    half width of s is a tenth of the track's.
+    The chain hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused.
+    The half width of s is a tenth of the track's.
 
     ## Episode End
 
@@ -113,7 +113,7 @@ class SwingUp(GuardedTrack, _Chain):
 
     ## Numerical Accuracy
 
-    s and s' are exact to rounding. The lower bar whips: a step is divided where one series would not converge.
+    s and s' are exact to rounding. The last bar whips: a step is divided where one series would not converge.
 
     ## Known Returns
 
@@ -152,8 +152,8 @@ class SwingUp(GuardedTrack, _Chain):
         "to come upright at the same moment and at rest, which the chaotic swing before makes hard to time."
     )
     note = """
-Best known is planning anew for each start. One recorded plan with time-varying feedback is nearly as good, for
-all starts are near to each other.
+Best known is planning anew for each start. One recorded plan with time-varying feedback is nearly as good,
+for all starts are near to each other.
 """
 
     @property
@@ -211,8 +211,8 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     largest = 5.0
 
     difficulty = (
-        "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped in "
-        "over several swings, and a deviation at the top that a strong support would catch is lost."
+        "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
+        "in over several swings, and a deviation at the top that a strong support would catch is lost."
     )
 
 
@@ -255,16 +255,16 @@ class Balance(_Chain):
 
     ## Rewards
 
-    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, the mean taken over the bars, at the step's end and before
-    a kick; S is half the track. Inside the limits that lies between 0 and 1. With another `dt` rewards are
-    scaled by dt/0.02.
+    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, the mean taken over the bars, at the step's end and
+    before a kick; S is half the track. Inside the limits that lies between 0 and 1. With another `dt` rewards
+    are scaled by dt/0.02.
 
     ## Starting State
 
     The bars are nearly upright. Given starts must lie inside the limits below.
 
-    After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes the last bar's
-    rate by a uniform amount within ±1 rad/s.
+    After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes the last
+    bar's rate by a uniform amount within ±1 rad/s.
 
     ## Episode End
 
@@ -342,7 +342,7 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
             "s": ("m", "place of the support"),
             "s_dot": ("m/s", "its speed"),
             **{
-                name.replace("theta", "e"): ("rad", f"angle from upright, {name} - π") for name in self.angles
+                f"e_{i + 1}": ("rad", f"angle from upright, {name} - π") for i, name in enumerate(self.angles)
             },
             **{f"{name}_dot": ("rad/s", f"rate of {name}") for name in self.angles},
         }
@@ -356,7 +356,7 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
 
     def leaning(self, state: Any) -> dict[str, Any]:
         """Return the angles from upright."""
-        return {name.replace("theta", "e"): state[name] - math.pi for name in self.angles}
+        return {f"e_{i + 1}": state[name] - math.pi for i, name in enumerate(self.angles)}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return 1 - mean((e/0.35)²)/2 - (s/S)²/2."""
@@ -390,19 +390,15 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
         slide = FASTEST_START + self.largest * self.duration
         turn = self.fastest_turn(kick=self.largest_kick)
         found = {"s": self.scene.track + slide * self.dt, "s_dot": slide}
-        for name in self.angles:
-            found |= {name.replace("theta", "e"): self.largest_angle + turn * self.dt, f"{name}_dot": turn}
+        for i, name in enumerate(self.angles):
+            found |= {f"e_{i + 1}": self.largest_angle + turn * self.dt, f"{name}_dot": turn}
         return found
 
     def check_start(self, state: Any) -> None:
         """Refuse a start at which the episode would be over."""
-        angles = [state[name] for name in self.angles]
-        if any(abs(angle - math.pi) > self.largest_angle for angle in angles) or (
-            abs(state.s) > self.scene.track
-        ):
-            given = ", ".join(
-                f"{name}={angle:g} rad" for name, angle in zip(self.angles, angles, strict=True)
-            )
+        leaning = max(abs(e) for e in self.leaning(state).values())
+        if leaning > self.largest_angle or abs(state.s) > self.scene.track:
+            given = ", ".join(f"{name}={state[name]:g} rad" for name in self.angles)
             raise ValueError(
                 f"the episode would be over at s={state.s:g} m, {given}: |theta - pi| must be at most "
                 f"{self.largest_angle} rad and |s| at most {self.scene.track:g} m"
