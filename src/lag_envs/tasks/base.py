@@ -92,6 +92,8 @@ class Task:
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
         The grid on which ``python -m agents.optimum`` solves it.
+    plans : record.Plans, optional
+        How ``python -m agents.optimum`` finds the plan that ships with the package.
     optimum : record.Optimum, optional
         The largest return from given starts, where it is known.
     examples : record.Examples
@@ -132,6 +134,7 @@ class Task:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     goal: ClassVar[Goal | None] = None
     value_iteration: ClassVar[ValueIteration | None] = None
+    plans: Any = None
     optimum: ClassVar[Optimum | None] = None
     examples: ClassVar[Examples] = Examples()
     difficulty: ClassVar[str] = ""

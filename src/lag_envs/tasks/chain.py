@@ -9,7 +9,7 @@ from typing import Any
 from lag_envs.scenes import Chain
 from lag_envs.scenes.shapes import Bodies, Polygon
 from lag_envs.tasks.base import FASTEST_START
-from lag_envs.tasks.record import Examples, Goal
+from lag_envs.tasks.record import Examples, Goal, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
@@ -156,6 +156,25 @@ Best known is planning anew for each start. One recorded plan with time-varying 
 for all starts are near to each other.
 """
 
+    steps_of_plan, batch, iterations, price, share = 75, 32, 120, 0.05, 0.9
+
+    @property
+    def plans(self) -> Plans:
+        """How the swing-up is planned; the feedback minds the angles most."""
+        weights = {"s": 0.1 / self.length**2, "s_dot": 0.1}
+        for name in self.angles:
+            weights |= {name: 1.0, f"{name}_dot": 0.02}
+        return Plans(
+            "lag_envs.controllers.chain:easier",
+            {"effort": self.price, "share": self.share},
+            steps=self.steps_of_plan,
+            batch=self.batch,
+            iterations=self.iterations,
+            rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
+            weights=weights,
+            effort=0.02,
+        )
+
     @property
     def quantities(self) -> Mapping[str, tuple[str, str]]:  # type: ignore[override]
         """The observation's units and meanings."""
@@ -209,6 +228,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     id = "DoubleBarWeak-v0"
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
+    steps_of_plan = 115
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -221,6 +241,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     id = "TripleBar-v0"
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
+    steps_of_plan, batch, iterations, price, share = 150, 28, 180, 0.02, 0.85
 
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0, 1.0, 2.0]},
