@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
-from lag_envs.tasks.base import Task
+from lag_envs.tasks.base import Lifted, Task
 
 Array = NDArray[np.float64]
 
@@ -159,30 +159,42 @@ def as_actions(values: Array) -> NDArray[np.float32]:
 class ObservationDecoder:
     """Reads states and targets from observations.
 
-    What a task observes is linear in the lifted state and the target; so it is inverted from the values at
-    zero and at the unit vectors.
+    What a task observes is linear in the state, in cosine and sine of its angles, and in the target; so it is
+    inverted from the values at zero and at the unit vectors.
 
     Parameters
     ----------
     task : Task
-        The task.
+        The task, with one target at most.
     """
 
     def __init__(self, task: Task) -> None:
         formulas, form = task.formulas, task.scene._form
         if formulas.targets > 1:
             raise ValueError(f"{type(task).__name__} has {formulas.targets} targets; one at most can be read")
-        k, angle = SimpleNamespace(**formulas.constants()), form.angle if form else None
+        k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
-        self._width = form.width if form else self._n
+        entries = enumerate(task.scene._layout.state)
+        angles = [i for i, entry in entries if entry.kind == "place" and entry.unit == "rad"]
+        self._width = self._n + 2 * len(angles)
+
+        def seen(row: NDArray[np.float64]) -> list:
+            """Return the observation of a state, cosines and sines of its angles, and a target."""
+            state = list(row[: self._n])
+            circles = row[self._n : self._width].reshape(-1, 2)
+            known = [(state[i], *circle) for i, circle in zip(angles, circles, strict=True)]
+            if form is not None and form.angle is not None:
+                state += circles[angles.index(form.angle)].tolist()
+            return formulas.observe(Lifted(np, known), state, [row[-1]] * formulas.targets, k)
+
         rows = np.vstack([np.zeros(self._width + 1), np.eye(self._width + 1)])
-        seen = np.array(
-            [formulas.observe(np, list(row[:-1]), [row[-1]] * formulas.targets, k) for row in rows]
-        )
-        self._zero, slopes = seen[0], seen[1:] - seen[0]
+        values = np.array([seen(row) for row in rows])
+        self._zero, slopes = values[0], values[1:] - values[0]
         self._inverse = np.linalg.pinv(slopes)
-        #: Index of an angle that is seen by its cosine and sine only, and so lies in [-π, π]; or None.
-        self.wrapped = None if angle is None or slopes[angle].any() else angle
+        #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
+        pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
+        self._pairs = [(i, j) for i, j in pairs if slopes[j].any() and slopes[j + 1].any()]
+        self.wrapped = [i for i, _ in self._pairs]
 
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
         """Return states (..., n_state) and targets (...) for observations (..., n)."""
@@ -194,6 +206,13 @@ class ObservationDecoder:
             )
         lifted = (values - self._zero) @ self._inverse
         state = lifted[..., : self._n].copy()
-        if self.wrapped is not None:
-            state[..., self.wrapped] = np.arctan2(lifted[..., self._n + 1], lifted[..., self._n])
+        for i, j in self._pairs:
+            state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])
         return state, lifted[..., self._width]
+
+    def difference(self, states: Array, others: Array) -> Array:
+        """Return states (..., n_state) minus others, the shorter way around where only that is seen."""
+        off = states - others
+        for i in self.wrapped:
+            off[..., i] -= 2.0 * np.pi * np.rint(off[..., i] / (2.0 * np.pi))
+        return off

@@ -43,7 +43,7 @@ class ILQR:
     task : Task
         The task with its parameters, ``env.unwrapped.task``; one without random kicks.
     guesses : sequence of controllers
-        What to start from; each is improved, and the best plan is played.
+        What to start from; each is improved, and the best plan is played. `improve` alone needs none.
     after : controller, optional
         Who goes on where the plan ends before the episode; by default the first guess.
     tail : callable, optional
@@ -75,7 +75,7 @@ class ILQR:
         if task.draws:
             raise ValueError(f"{type(task).__name__} has random kicks, which a plan does not foresee")
         self.task, self.guesses, self.tail = task, guesses, tail
-        self.after = guesses[0] if after is None else after
+        self.after = guesses[0] if after is None and guesses else after
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
         self.iterations, self.tolerance = iterations, tolerance
         self.flat = FLAT * task.dt / task.interval
@@ -106,10 +106,7 @@ class ILQR:
                 getattr(plan, name)[fresh] = getattr(new, name)
             plan.step[fresh] = 0
         rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
-        off = x - plan.states[rows, now]
-        if self.read.wrapped is not None:  # a plan goes on beyond ±π
-            angle = off[:, self.read.wrapped]
-            off[:, self.read.wrapped] = angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
+        off = self.read.difference(x, plan.states[rows, now])  # a plan goes on beyond ±π
         action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
         memory = plan.memory
         if (plan.step >= self.steps).any():
@@ -130,7 +127,7 @@ class ILQR:
         most = np.full(len(starts), -math.inf)
         for guess in self.guesses:
             actions = self._guess(guess, starts, targets)
-            plan, returns = self._improve(starts, targets, actions)
+            plan, returns = self.improve(starts, targets, actions)
             if best is None:
                 best, most = plan, returns
                 continue
@@ -165,8 +162,8 @@ class ILQR:
             x = self._step(x, actions[:, t], targets)[0]
         return actions
 
-    def _improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps), and their returns (n,)."""
+    def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
+        """Return plans improved from actions (n, steps), and their returns (n,), less what the tail costs."""
         n = len(starts)
         plan = self._blank(n)
         states, actions, returns = self._play(

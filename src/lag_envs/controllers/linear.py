@@ -71,3 +71,62 @@ def regulator(
     q, r = c[:-1, :-1], c[-1:, -1:]
     p = solve_discrete_are(a, b, q, r)
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)[0], p
+
+
+def time_varying(
+    task: Task,
+    states: Array,
+    actions: Array,
+    rest: Sequence[float],
+    weights: Mapping[str, float],
+    effort: float,
+) -> tuple[Array, Array]:
+    """Return the feedback that keeps a task to a plan, and that which holds it at rest.
+
+    Both minimise the sum of weighted squares of deviations from the plan, the first from its end backwards,
+    where the second takes over.
+
+    Parameters
+    ----------
+    task : Task
+        The task, with one control.
+    states : ndarray, shape (steps + 1, n_state)
+        The plan's states.
+    actions : ndarray, shape (steps,)
+        Its actions.
+    rest : sequence of float, shape (n_state,)
+        The equilibrium at its end.
+    weights : mapping of str to float
+        Weights of squares of deviations, by entry of the state.
+    effort : float
+        Weight of the square of an action's deviation.
+
+    Returns
+    -------
+    gains : ndarray, shape (steps, n_state)
+        K_t of δa = -K_t δx.
+    hold : ndarray, shape (n_state,)
+        The same at rest.
+    """
+    scene = task.scene
+    q, r = np.diag([weights.get(name, 0.0) for name in scene.state_names]), np.array([[effort]])
+    unit = task.wanted([1.0]) - task.wanted([0.0])
+    column = int(np.flatnonzero(unit[0])[0])
+    a, b = scene.jacobian(rest, task.wanted([task.formulas.action(0.0)])[0], task.dt)
+    b = b[:, column : column + 1] * unit[0, column]
+    p = solve_discrete_are(a, b, q, r)
+
+    def gain(a: Array, b: Array, p: Array) -> Array:
+        return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+
+    hold = gain(a, b, p)[0]
+    gains = np.empty((len(actions), len(rest)))
+    if not len(actions):
+        return gains, hold
+    along, by = scene.jacobian(states[:-1], task.wanted(actions), task.dt)
+    for t in range(len(actions) - 1, -1, -1):
+        a, b = along[t], by[t][:, column : column + 1] * unit[0, column]
+        k = gain(a, b, p)
+        gains[t], closed = k[0], a - b @ k
+        p = q + k.T @ r @ k + closed.T @ p @ closed
+    return gains, hold

@@ -385,8 +385,9 @@ class _Grid:
         from lag_envs.leaderboard.kernels import interpolate
 
         time = taken * self.about.task.interval
-        if (angle := self.wrapped) is not None:
+        if self.wrapped:
             states = states.copy()
+        for angle in self.wrapped:
             states[:, angle] = np.remainder(states[:, angle] + math.pi, 2.0 * math.pi) - math.pi
         given = [*states.T, targets, time]
         # Sums by hand: a matrix product's bits may depend on the number of rows.

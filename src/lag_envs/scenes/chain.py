@@ -21,11 +21,13 @@ One bar is a `PivotedBar`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
+from lag_envs.scenes import shapes
 from lag_envs.scenes.acrobot import link
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Bodies, Polygon, Shape
+from lag_envs.scenes.shapes import Arrow, Bodies, Polygon, Window
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,8 @@ class Chain(Scene):
         Coefficient b of the viscous torque in each joint.
     gravity : float [m/s²]
         Field g, downward.
+    track : float [m]
+        Travel S of the support to either side, for tasks with a track. `simulate` does not enforce it.
 
     Notes
     -----
@@ -62,6 +66,7 @@ class Chain(Scene):
     inertia: float = parameter(lambda chain: chain.mass * chain.length**2 / 12, "kg m²", least=0.0)
     damping: float = parameter(0.0, "N m s", least=0.0)
     gravity: float = parameter(9.81, "m/s²", least=0.0)
+    track: float = parameter(math.inf, "m", above=0.0, endless=True)
 
     prescribed = {"s": "m", "rise": "m"}
     controls = {"s_ddot": "m/s²"}
@@ -110,9 +115,25 @@ class Chain(Scene):
         return poses
 
     def bodies(self) -> Bodies:
-        """Return the support, and the bars as they hang down."""
+        """Return the rail, the support, the bars as they hang down, and an arrow for the acceleration."""
         wide, high = 0.2 * self.length, 0.08 * self.length
-        support: list[Shape] = [
-            Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame")
-        ]
-        return {"support": support, **{f"bar_{i + 1}": link(self.length) for i in range(self.bars)}}
+        return {
+            "ground": shapes.rail(self.track, self.reach),
+            "line": shapes.rail_without_end(self.track, self.reach),
+            "support": [Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame")],
+            **{f"bar_{i + 1}": link(self.length) for i in range(self.bars)},
+            "push": [Arrow([(0.0, wide), (0.0, wide + 0.45 * self.reach)])],
+        }
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the rail without end and the arrow are."""
+        return {"line": (now.q.s, 0.0), "push": (now.q.s, 0.0, -0.5 * math.pi, now.share[0])}
+
+    @property
+    def reach(self) -> float:
+        """Length of the chain [m]."""
+        return self.bars * self.length
+
+    def window(self) -> Window:
+        """Return a window on the whole track, or one that follows the support."""
+        return shapes.window_on_rail(self.track, 1.08 * self.reach)

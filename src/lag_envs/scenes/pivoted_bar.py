@@ -24,7 +24,7 @@ from typing import Any
 
 from lag_envs.scenes import shapes
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Arrow, Bodies, Circle, Line, Polygon, Role, Ruler, Shape, Window
+from lag_envs.scenes.shapes import Arrow, Bodies, Circle, Line, Polygon, Role, Window
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,8 +104,8 @@ class PivotedBar(Scene):
         wide, high = 0.11 * self.reach, 0.05 * self.reach
         com = (0.0, -self.com_distance)
         return {
-            "ground": self._rail(),
-            "line": self._endless_rail(),
+            "ground": shapes.rail(self.track, self.reach),
+            "line": shapes.rail_without_end(self.track, self.reach),
             "support": [
                 Line([(0.0, 0.0), (0.0, -0.4 * self.reach)], "guide"),
                 Polygon([(-wide, -high), (wide, -high), (wide, high), (-wide, high)], "frame"),
@@ -140,29 +140,6 @@ class PivotedBar(Scene):
         """Distance from the pivot to the far end of a uniform bar with this mass, centre and inertia [m]."""
         return self.com_distance + 0.5 * math.sqrt(12.0 * self.inertia / self.mass)
 
-    def _rail(self) -> list[Shape]:
-        """Return what stays where it is: a track with its ends, or the ticks of one without."""
-        if self.track is None:
-            return [Line([(-2.0 * self.reach, 0.0), (2.0 * self.reach, 0.0)], "guide")]
-        size = 0.035 * self.reach
-        if math.isinf(self.track):
-            return [Ruler(shapes.round_length(0.6 * self.reach), size)]
-        low, high = -self.track, self.track
-        step = shapes.round_length(0.2 * self.track)
-        return [
-            *(Line([(x, 0.0), (x, -size)], "ground") for x in shapes.ticks(low, high, step)),
-            Line([(low, 0.0), (high, 0.0)], "frame"),
-            *(Line([(end, -2.0 * size), (end, 2.0 * size)], "limit") for end in (low, high)),
-        ]
-
-    def _endless_rail(self) -> list[Shape]:
-        """Return the part of a track without ends that goes along with the support."""
-        far = 3.0 * self.reach
-        return [Line([(-far, 0.0), (far, 0.0)], "frame")] if self.track == math.inf else []
-
     def window(self) -> Window:
         """Return a window on the whole track, or one that follows the support."""
-        tall = 1.08 * self.reach
-        if self.track is None or math.isinf(self.track):
-            return Window(-tall, -tall, tall, tall, "support")
-        return Window(-self.track - tall, -tall, self.track + tall, tall)
+        return shapes.window_on_rail(self.track, 1.08 * self.reach)

@@ -224,6 +224,40 @@ def share_of_half_turn(angle: Any, xp: Any) -> Any:
     return 2.0 / math.pi * xp.atan(xp.sin(angle) / xp.maximum(1.0 + xp.cos(angle), 1e-9))
 
 
+def rail(track: float | None, reach: float) -> list[Shape]:
+    """Return what of a rail stays where it is: a track with its ends, or the ticks of one without.
+
+    Parameters
+    ----------
+    track : float [m] or None
+        Half length of the track; infinity for one without an end, None for none.
+    reach : float [m]
+        Size of what hangs from the support.
+    """
+    if track is None:
+        return [Line([(-2.0 * reach, 0.0), (2.0 * reach, 0.0)], "guide")]
+    size = 0.035 * reach
+    if math.isinf(track):
+        return [Ruler(round_length(0.6 * reach), size)]
+    return [
+        *(Line([(x, 0.0), (x, -size)], "ground") for x in ticks(-track, track, round_length(0.2 * track))),
+        Line([(-track, 0.0), (track, 0.0)], "frame"),
+        *(Line([(end, -2.0 * size), (end, 2.0 * size)], "limit") for end in (-track, track)),
+    ]
+
+
+def rail_without_end(track: float | None, reach: float) -> list[Shape]:
+    """Return the part of a track without ends that goes along with the support."""
+    return [Line([(-3.0 * reach, 0.0), (3.0 * reach, 0.0)], "frame")] if track == math.inf else []
+
+
+def window_on_rail(track: float | None, tall: float) -> Window:
+    """Return a window on the whole track and as far around [m], or one that follows the support."""
+    if track is None or math.isinf(track):
+        return Window(-tall, -tall, tall, tall, "support")
+    return Window(-track - tall, -tall, track + tall, tall)
+
+
 def ticks(low: float, high: float, step: float) -> list[float]:
     """Return the multiples of a step that lie between two numbers."""
     return [i * step for i in range(math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6) + 1)]

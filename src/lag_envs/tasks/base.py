@@ -92,6 +92,8 @@ class Task:
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional
         The grid on which ``python -m agents.optimum`` solves it.
+    plans : record.Plans, optional
+        How ``python -m agents.optimum`` finds the plan that ships with the package.
     optimum : record.Optimum, optional
         The largest return from given starts, where it is known.
     examples : record.Examples
@@ -132,6 +134,7 @@ class Task:
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     goal: ClassVar[Goal | None] = None
     value_iteration: ClassVar[ValueIteration | None] = None
+    plans: Any = None
     optimum: ClassVar[Optimum | None] = None
     examples: ClassVar[Examples] = Examples()
     difficulty: ClassVar[str] = ""
@@ -488,8 +491,16 @@ class _Recording(NamedTuple):
     chance: Callable[[float], Any]
 
 
-class _Lifted:
-    """The namespace ``xp`` where cosine and sine of angles are already known."""
+class Lifted:
+    """The namespace ``xp`` where cosine and sine of angles are already known.
+
+    Parameters
+    ----------
+    xp : namespace
+        What computes all else.
+    known : sequence of (angle, cosine, sine)
+        They are told by the identity of the angle, which is the very object that a formula gets.
+    """
 
     def __init__(self, xp: Any, known: Sequence[tuple[Any, Any, Any]]) -> None:
         self._xp, self._known = xp, known
@@ -611,7 +622,7 @@ class TaskFormulas:
         """Return the namespace that knows cosine and sine of the states' angles."""
         if self._form is None or self._form.angle is None:
             return xp
-        return _Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
+        return Lifted(xp, [(y[self._form.angle], *y[len(self.state) :]) for y in states])
 
     def _state(self, y: Sequence) -> Values:
         layout = self._task.scene._layout

@@ -10,9 +10,9 @@ import numpy as np
 
 from lag_envs.scenes import PivotedBar
 from lag_envs.scenes.shapes import Bodies, Line, Window, polar
-from lag_envs.stepping.tracing import clip
-from lag_envs.tasks.base import FASTEST_START, Task
+from lag_envs.tasks.base import FASTEST_START
 from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIteration
+from lag_envs.tasks.track import GuardedTrack, Support
 
 #: Episodes of 5 s show twice as often how the bar is swung up; the evaluation has it held for 10 s.
 _SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 250}}
@@ -20,16 +20,8 @@ _SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 250}}
 _SCALED = {"normalize": False, "vec_env_wrapper": [{"lag_envs.sb3.ScaledReward": {"factor": 0.1}}]}
 
 
-class _Bar(Task):
+class _Bar(Support):
     """What the tasks with the bar have in common."""
-
-    scene: Any
-    largest: float  # acceleration of the support [m/s²]
-
-    @property
-    def action(self) -> Mapping[str, float]:
-        """The support's acceleration."""
-        return {"s_ddot": self.largest}
 
     def _strength(self) -> tuple[float, float]:
         """Return field and largest drive [1/s²]."""
@@ -47,7 +39,7 @@ class _Bar(Task):
         return FASTEST_START + sum(self._strength()) * self.duration
 
 
-class SwingUp(_Bar):
+class SwingUp(GuardedTrack, _Bar):
     """Swing a bar up by moving its support, and hold it upright.
 
     ## Description
@@ -170,44 +162,10 @@ is for the bar without a track, so nobody knows whether the difference can be ga
 the bar only now and then.
 """
 
-    def check(self) -> None:
-        """Note whether the support's place is part of the task, and whether its track ends."""
-        self.has_track = self.scene.track is not None
-        self.ends = self.has_track and math.isfinite(self.scene.track)
-
-    @property
-    def variant(self) -> tuple:
-        """Add whether there is an end of the track to guard."""
-        return *super().variant, self.ends
-
-    @property
-    def length(self) -> Any:
-        """The track's half length S, that of one without an end being 0.5 m."""
-        return self.scene.track if self.ends else 0.5
-
     @property
     def start(self) -> Mapping[str, float]:
         """Hanging, nearly at rest, near the middle of the track."""
-        support = {"s": 0.1 * self.length, "s_dot": 0.02} if self.has_track else {}
-        return {**support, "theta": 0.1, "theta_dot": 0.1}
-
-    def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
-        """Return the acceleration nearest to U·a from which the support can still stop inside the track."""
-        if not self.ends:
-            return wanted
-        # With v the speed at the step's end, and braking from there at U, the support stops at
-        # ±v²/(2U) + s + (s' + v) dt/2. Multiplied by 2U, it passes S or -S where v² + |reach| > 2US.
-        s, s_dot, push = before.s, before.s_dot, wanted.s_ddot
-        top, per_step = self.largest, self.largest * dt
-        ends, start = 2.0 * (top * self.length), (2.0 * top) * s + per_step * s_dot
-        v = s_dot + dt * push
-        reach = start + per_step * v
-        side = xp.where(reach < 0.0, -1.0, 1.0)
-        # The root of v² + U dt v + start = 2US, seen from that side, is the highest speed allowed.
-        half = 0.5 * per_step
-        highest = xp.sqrt(xp.maximum(half * half + ends - side * start, 0.0)) - half
-        hardest = clip((highest - side * s_dot) * (1.0 / dt), -top, top, xp)
-        return xp.where(v * v + xp.abs(reach) > ends, side * xp.minimum(side * push, hardest), push)
+        return {**self.start_of_support(), "theta": 0.1, "theta_dot": 0.1}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² - 0.02 (u/U)² with the height h = (1 - cosθ)/2."""
@@ -221,22 +179,13 @@ the bar only now and then.
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return (s/S, s'/2,) cosθ, sinθ, θ'/8."""
-        support = (
-            {"s/S": after.s * (1.0 / self.length), "s_dot/2": 0.5 * after.s_dot} if self.has_track else {}
-        )
         bar = {"cos(theta)": xp.cos(after.theta), "sin(theta)": xp.sin(after.theta)}
-        return support | bar | {"theta_dot/8": 0.125 * after.theta_dot}
+        return self.observe_support(after) | bar | {"theta_dot/8": 0.125 * after.theta_dot}
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation."""
         bar = {"cos(theta)": 1.0, "sin(theta)": 1.0, "theta_dot/8": 0.125 * self.swing_bound()}
-        if not self.has_track:
-            return bar
-        if self.ends:
-            fastest = math.sqrt(2.0 * self.largest * self.length) * (1.0 + 1e-6)
-            return {"s/S": 1.0 + 1e-6, "s_dot/2": 0.5 * fastest} | bar
-        fastest = FASTEST_START + self.largest * self.duration
-        return {"s/S": (1e3 + fastest * self.duration) / self.length, "s_dot/2": 0.5 * fastest} | bar
+        return self.bounds_of_support() | bar
 
     def bodies(self) -> Bodies:
         """Add the upright bar."""
@@ -245,20 +194,6 @@ the bar only now and then.
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
         """Add where the upright bar is."""
         return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
-
-    def check_start(self, state: Any) -> None:
-        """Refuse a start from which the support cannot stop inside the track."""
-        if not self.has_track:
-            return
-        s, s_dot = state.s, state.s_dot
-        if not self.ends:
-            if abs(s) > 1e3:
-                raise ValueError(f"s must lie within ±1000 m at the start, got {s:g} m")
-        elif abs(s) + s_dot * s_dot / (2.0 * self.largest) > self.length:
-            raise ValueError(
-                f"from s={s:g} m with s_dot={s_dot:g} m/s the support cannot stop inside the track: "
-                f"|s| + s_dot²/(2U) must be at most {self.length:g} m with U={self.largest:g} m/s²"
-            )
 
 
 class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)

@@ -57,6 +57,41 @@ class Controller:
 
 
 @dataclass(frozen=True)
+class Plans:
+    """How plans for a task are found and followed: iLQR from random guesses, then time-varying feedback.
+
+    Parameters
+    ----------
+    place : str
+        Function of the task, "module:function". It returns a task on the same scene that is easier to plan
+        for, and what the end of a plan costs, a function from states (n, n_state) to numbers (n,).
+    numbers : mapping
+        Its keyword arguments.
+    steps : int
+        Steps of a plan.
+    batch : int
+        Guesses that are improved at once.
+    iterations : int
+        At most so many improvements.
+    rest : sequence of float
+        The equilibrium in which a plan should end.
+    weights : mapping of str to float
+        Weights of the feedback: squares of deviations, by entry of the state.
+    effort : float
+        Weight of the square of an action's deviation.
+    """
+
+    place: str
+    numbers: Mapping[str, Any]
+    steps: int
+    batch: int
+    iterations: int
+    rest: Sequence[float]
+    weights: Mapping[str, float]
+    effort: float
+
+
+@dataclass(frozen=True)
 class Optimum:
     """The largest return from given starts, where it is known.
 

@@ -263,8 +263,7 @@
     /** The table's number at a moment, and whether it is that of the mirror image. */
     function lookUp(state, target, steps) {
       const given = [...state, target, steps * about.interval];
-      const { wrapped } = about;
-      if (wrapped !== null) given[wrapped] -= 2 * Math.PI * Math.round(given[wrapped] / (2 * Math.PI));
+      for (const i of about.wrapped) given[i] -= 2 * Math.PI * Math.round(given[i] / (2 * Math.PI));
       const points = about.sums.map((row) => row.reduce((sum, s, i) => sum + (s ? s * given[i] : 0), 0));
       const mirrored = about.mirror !== null && points[about.mirror] < 0;
       const cells = points.map((x, j) => {

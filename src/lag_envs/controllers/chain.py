@@ -1,0 +1,84 @@
+"""Controllers of chains of bars on a moving support."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lag_envs.controllers.basic import Array
+from lag_envs.controllers.ilqr import ILQR
+from lag_envs.controllers.linear import regulator
+from lag_envs.controllers.tracking import hold, recorded
+from lag_envs.tasks.chain import SwingUp
+
+
+def easier(
+    task: SwingUp, *, effort: float, share: float = 0.9, edge: float = 0.9
+) -> tuple[SwingUp, Callable[[Array], Array]]:
+    """Return a task that is easier to plan for, and what its end costs.
+
+    In place of the guard, which has kinks, it has a penalty that begins before the track's end. It pays for
+    the height's square, whose slope leads upward from anywhere, and hardly matters beside the end's cost. The
+    support is weaker, so that feedback has something left to correct the plan with.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task.
+    effort : float
+        Price of a step with the largest acceleration.
+    share : float
+        Largest acceleration, as a share of the task's.
+    edge : float
+        Share of the track from which on a support that brakes as hard as it can is punished.
+    """
+    kind: Any = type(task)
+
+    class Easier(kind):  # type: ignore[misc]
+        id = ""
+        largest = share * task.largest
+
+        def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
+            return wanted
+
+        def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+            a = control.s_ddot * (1.0 / self.largest)
+            stop = after.s + after.s_dot * xp.abs(after.s_dot) * (0.5 / self.largest)
+            over = xp.maximum(xp.abs(stop) * (1.0 / self.length) - edge, 0.0)
+            height = self.height(after, xp)
+            return 0.1 * (height * height) - effort * (a * a) - 300.0 * (over * over)
+
+    def end(states: Array) -> Array:
+        s, s_dot, angles, rates = states[:, 0], states[:, 1], states[:, 2::2], states[:, 3::2]
+        away = 2.0 * (1.0 + np.cos(angles)).sum(axis=1) + 0.01 * (rates**2).sum(axis=1)
+        return 10.0 * (away + 0.3 * (s / task.length) ** 2 + 0.1 * s_dot**2)
+
+    fields = dataclasses.fields(task.scene)
+    parameters = {field.name: getattr(task.scene, field.name) for field in fields}
+    return Easier(dt=task.dt, duration=task.duration, **parameters), end
+
+
+def replan(task: SwingUp, *, steps: float = 1.6) -> ILQR:
+    """Return an iLQR that plans each episode anew, from the recorded plan and its mirror image.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``.
+    steps : float
+        How far to plan, in lengths of the recorded plan.
+    """
+    follow = recorded(task)
+    rest = np.array(task.plans.rest)
+    # The reward does not mind where on the track the bars stand; something has to call the support back.
+    _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
+
+    def lost(states: Array) -> Array:
+        off = follow.read.difference(states, rest)
+        return np.einsum("...i,ij,...j->...", off, cost, off)
+
+    ahead = round(steps * len(follow.actions))
+    return ILQR(task, [follow, follow.mirrored()], after=hold(task), tail=lost, steps=ahead)

@@ -1,0 +1,161 @@
+"""Follow a recorded plan by time-varying linear feedback; and find such plans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lag_envs.controllers.ilqr import ILQR
+from lag_envs.controllers.linear import time_varying
+from lag_envs.controllers.lookahead import Clocked
+from lag_envs.tasks import resolve
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Plans
+
+Array = NDArray[np.float64]
+
+#: Where recorded plans are: a file per environment, which ``python -m agents.optimum`` writes.
+FOLDER = Path(__file__).with_name("plans")
+
+
+class Tracking(Clocked):
+    """Follow a plan by time-varying linear feedback, and hold where it ends by constant feedback.
+
+    Near the plan's state x_t the action is a_t - K_t (x - x_t), from the plan's end on -K (x - rest); angles
+    that are only seen by cosine and sine are compared the shorter way around. All of it is data.
+
+    Parameters
+    ----------
+    task : Task
+        The task, with one control.
+    states : array_like, shape (steps + 1, n_state)
+        The plan's states. Without any step, the feedback at rest is all there is.
+    actions : array_like, shape (steps,)
+        Its actions.
+    gains : array_like, shape (steps, n_state)
+        The feedback K_t, actions per deviation.
+    rest : array_like, shape (n_state,)
+        The equilibrium that is held.
+    hold : array_like, shape (n_state,)
+        The feedback K there.
+    """
+
+    #: Its numbers, by name.
+    DATA = ("states", "actions", "gains", "rest", "hold")
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        states: ArrayLike,
+        actions: ArrayLike,
+        gains: ArrayLike,
+        rest: ArrayLike,
+        hold: ArrayLike,
+    ) -> None:
+        super().__init__(task)
+        self.task, n = task, len(task.scene.state_names)
+        self.states, self.actions, self.gains, self.rest, self.hold = (
+            np.asarray(values, np.float64) for values in (states, actions, gains, rest, hold)
+        )
+        steps = len(self.actions)
+        wanted = {"states": (steps + 1, n), "gains": (steps, n), "rest": (n,), "hold": (n,)}
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
+
+    @classmethod
+    def load(cls, task: Task, file: Path) -> Tracking:
+        """Read a plan from a file.
+
+        Raises
+        ------
+        ValueError
+            Where there is none, or where it is of a task with another state.
+        """
+        if not file.is_file():
+            raise ValueError(f"there is no plan {file}; python -m agents.optimum {task.id} makes one")
+        with np.load(file, allow_pickle=False) as data:
+            return cls(task, **{name: data[name] for name in cls.DATA})
+
+    def save(self, file: Path) -> None:
+        """Write the plan to a file, in single precision."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(
+            file,
+            allow_pickle=False,
+            **{name: getattr(self, name).astype(np.float32) for name in self.DATA},
+        )
+
+    def mirrored(self) -> Tracking:
+        """Return the plan to the other side, for a task that looks the same from behind."""
+        return Tracking(
+            self.task, states=-self.states, actions=-self.actions, gains=self.gains, rest=-self.rest,
+            hold=self.hold,
+        )  # fmt: skip
+
+    def act(self, states: Array, targets: Array, taken: Array) -> Array:
+        """Return the actions."""
+        steps = len(self.actions)
+        step = np.minimum((taken + 1e-6).astype(np.int64), steps)  # the margin: see `Clocked.pace`
+        share = np.clip(taken - step, 0.0, 1.0)[:, None]
+        following = np.minimum(step + 1, steps)
+        planned = self.states[step] + share * (self.states[following] - self.states[step])
+        planned = np.where((step < steps)[:, None], planned, self.rest)
+        gains = np.vstack([self.gains, self.hold])[step]
+        off = self.read.difference(states, planned)
+        return np.append(self.actions, 0.0)[step] - np.einsum("ij,ij->i", gains, off)
+
+
+def recorded(task: Task) -> Tracking:
+    """Return the controller that follows the plan that was recorded for a task's id."""
+    return Tracking.load(task, FOLDER / f"{task.id}.npz")
+
+
+def hold(task: Task) -> Tracking:
+    """Return the regulator that holds a task's plans where they end, `Task.plans` says how."""
+    return follow(task, [task.plans.rest], np.empty(0), task.plans)
+
+
+def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
+    """Return the controller that follows states (steps + 1, n_state) and actions (steps,)."""
+    states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
+    gains, last = time_varying(task, states, actions, plans.rest, plans.weights, plans.effort)
+    return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)
+
+
+def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
+    """Return random actions (n, steps): sums of three sines of 0.5 to 3 Hz, clipped."""
+    size, phase = rng.uniform(0.0, 1.0, (3, n, 1)), rng.uniform(0.0, 2.0 * np.pi, (3, n, 1))
+    turn = 2.0 * np.pi * rng.uniform(0.5, 3.0, (3, n, 1)) * dt * np.arange(steps)
+    return np.clip(np.sum(size * np.sin(turn + phase), axis=0), -1.0, 1.0)
+
+
+def search(task: Task, seed: int = 0, start: Sequence[float] | None = None) -> Iterator[Tracking]:
+    """Plan from random guesses at once, by iLQR on an easier task, and yield what follows each plan.
+
+    The most promising plan comes first.
+
+    Parameters
+    ----------
+    task : Task
+        The task; its `plans` say how.
+    seed : int
+        Seed of the guesses.
+    start : sequence of float, optional
+        Where the plans start; the centre of the task's starts by default.
+    """
+    plans: Plans = task.plans
+    easier, tail = resolve(plans.place)(task, **plans.numbers)
+    planner = ILQR(easier, [], tail=tail, steps=plans.steps, iterations=plans.iterations)
+    guesses = waves(np.random.default_rng(seed), plans.batch, plans.steps, task.dt)
+    starts = np.tile(np.asarray(task.centre if start is None else start, np.float64), (plans.batch, 1))
+    found, values = planner.improve(starts, np.zeros(plans.batch), guesses)
+    shares: Any = easier.limit_control / task.limit_control
+    for i in np.argsort(-values):
+        states = task.scene.simulate(starts[i], easier.wanted(found.actions[i])[:, 0], task.dt)
+        yield follow(task, states, shares * found.actions[i], plans)

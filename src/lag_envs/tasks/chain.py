@@ -1,0 +1,426 @@
+"""Swing chains of bars up by moving their support, and keep them up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import Chain
+from lag_envs.scenes.shapes import Bodies, Polygon
+from lag_envs.tasks.base import FASTEST_START
+from lag_envs.tasks.record import Examples, Goal, Plans
+from lag_envs.tasks.track import GuardedTrack, Support
+
+
+class _Chain(Support):
+    """What the tasks with chains have in common."""
+
+    scene: Any
+
+    @property
+    def angles(self) -> list[str]:
+        """Names of the angles, from the support on."""
+        return list(self.scene.coordinates)
+
+    def fastest_turn(self, start: float = FASTEST_START, kick: float = 0.0) -> float:
+        r"""Return a bound on the rates of the angles [rad/s].
+
+        Let W be kinetic plus potential energy in the support's frame, at least 0, and M the mass of all bars.
+        The frame's acceleration u adds the power -u Σ m x' ≤ U √(2 M W), and damping takes some, so √W
+        grows by U √(M/2) a second at most. A kick of the last bar's rate by k adds at most k √(J/2) to it, J
+        being the bar's moment of inertia about its joint. Each bar's turning is a part of W, I θ'²/2 ≤ W.
+
+        Parameters
+        ----------
+        start : float
+            Largest rate at the start [rad/s].
+        kick : float
+            Largest change of the last bar's rate between two steps [rad/s].
+        """
+        scene = self.scene
+        if scene.inertia == 0.0:
+            return math.inf
+        arms = [i * scene.length + scene.com_distance for i in range(scene.bars)]
+        turning = 0.5 * start**2 * sum(scene.mass * arm**2 + scene.inertia for arm in arms)
+        fall = 2.0 * scene.mass * scene.gravity * sum(arms)
+        pushed = self.largest * math.sqrt(0.5 * scene.bars * scene.mass) * self.duration
+        about_joint = scene.inertia + scene.mass * scene.com_distance**2
+        kicked = kick * math.sqrt(0.5 * about_joint) * self.limit
+        return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
+
+    def bodies(self) -> Bodies:
+        """Add the upright chain."""
+        half, low = 0.05 * self.scene.length, -self.scene.reach
+        corners = [(-half, half), (-half, low - half), (half, low - half), (half, half)]
+        return {"upright": [Polygon(corners, "target")], **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where it is."""
+        return {**super().indicators(now, xp), "upright": (now.q.s, 0.0, math.pi)}
+
+
+class SwingUp(GuardedTrack, _Chain):
+    """Swing a double pendulum up by moving its support, and hold it upright.
+
+    ## Description
+
+    Uniform bars, each hinged to the end of the one above, hang from a support. Move the support to and fro to
+    swing them up, then keep all of them upright, within the support's track.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
+
+    The support must be able to stop inside the track, braking at U, the largest acceleration. Where the
+    wanted acceleration would make that impossible, the nearest one that does not is applied.
+    `env.unwrapped.control` tells which.
+
+    ## Observation Space
+
+    The bounds are proved for every start that is accepted. They allow for a support that does nothing but add
+    energy, so an episode stays far within.
+
+    ## Rewards
+
+    Each step pays h⁴ - 0.02 (u/U)². The height h of the chain's end is 0 hanging and 1 upright, taken at
+    the step's end; u is the acceleration that was applied. Because of the fourth power a chain that spins
+    earns little, and so does one whose upper bar stands while the lower one hangs. With another `dt` rewards
+    are scaled by dt/0.02, so a second is always worth the same.
+
+    ## Starting State
+
+    The chain hangs, nearly at rest. Starts from which the support cannot stop inside the track are refused.
+    The half width of s is a tenth of the track's.
+
+    ## Episode End
+
+    Termination: never. The ends of the track are guarded, as described above.
+
+    ## Arguments
+
+    `track=math.inf` is a track without an end; the observation then divides s by 0.5 m. `bars` changes the
+    state and the spaces.
+
+    ## Equations
+
+    The drive is strong enough to move the support as commanded: the bars do not act back on it.
+
+    ## Signs and Units
+
+    SI units. Angles are against straight down, not against the bar above: θ = 0 hangs and θ = π stands. They
+    grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle of the track.
+
+    ## Numerical Accuracy
+
+    s and s' are exact to rounding. The last bar whips: a step is divided where one series would not converge.
+
+    ## Known Returns
+
+    The optimum is not known.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.2.0).
+    """
+
+    id = "DoubleBar-v0"
+    scene: Any = Chain
+    defaults = {"bars": 2, "mass": 0.1, "length": 0.3, "damping": 1e-4, "track": 0.6}
+    largest = 10.0
+
+    goal = Goal(
+        "success: each bar within 0.2 rad of upright throughout the last second; time: until it is so for "
+        "good",
+        arrival="upright",
+    )
+    examples = Examples(
+        start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0]},
+        moving=[0.1, -0.2, 2.0, 12.0, 2.5, -20.0],
+        refused=[{"state": [s, s_dot, 0, 0, 0, 0]} for s, s_dot in ((0.7, 0), (0.3, 3.0), (-0.3, -3.0))],
+        reach=60.0,
+        rest=[0.0, 0.0, math.pi, 0.0, math.pi, 0.0],
+        batch={
+            "damping": [0.0, 1e-4, 0.01, 1e-3, 1e-4],
+            "gravity": [9.81, 0.0, 30.0, 1.6, 9.81],
+            "track": [0.6, 0.3, 1.0, 0.6, 5.0],
+        },
+        variants={"endless track": {"track": math.inf}, "three bars": {"bars": 3}},
+    )
+    difficulty = (
+        "Two unstable bars on one control, within a short track. Energy alone does not do it: both bars have "
+        "to come upright at the same moment and at rest, which the chaotic swing before makes hard to time."
+    )
+    note = """
+Best known is planning anew for each start. One recorded plan with time-varying feedback is nearly as good,
+for all starts are near to each other.
+"""
+
+    steps_of_plan, batch, iterations, price, share = 75, 32, 120, 0.05, 0.9
+
+    @property
+    def plans(self) -> Plans:
+        """How the swing-up is planned; the feedback minds the angles most."""
+        weights = {"s": 0.1 / self.length**2, "s_dot": 0.1}
+        for name in self.angles:
+            weights |= {name: 1.0, f"{name}_dot": 0.02}
+        return Plans(
+            "lag_envs.controllers.chain:easier",
+            {"effort": self.price, "share": self.share},
+            steps=self.steps_of_plan,
+            batch=self.batch,
+            iterations=self.iterations,
+            rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
+            weights=weights,
+            effort=0.02,
+        )
+
+    @property
+    def quantities(self) -> Mapping[str, tuple[str, str]]:  # type: ignore[override]
+        """The observation's units and meanings."""
+        return {
+            "s/S": ("1", "place of the support, divided by the track's half length S"),
+            "s_dot/2": ("m/s", "speed of the support, halved"),
+            **{f"cos({name})": ("1", f"cosine of {name}") for name in self.angles},
+            **{f"sin({name})": ("1", f"sine of {name}") for name in self.angles},
+            **{f"{name}_dot/8": ("rad/s", f"rate of {name}, divided by 8") for name in self.angles},
+        }
+
+    @property
+    def start(self) -> Mapping[str, float]:
+        """Hanging, nearly at rest, near the middle of the track."""
+        rates = {f"{name}_dot": 0.1 for name in self.angles}
+        return {**self.start_of_support(), **dict.fromkeys(self.angles, 0.1), **rates}
+
+    def height(self, state: Any, xp: Any) -> Any:
+        """Return the height of the chain's end: 0 hanging, 1 upright."""
+        cosines = sum(xp.cos(state[name]) for name in self.angles)
+        return 0.5 - cosines * (0.5 / self.scene.bars)
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return h⁴ - 0.02 (u/U)²."""
+        effort = control.s_ddot * (1.0 / self.largest)
+        return self.height(after, xp) ** 4 - 0.02 * (effort * effort)
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether each bar is within 0.2 rad of upright."""
+        lowest = xp.cos(after[self.angles[0]])
+        for name in self.angles[1:]:
+            lowest = xp.maximum(lowest, xp.cos(after[name]))
+        return lowest <= -math.cos(0.2)
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return s/S, s'/2, the cosines, the sines, and the rates divided by 8."""
+        cosines = {f"cos({name})": xp.cos(after[name]) for name in self.angles}
+        sines = {f"sin({name})": xp.sin(after[name]) for name in self.angles}
+        rates = {f"{name}_dot/8": 0.125 * after[f"{name}_dot"] for name in self.angles}
+        return self.observe_support(after) | cosines | sines | rates
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return bounds on the observation."""
+        circle = {f"{part}({name})": 1.0 for part in ("cos", "sin") for name in self.angles}
+        turn = 0.125 * self.fastest_turn()
+        return self.bounds_of_support() | circle | {f"{name}_dot/8": turn for name in self.angles}
+
+
+class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
+    __doc__ = (SwingUp.__doc__ or "").replace("its support,", "a support that is weak,", 1)
+    id = "DoubleBarWeak-v0"
+    defaults = {**SwingUp.defaults, "track": 0.5}
+    largest = 5.0
+    steps_of_plan = 115
+
+    difficulty = (
+        "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
+        "in over several swings, and a deviation at the top that a strong support would catch is lost."
+    )
+
+
+class SwingUpTriple(SwingUp):  # noqa: D101
+    __doc__ = (SwingUp.__doc__ or "").replace("double", "triple", 1)
+    id = "TripleBar-v0"
+    defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
+    largest = 15.0
+    steps_of_plan, batch, iterations, price, share = 150, 28, 180, 0.02, 0.85
+
+    examples = Examples(
+        start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0, 1.0, 2.0]},
+        moving=[0.1, -0.2, 2.0, 12.0, 2.5, -20.0, 1.0, 30.0],
+        refused=[{"state": [s, s_dot, *[0] * 6]} for s, s_dot in ((0.9, 0), (0.3, 4.5), (-0.3, -4.5))],
+        reach=95.0,
+        rest=[0.0, 0.0, *[math.pi, 0.0] * 3],
+        batch=SwingUp.examples.batch,
+        variants={"endless track": {"track": math.inf}},
+    )
+    difficulty = (
+        "Three unstable bars on one control. Upright, the fastest deviation grows tenfold in a quarter of a "
+        "second, so the chain has to arrive nearly at rest in all three angles at once."
+    )
+
+
+class Balance(_Chain):
+    """Keep a double pendulum upright against kicks by moving its support.
+
+    ## Description
+
+    Two uniform bars, one hinged to the end of the other, start nearly upright. Keep them there, near the
+    middle of the track, while random kicks hit the upper one.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
+
+    ## Observation Space
+
+    The bounds are proved for every start that is accepted, even with a kick in every step.
+
+    ## Rewards
+
+    Each step pays 1 - mean((e/0.35)²)/2 - (s/S)²/2, the mean taken over the bars, at the step's end and
+    before a kick; S is half the track. Inside the limits that lies between 0 and 1. With another `dt` rewards
+    are scaled by dt/0.02.
+
+    ## Starting State
+
+    The bars are nearly upright. Given starts must lie inside the limits below.
+
+    After each step, with probability 0.01 (1 - 0.99^(dt/0.02) for another `dt`), a kick changes the last
+    bar's rate by a uniform amount within ±1 rad/s.
+
+    ## Episode End
+
+    Termination: |e| > 0.35 rad for one of the bars, or |s| > S at a step's end. That step still pays.
+
+    ## Arguments
+
+    The track must be finite here. `bars` changes the state and the spaces.
+
+    ## Equations
+
+    The drive is strong enough to move the support as commanded: the bars do not act back on it.
+
+    ## Signs and Units
+
+    SI units. Angles are against straight down, not against the bar below: θ = π stands. They grow
+    counter-clockwise and are not wrapped, so θ = -π is another angle and outside the limits. s is positive to
+    the right.
+
+    ## Numerical Accuracy
+
+    s and s' are exact to rounding.
+
+    ## Known Returns
+
+    The optimum is not known. Some kicks cannot be survived, so it lies below 500.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.2.0).
+    """
+
+    id = "DoubleBarBalance-v0"
+    scene: Any = Chain
+    defaults = {"bars": 2, "mass": 0.1, "length": 0.3, "damping": 1e-4, "track": 0.5}
+    largest = 5.0
+    draws = 2
+    largest_angle = 0.35
+    largest_kick = 1.0
+
+    goal = Goal(
+        "success: neither a bar nor the support leaves its limits in 10 s; there is no time", None, None
+    )
+    examples = Examples(
+        start={"state": [0.1, -0.2, 3.0, 0.5, 3.2, -0.5]},
+        refused=[
+            {"state": state}
+            for state in ([0.0] * 6, [0.51, 0, math.pi, 0, math.pi, 0], [0, 0, math.pi, 0, -math.pi, 0])
+        ],
+        ending=([0.0, 0.0, math.pi, 0.0, math.pi + 0.34, 3.0], 0.0),
+        reach=12.0,
+        rest=[0.0, 0.0, math.pi, 0.0, math.pi, 0.0],
+        batch={
+            "damping": [0.0, 1e-4, 0.01, 1e-3, 1e-4],
+            "track": [0.5, 0.6, 1.0, 0.5, 0.3],
+        },
+    )
+    difficulty = (
+        "Two unstable bars on one control, and kicks at random. To push the bars back the support must first "
+        "move the wrong way, which uses up the track."
+    )
+    note = """
+The LQR is tuned for small deviations; feedback whose gains were searched for directly bears larger kicks.
+"""
+
+    def check(self) -> None:
+        """Ask for a track: the task ends at its ends."""
+        if math.isinf(self.scene.track):
+            raise ValueError(f"balancing needs a track of finite length, got track={self.scene.track}")
+
+    @property
+    def quantities(self) -> Mapping[str, tuple[str, str]]:  # type: ignore[override]
+        """The observation's units and meanings."""
+        return {
+            "s": ("m", "place of the support"),
+            "s_dot": ("m/s", "its speed"),
+            **{
+                f"e_{i + 1}": ("rad", f"angle from upright, {name} - π") for i, name in enumerate(self.angles)
+            },
+            **{f"{name}_dot": ("rad/s", f"rate of {name}") for name in self.angles},
+        }
+
+    @property
+    def start(self) -> Mapping[str, Any]:
+        """Nearly upright."""
+        places = dict.fromkeys(self.angles, (math.pi, 0.05))
+        rates = {f"{name}_dot": 0.15 for name in self.angles}
+        return {"s": 0.2 * self.scene.track, "s_dot": 0.15, **places, **rates}
+
+    def leaning(self, state: Any) -> dict[str, Any]:
+        """Return the angles from upright."""
+        return {f"e_{i + 1}": state[name] - math.pi for i, name in enumerate(self.angles)}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 1 - mean((e/0.35)²)/2 - (s/S)²/2."""
+        squares = sum((e * (1.0 / self.largest_angle)) ** 2 for e in self.leaning(after).values())
+        s = after.s * (1.0 / self.scene.track)
+        return 1.0 - squares * (0.5 / self.scene.bars) - 0.5 * (s * s)
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether a bar has fallen or the support has left the track."""
+        over = xp.abs(after.s) > self.scene.track
+        for e in self.leaning(after).values():
+            over = over | (xp.abs(e) > self.largest_angle)
+        return over
+
+    def behaviour(self, played: Any) -> Mapping[str, float]:
+        """Return how often the bars are balanced to the end."""
+        return {"episodes that last 10 s [%]": 100.0 * float((played.steps == self.limit).mean())}
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Change the last bar's rate by up to 1 rad/s to either side, now and then."""
+        size = self.largest_kick * (2.0 * draws[1] - 1.0)
+        return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(0.01), size, 0.0)}
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return s, s', the angles from upright, and their rates."""
+        rates = {f"{name}_dot": after[f"{name}_dot"] for name in self.angles}
+        return {"s": after.s, "s_dot": after.s_dot} | self.leaning(after) | rates
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return bounds on the observation; each step may have a kick."""
+        slide = FASTEST_START + self.largest * self.duration
+        turn = self.fastest_turn(kick=self.largest_kick)
+        found = {"s": self.scene.track + slide * self.dt, "s_dot": slide}
+        for i, name in enumerate(self.angles):
+            found |= {f"e_{i + 1}": self.largest_angle + turn * self.dt, f"{name}_dot": turn}
+        return found
+
+    def check_start(self, state: Any) -> None:
+        """Refuse a start at which the episode would be over."""
+        leaning = max(abs(e) for e in self.leaning(state).values())
+        if leaning > self.largest_angle or abs(state.s) > self.scene.track:
+            given = ", ".join(f"{name}={state[name]:g} rad" for name in self.angles)
+            raise ValueError(
+                f"the episode would be over at s={state.s:g} m, {given}: |theta - pi| must be at most "
+                f"{self.largest_angle} rad and |s| at most {self.scene.track:g} m"
+            )
