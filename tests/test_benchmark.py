@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from covering import covering
 
 import lag_envs
 from lag_envs import benchmark, cli
@@ -67,7 +68,7 @@ def test_list_shows_the_control_in_its_unit(capsys):
     assert "  s_ddot -5 to 5 m/s²  0.02 s  500  10 s" in re.sub(" {2,}", "  ", line)
 
 
-@pytest.mark.parametrize("id", TASKS)
+@pytest.mark.parametrize("id", covering())
 def test_info_tells_about_parameters_and_accuracy(id, capsys):
     status, out, _ = call(capsys, "info", id)
     assert status == 0

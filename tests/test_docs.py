@@ -7,17 +7,21 @@ import itertools
 import json
 import math
 import re
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from PIL import Image
 from rollouts import IDS, RENDERS, make
 
 from lag_envs.benchmark import TARGETS
 from lag_envs.envs.program import BLOCK
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import reference
+from lag_envs.leaderboard.standings import board_data
 from lag_envs.report.docs import generated
 from lag_envs.report.environment_results import LARGEST_STEP
 from lag_envs.report.episodes import play, random_actions
@@ -32,7 +36,7 @@ from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
 
 ROOT = Path(__file__).parents[1]
-each_id = pytest.mark.parametrize("env_id", IDS)
+each_id = pytest.mark.parametrize("env_id", covering())
 
 
 def sections(text):
@@ -65,8 +69,16 @@ def agrees(stated, value):
 
 
 @pytest.fixture(scope="module")
-def pages():
-    return environments.pages(ROOT)
+def page_of():
+    """Return a function that returns an environment's page."""
+    board = board_data(Board(ROOT / "leaderboard"))
+    return cache(lambda env_id: environments.pages(board, ROOT, [env_id])[env_id])
+
+
+@pytest.fixture
+def page(env_id, page_of):
+    """Return the environment's page."""
+    return page_of(env_id)
 
 
 def rows(page, heading, head):
@@ -75,7 +87,7 @@ def rows(page, heading, head):
     return {row[head].split("`")[1] if "`" in row[head] else row[head]: row for row in found}
 
 
-@each_id
+@pytest.mark.parametrize("env_id", TASKS)
 def test_docstring_has_prose_only(env_id):
     task = TASKS[env_id]
     found = sections(task.__doc__)
@@ -85,17 +97,17 @@ def test_docstring_has_prose_only(env_id):
 
 
 @each_id
-def test_headings(env_id, pages):
-    found = sections(pages[env_id])
+def test_headings(env_id, page):
+    found = sections(page)
     assert list(found) == list(environments.HEADINGS)
     assert all(text.strip() for text in found.values())
 
 
 @each_id
-def test_action_table(env_id, pages):
+def test_action_table(env_id, page):
     """The controls at both ends of the action are those that a step applies."""
     env = make(env_id)
-    ((name, row),) = rows(pages[env_id], "Action Space", "Control").items()
+    ((name, row),) = rows(page, "Action Space", "Control").items()
     for column, action in (("At -1", -1.0), ("At 1", 1.0)):
         env.reset(seed=0, options={"state": env.task.centre})
         env.step(np.array([action]))
@@ -104,9 +116,9 @@ def test_action_table(env_id, pages):
 
 
 @each_id
-def test_observation_table(env_id, pages):
+def test_observation_table(env_id, page):
     env = make(env_id)
-    found = rows(pages[env_id], "Observation Space", "Observation")
+    found = rows(page, "Observation Space", "Observation")
     assert list(found) == list(env.task.observation) and set(env.task.quantities) >= set(found)
     for row, low, high in zip(
         found.values(), env.observation_space.low, env.observation_space.high, strict=True
@@ -117,23 +129,23 @@ def test_observation_table(env_id, pages):
 
 
 @each_id
-def test_start_table(env_id, pages):
+def test_start_table(env_id, page):
     """Starts lie in the box that the page states, and reach its edges."""
     task = make(env_id).task
-    found = rows(pages[env_id], "Starting State", "Entry")
+    found = rows(page, "Starting State", "Entry")
     envs = gym.make_vec(env_id, num_envs=2000)
     envs.reset(seed=0)
     for name, starts in zip(task.scene.state_names, np.asarray(envs.unwrapped.state).T, strict=True):
         centre, half = float(found[name]["Centre"]), float(found[name]["To either side"])
         assert np.ptp(starts) == pytest.approx(2.0 * half, rel=0.01, abs=1e-12), name
         assert starts.mean() == pytest.approx(centre, abs=0.05 * half + 1e-4), name
-    assert ("kick" in sections(pages[env_id])["Starting State"]) == bool(task.draws)
+    assert ("kick" in sections(page)["Starting State"]) == bool(task.draws)
 
 
 @each_id
-def test_argument_table(env_id, pages):
+def test_argument_table(env_id, page):
     """Every keyword is there, and makes an environment with its default."""
-    found = rows(pages[env_id], "Arguments", "Keyword")
+    found = rows(page, "Arguments", "Keyword")
     task = make(env_id).task
     names = {field.name for field in dataclasses.fields(task.scene)}
     own = {"dt", "duration"} | ({"target"} if task.formulas.target_boxes else set())
@@ -147,10 +159,10 @@ def test_argument_table(env_id, pages):
 
 
 @each_id
-def test_equations(env_id, pages):
+def test_equations(env_id, page):
     """The formula with numbers is the scene's acceleration."""
     scene = make(env_id).scene
-    latex = re.findall(r"application/x-tex\">(.*?)</annotation>", pages[env_id])
+    latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
     assert len(latex) == 3 and latex[0].startswith(r"\mathcal{L} = ") and latex[1].endswith("= 0")
     (free,) = scene._layout.free
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
@@ -174,8 +186,8 @@ def test_equations(env_id, pages):
 
 
 @each_id
-def test_known_returns_and_agents(env_id, pages):
-    found = sections(pages[env_id])
+def test_known_returns_and_agents(env_id, page):
+    found = sections(page)
     known, agents = measured(env_id)["measured"], table(found["Agents"])
     stated = {row["Policy"]: row for row in table(found["Known Returns"])}
     assert float(stated["random actions"]["Return"].split(" ")[0]) == pytest.approx(
@@ -190,10 +202,10 @@ def test_known_returns_and_agents(env_id, pages):
 
 
 @each_id
-def test_certified_speed(env_id, pages):
+def test_certified_speed(env_id, page):
     """The stated speed is the task's own, rounded down, and one series suffices up to it and no further."""
     env = make(env_id)
-    scene, task, text = env.scene, env.task, plain(sections(pages[env_id])["Numerical Accuracy"])
+    scene, task, text = env.scene, env.task, plain(sections(page)["Numerical Accuracy"])
     stated = re.search(r"\|`theta_dot`\| is at most ([\d.]+) rad/s", text)
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
@@ -249,7 +261,7 @@ def scale(env_id):
     return measured(env_id)["measured"]
 
 
-@each_id
+@pytest.mark.parametrize("env_id", TASKS)
 def test_scale_is_what_was_measured(env_id):
     """It was set once; what was measured since lies within the errors of both, or it would mislead."""
     known, found = known_returns(env_id), scale(env_id)

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import serious, until
+from covering import covering
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -91,7 +92,7 @@ def check_bits(page, folder, task, name, episodes):
         )
 
 
-@pytest.mark.parametrize("id", sorted(TASKS))
+@pytest.mark.parametrize("id", covering())
 def test_the_pages_step_has_pythons_bits(browsing, bare, id):
     task = TASKS[id]()
     page = browsing.open(f"{bare.as_uri()}/{id}.html", bare.as_uri())

@@ -11,6 +11,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
@@ -25,8 +26,8 @@ from lag_envs.scenes.checks import StepRefused
 from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline, pivoted_bar
 from lag_envs.tasks.incline import Brake
 
-each_id = pytest.mark.parametrize("env_id", IDS)
-each_single = pytest.mark.parametrize("env_id", SINGLE)
+each_id = pytest.mark.parametrize("env_id", covering())
+each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 
 #: Parameters that a scene, or a task, must refuse.
 IMPOSSIBLE = {
@@ -500,7 +501,7 @@ def test_step_before_reset(env_id):
     env.step(np.zeros(env.action_space.shape))
 
 
-@pytest.mark.parametrize("env_id", [env_id for env_id, task in TASKS.items() if task.examples.ending])
+@pytest.mark.parametrize("env_id", covering(i for i, task in TASKS.items() if task.examples.ending))
 def test_step_after_termination(env_id):
     env, (start, action) = make(env_id), TASKS[env_id].examples.ending
     env.reset(seed=1, options={"state": start})
@@ -650,7 +651,7 @@ def test_an_endless_episode():
     assert not any(env.step(np.zeros(env.action_space.shape))[3] for _ in range(2000))
 
 
-@pytest.mark.parametrize("env_id", [i for i in IDS if i != incline.Brake.id])
+@pytest.mark.parametrize("env_id", covering(i for i in IDS if i != incline.Brake.id))
 def test_running_rewards_scale_with_the_interval(env_id):
     start = TASKS[env_id].examples.start["state"]
     rates = []

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rollouts import IDS, actions, make, trace
@@ -22,7 +23,7 @@ from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
 #: Those that promise to work wherever in their ranges all parameters lie.
 PROMISED = [env_id for env_id in IDS if TASKS[env_id]().usable_ranges()]
-each_id = pytest.mark.parametrize("env_id", PROMISED)
+each_id = pytest.mark.parametrize("env_id", covering(PROMISED))
 
 MASKED = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
 #: No number, and no number for each of three environments.

@@ -7,8 +7,8 @@ from html.parser import HTMLParser
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 
-import lag_envs
 from lag_envs.scenes import SCENES, Scene, html, parameter
 from lag_envs.tasks import incline
 
@@ -86,7 +86,7 @@ def test_long_equations_are_left_out():
     assert "equations of motion are long" in Chain(bars=4)._repr_html_()
 
 
-@pytest.mark.parametrize("env_id", lag_envs.TASKS)
+@pytest.mark.parametrize("env_id", covering())
 def test_environments_show_picture_and_spaces(env_id):
     env = gym.make(env_id).unwrapped
     before = env._repr_html_()

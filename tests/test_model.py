@@ -7,14 +7,15 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
-from rollouts import IDS, actions, make
+from covering import covering
+from rollouts import actions, make
 
 from lag_envs.envs.model import Model
 from lag_envs.scenes import StepRefused
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_steps_as_the_environment_does(env_id):
     n = 64
     envs = gym.make_vec(env_id, n, autoreset_mode="SameStep", duration=100.0)

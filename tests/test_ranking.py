@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from covering import covering
 
 from lag_envs.controllers import make_controller
 from lag_envs.evaluation.rollout import play
@@ -263,7 +264,7 @@ def test_intervals_of_corrected_rows_cover_the_truth():
     assert all(0.88 <= count / rounds for count in inside.values()), inside
 
 
-@pytest.mark.parametrize("env_id", [env_id for env_id in TASKS if reference(env_id)])
+@pytest.mark.parametrize("env_id", covering(filter(reference, TASKS)))
 def test_references_are_controllers_that_are_known_and_help(env_id):
     name, mean, error, episodes = reference(env_id)
     known = known_returns(env_id)

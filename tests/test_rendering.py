@@ -18,6 +18,7 @@ from typing import get_args
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from rollouts import SINGLE
 
 import lag_envs
@@ -79,7 +80,7 @@ def length(points):
 # --- pictures -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_frames_are_pictures_that_follow_the_state(env_id):
     env = gym.make(env_id, render_mode="rgb_array")
     env.reset(seed=1)
@@ -288,7 +289,7 @@ def test_vector_environment_draws_each_of_its_environments():
     envs.close()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_record_video_without_a_warning(env_id, tmp_path):
     pytest.importorskip("moviepy")
     env = gym.wrappers.RecordVideo(
@@ -318,7 +319,7 @@ def window(monkeypatch):
     pygame.display.quit()
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_window_opens_closes_and_opens_again(window, env_id):
     env = gym.make(env_id, render_mode="human")
     for _ in range(2):
@@ -505,7 +506,7 @@ def colours(frame, *wanted):
     return [int(np.all(frame == rendering._rgb(colour), axis=-1).sum()) for colour in wanted]
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_nothing_more_is_shown_unless_it_is_asked_for(env_id):
     plain = shown(env_id)
     assert max(colours(plain, rendering.FORCE.edge, rendering.STRIP_PAPER)) < 20
@@ -738,7 +739,7 @@ def test_colours_and_widths_are_those_of_the_page():
 # --- speed and real time ---
 
 
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_pictures_are_quick(env_id):
     """At least 300 steps with a picture per second of processor time, in the best of a few samples."""
     env = gym.make(env_id, render_mode="rgb_array")
@@ -843,7 +844,7 @@ PAINT = """([picture, poses, margin]) => {
 
 
 @pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
-@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("env_id", covering())
 def test_pictures_are_those_of_the_page(env_id, page):
     """Both painters, given the same shapes and poses; what differs are roundings where edges are."""
     from lag_envs.leaderboard.site import scenery

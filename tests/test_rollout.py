@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from covering import covering
 from rollouts import one_by_one
 
 from lag_envs.controllers import Constant, build, controllers, make_controller
@@ -11,7 +12,7 @@ from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 ENV = incline.Brake.id
 
 
-@pytest.mark.parametrize("env_id", TASKS)
+@pytest.mark.parametrize("env_id", covering())
 def test_together_as_one_by_one(env_id):
     """Also where episodes end at different times, and seeds are anyhow."""
     seeds = [5, 99, 7]

@@ -7,6 +7,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -27,7 +28,7 @@ def made(task):
     return gym.make(task.id).unwrapped
 
 
-@pytest.mark.parametrize("id", REGISTERED)
+@pytest.mark.parametrize("id", covering())
 def test_unfused_is_the_environments_step_to_rounding(id):
     """Synchronised before each step, at most 1e-15 times size times condition."""
     check_against_fused(gym.make(id).unwrapped, range(2))

@@ -10,17 +10,18 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import covering
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from rollouts import ANY_BAR, IDS, SINGLE, actions, make
+from rollouts import ANY_BAR, SINGLE, actions, make
 
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
-each_id = pytest.mark.parametrize("env_id", IDS)
-each_single = pytest.mark.parametrize("env_id", SINGLE)
+each_id = pytest.mark.parametrize("env_id", covering())
+each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
 

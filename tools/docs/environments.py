@@ -11,7 +11,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -353,12 +353,18 @@ def _interval(row: Mapping[str, Any]) -> str:
 # --- what pages are made from -------------------------------------------------------------------------------
 
 
-def pages(root: Path = ROOT) -> dict[str, str]:
-    """Return the pages of all environments by id, from a checkout."""
-    from lag_envs.leaderboard.board import Board
-    from lag_envs.leaderboard.standings import board_data
+def pages(data: Mapping[str, Any], root: Path = ROOT, env_ids: Iterable[str] = TASKS) -> dict[str, str]:
+    """Return pages of environments by id, from a checkout.
 
+    Parameters
+    ----------
+    data : mapping
+        What `lag_envs.leaderboard.standings.board_data` returns.
+    root : Path, optional
+        The checkout.
+    env_ids : iterable of str, optional
+        Which ones; by default all.
+    """
     accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
-    data = board_data(Board(root / "leaderboard"))
     boards = {one["id"]: one for one in data["environments"] if not one["frozen"]}
-    return {env_id: page(env_id, boards.get(env_id), accuracy) for env_id in TASKS}
+    return {env_id: page(env_id, boards.get(env_id), accuracy) for env_id in env_ids}

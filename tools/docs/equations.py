@@ -11,6 +11,7 @@ from typing import Any
 
 import sympy
 from latex2mathml.converter import convert
+from sympy.simplify.fu import TR10i
 
 from lag_envs.scenes import Scene, symbolic
 from tools.docs.markdown import described, groups
@@ -46,7 +47,7 @@ def equations(scene: Scene) -> list[str]:
     """Return the equations of motion: Lagrange's, one for each free coordinate, without denominators."""
     found = []
     for name in scene._layout.free:
-        equation = sympy.simplify(symbolic.euler_lagrange(scene, name))
+        equation = _tidied(symbolic.euler_lagrange(scene, name))
         numerator = sympy.expand(sympy.fraction(sympy.together(equation))[0])
         common = sympy.Mul(*(f for f in sympy.Mul.make_args(sympy.factor_terms(numerator)) if not f.is_Add))
         tidy = sympy.collect(sympy.expand(numerator / common), _accelerations(scene), _short)
@@ -58,12 +59,22 @@ def with_numbers(scene: Scene) -> str:
     """Return the acceleration of the only free coordinate with the scene's numbers in place of symbols."""
     (name,) = scene._layout.free
     acceleration = sympy.Function(name, real=True)(symbolic.t).diff(symbolic.t, 2)
-    equation = sympy.simplify(symbolic.euler_lagrange(scene, name))
+    equation = _tidied(symbolic.euler_lagrange(scene, name))
     numbers = {s: getattr(scene, s.name) for s in equation.free_symbols if s.name in scene._numbers()}
     equation = sympy.expand(equation.xreplace({s: sympy.Rational(repr(x)) for s, x in numbers.items()}))
     factor = sympy.simplify(equation.diff(acceleration))
     rest = sympy.expand(acceleration - equation / factor)
     return f"{_latex(scene, acceleration)} = {_latex(scene, rest.evalf(5))}"
+
+
+def _tidied(expression: Any) -> Any:
+    """Simplify by the identities that mechanics needs; `sympy.simplify` takes ten times as long."""
+    expression = sympy.expand(expression)
+    for angle in sorted({f.args[0] for f in expression.atoms(sympy.sin, sympy.cos)}, key=str):
+        sine, cosine = sympy.sin(angle), sympy.cos(angle)
+        expression = sympy.expand(expression.subs(cosine**2, 1 - sine**2))
+        expression = expression.subs(sine * cosine, sympy.sin(2 * angle) / 2)
+    return TR10i(expression)  # sin a sin b + cos a cos b = cos(a - b), and the like
 
 
 def _short(coefficient: Any) -> Any:

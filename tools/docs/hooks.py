@@ -38,7 +38,9 @@ def generated() -> dict[str, str]:
     """Return the pages that are generated, by their place in the site."""
     from tools.docs import environments, scenes
 
-    found = {f"{ENVIRONMENTS}/{env_id}.md": text for env_id, text in environments.pages(ROOT).items()}
+    found = {
+        f"{ENVIRONMENTS}/{env_id}.md": text for env_id, text in environments.pages(board(), ROOT).items()
+    }
     found[f"{ENVIRONMENTS}/index.md"] = environments.index()
     found["scenes.md"] = scenes.page()
     return found

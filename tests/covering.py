@@ -1,0 +1,60 @@
+"""Which environments the quick tests run on: a few that together have every feature of a task's record.
+
+Tests over environments take their parameters from `covering`. Those outside the covering set are marked
+slow, so ``make test`` costs about the same however many environments there are, and ``make test-slow`` runs
+the rest. Checks of a few milliseconds run on all: they are parametrised with `TASKS` itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any
+
+import pytest
+
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
+
+#: Entries of a record in which tasks differ by numbers and words only. Any other that a task has of its own
+#: is a feature.
+WORDS_AND_NUMBERS = frozenset(
+    "id scene defaults interval steps action start target usable usable_ranges check check_start fastest "
+    "edges observe bounds reward reached behaviour controllers reference hyperparameters goal "
+    "value_iteration examples difficulty note quantities".split()
+)
+
+
+@cache
+def features(kind: type[Task]) -> frozenset[str]:
+    """Return what code depends on in a task's record, in words."""
+    task = kind()
+    formulas, form = task.formulas, task.scene._form
+    own = {name for name in vars(Task) if getattr(kind, name) is not getattr(Task, name)}
+    found = {name for name in own - WORDS_AND_NUMBERS if not name.startswith("_")}
+    found |= {f"variant: {name}" for name in kind.examples.variants}
+    found |= {f"control: {held.level}" for held in task.scene._layout.prescribed if held.level}
+    found.add(f"engine: {form.kind.__name__ if form else 'series'}")
+    found.add(f"{formulas.actions} actions, {'listed' if formulas.choices else 'ranges'}")
+    found.add(f"{formulas.targets} targets")
+    if any(acting.low != -acting.high for acting in formulas.acting if not acting.values):
+        found.add("a range that is not symmetric")
+    return frozenset(found)
+
+
+def quick(ids: Iterable[str] = TASKS) -> list[str]:
+    """Return a covering set, chosen greedily: what adds most features, and then has fewest coordinates."""
+    left = {env_id: features(TASKS[env_id]) for env_id in ids}
+    size = {env_id: len(TASKS[env_id]().scene._layout.free) for env_id in left}
+    missing, found = frozenset[str]().union(*left.values()), []
+    while missing:
+        found.append(max(left, key=lambda env_id: (len(left[env_id] & missing), -size[env_id])))
+        missing -= left[found[-1]]
+    return [env_id for env_id in left if env_id in found]
+
+
+def covering(ids: Iterable[str] = TASKS) -> list[Any]:
+    """Return all ids for the parameters of a test, those outside their covering set marked slow."""
+    every = list(ids)
+    chosen = quick(every)
+    return [pytest.param(i, marks=() if i in chosen else pytest.mark.slow) for i in every]
