@@ -104,9 +104,9 @@ def oracle(case):
 @pytest.mark.parametrize(
     ("kind", "n"),
     [
-        ("task", 6),
-        ("damped", 6),
-        ("stiff", 8),
+        ("task", 3),
+        ("damped", 3),
+        ("stiff", 4),
         *(pytest.param(kind, 120, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
     ],
 )

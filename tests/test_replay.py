@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from functools import cache
 
 import pytest
 from covering import covering
@@ -57,13 +58,17 @@ def test_a_claim_in_its_last_bit_is_false():
 
 
 def test_a_drive_may_stop_before_its_end():
-    drive = driven(TASKS[ID](), most=10)
-    found = replay.replay(drive)
+    found = replay.replay(short())
     assert found.true and not found.finished
 
 
+@cache
+def short():
+    return driven(TASKS[ID](), most=10)
+
+
 def altered(field, value):
-    link = replay.write_link(driven(TASKS[ID](), most=10))
+    link = replay.write_link(short())
     fields = link.removeprefix("#drive=").split("~")[:-1]
     fields[field] = value
     text = "~".join(fields)

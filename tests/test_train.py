@@ -424,7 +424,7 @@ def beside_the_example(monkeypatch):
 @pytest.mark.parametrize(
     ("given", "env_id"),
     [
-        (str(BALL), "BallOnBeam-v0"),
+        pytest.param(str(BALL), "BallOnBeam-v0", marks=pytest.mark.slow),
         pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
         # It chooses among three actions.
         pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),

@@ -142,6 +142,11 @@ class UnfusedProgram:
         return self.script.text(PYTHON)
 
     @cached_property
+    def functions(self) -> dict[str, Any]:
+        """The functions of the script in Python; they keep nothing."""
+        return run_python(self.python)
+
+    @cached_property
     def javascript(self) -> str:
         """The script in JavaScript."""
         return self.script.text(JAVASCRIPT)
@@ -370,7 +375,7 @@ class Unfused:
     def __init__(self, task: Task, program: UnfusedProgram | None = None) -> None:
         self.task = task
         self.program = program = program or UnfusedProgram(task)
-        self._functions = run_python(program.python)
+        self._functions = program.functions
         self.numbers = [0.0] * program.size
         self.constants = program.constants
         self._actions = Actions(task.formulas.actions, task.formulas.choices)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -106,24 +107,39 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     told at `MARKS`.
     """
     task, program = env.task, env.program
-    names = list(program.given)
-    found = []
-    for name, unit in zip(task.scene._numbers(), _units(task), strict=True):
-        value = getattr(task.scene, name)
-        if name in program.made or not 0.0 < value < math.inf:
-            continue
-        try:
-            others = [kind(**{name: value * mark}) for mark in MARKS]
-        except (ValueError, TypeError, FormulaError):
-            continue
-        if all(_steps_as(env, name, other) for other in (others[0], others[-1])):
-            slider = {"name": name, "unit": unit, "at": names.index(f"self_{name}"), "value": value}
+    names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
+    values = {name: getattr(task.scene, name) for name in units if name not in program.made}
+    marked = {
+        name: others
+        for name, value in values.items()
+        if 0.0 < value < math.inf and (others := _made(kind, {name: value}, MARKS))
+    }
+    # All at once, which is quick; and only where that is not as it should be one by one.
+    together = _follows(env, {name: values[name] for name in marked})
+    found: list[dict[str, Any]] = []
+    for name, others in marked.items():
+        if together or _follows(env, {name: values[name]}):
             looks = [_look(other) for other in others]
-            found.append(slider | ({"looks": looks} if looks[0] != looks[-1] else {}))
+            at = {"name": name, "unit": units[name], "at": names.index(f"self_{name}"), "value": values[name]}
+            found.append(at | ({"looks": looks} if looks[0] != looks[-1] else {}))
     acting = task.formulas.acting
     if task.formulas.clipped and acting and all(a.low == -a.high for a in acting):
         found.append({"name": "control limit", "unit": "", "at": names.index("strength"), "value": 1.0})
     return found
+
+
+def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float]) -> list[Task]:
+    """Return the task with parameters at marks; nothing where one of them is refused."""
+    try:
+        return [kind(**{name: value * mark for name, value in values.items()}) for mark in marks]
+    except (ValueError, TypeError, FormulaError):
+        return []
+
+
+def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
+    """Tell whether a script with other values of parameters does what tasks made with them do."""
+    others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
+    return bool(others) and all(_steps_as(env, list(values), other) for other in others)
 
 
 def _units(task: Task) -> list[str]:
@@ -136,12 +152,13 @@ def _look(task: Task) -> dict[str, Any]:
     return {key: found.get(key) for key in ("shapes", "window")}
 
 
-def _steps_as(env: Unfused, name: str, other: Task) -> bool:
-    """Tell whether a script with another value of a parameter does what another task's does."""
+def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
+    """Tell whether a script with another task's values of parameters does what that task's does."""
     if other.formulas.key != env.task.formulas.key or other.limit != env.task.limit:
         return False
     changed, own = Unfused(env.task, env.program), Unfused(other)
-    changed.set_parameter(name, getattr(other.scene, name))
+    for name in names:
+        changed.set_parameter(name, getattr(other.scene, name))
     if not np.allclose(changed.constants, own.constants, rtol=1e-13, atol=0.0):
         return False
     formulas = other.formulas
