@@ -12,6 +12,7 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -78,6 +79,13 @@ class Run:
     def path(self, name: str) -> Path:
         """Return the path of one of the run's files."""
         return self.folder / name
+
+    @contextmanager
+    def clock(self) -> Iterator[None]:
+        """Add the time that passes to that of training."""
+        started = time.perf_counter()
+        yield
+        self.seconds += time.perf_counter() - started
 
     # --- files ----------------------------------------------------------------------------------------------
 
