@@ -242,7 +242,6 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     model.get_env().reset()  # compiles
     # Another seed has other episodes from the first to the last, and so has one that goes on.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
-    started, before = time.perf_counter(), run.seconds
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
@@ -252,8 +251,9 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 
         def _on_step(self) -> bool:
             run.trained = self.num_timesteps
-            run.seconds = before + time.perf_counter() - started
+            run.stop_clock()
             show(run)
+            run.start_clock()
             return True
 
         def _on_rollout_start(self) -> None:
@@ -262,19 +262,21 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
                 self.keep()
 
         def keep(self) -> None:
-            """Test the policy as it is, and save all."""
+            """Test the policy as it is, and save all; none of it is training."""
+            run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
             mean = play(run.env, policy_of(run, self.model), seeds).mean()
             run.trained = self.last = self.num_timesteps
-            run.seconds = before + time.perf_counter() - started
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             run.save_checkpoint(content)
             self.logger.record("test/mean_return", mean)
             tested(run)
+            run.start_clock()
 
     watch = Watch()
     if run.trained < run.steps:
+        run.start_clock()
         # The learner adds what it has done before to the number of steps it is given.
         model.learn(
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
@@ -303,6 +305,7 @@ def evaluate(run: Run, policy: Any) -> None:
         **run.settings,
         "trained": run.trained,
         "wall_seconds": round(run.seconds, 2),
+        "processor_seconds": round(run.processor_seconds, 2),
         "evaluation_seconds": round(time.perf_counter() - started, 2),
         "mean_return": float(returns.mean()),
         "score": score(run.env, float(returns.mean())),

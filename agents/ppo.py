@@ -411,8 +411,9 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     if not run.curve:
         test()
     while learner.trained < run.steps:
-        with run.clock():
-            learner.iterate()
+        run.start_clock()
+        learner.iterate()
+        run.stop_clock()
         run.trained = learner.trained
         show(run)
         if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
