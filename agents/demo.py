@@ -18,7 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.learners import ALGORITHMS, hyperparameters, load_policy
+from agents.learners import LEARNERS, hyperparameters, label, load_policy
 from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env, reports_errors
 from agents.train import command, follow, processes
 from lag_envs.evaluation.rollout import play
@@ -30,17 +30,18 @@ from lag_envs.tasks.registration import make_task
 DEFAULT_FOLDER = Path("runs/demo")
 EPISODES = 20
 EPILOG = """what is left in the output folder:
-  model.zip            the policy: stable_baselines3's load reads it
+  model.zip            the policy: agents.learners.load_policy reads it
   learning_curve.png   returns while training, beside the controllers and the random policy
   episode.mp4          one fresh episode of the trained policy
   comparison.json      returns and scores of all agents on the same fresh episodes
   result.json          the training: returns, learning curve, hyperparameters, versions and times
-  tensorboard/         for `tensorboard --logdir FOLDER`
+  tensorboard/         for `tensorboard --logdir FOLDER`, of learners of Stable-Baselines3
 
 Re-run it to resume where it was interrupted; a finished run is evaluated again.
 
 examples:
-  python -m agents.demo                                  train on PivotedBar-v0, in about a minute
+  python -m agents.demo                                  train on PivotedBar-v0, in seconds
+  python -m agents.demo --algo ppo --output runs/sb3     the same by Stable-Baselines3, in about a minute
   python -m agents.demo --new --seed 7                   anew, with other random numbers
   python -m agents.demo --env ball_on_beam.py --output runs/ball"""
 
@@ -57,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
         "--env", default="PivotedBar-v0", metavar="ENV",
         help="id, module:ID or FILE, whose code is run (default %(default)s)",
     )  # fmt: skip
-    p.add_argument("--algo", default="ppo", help=f"{', '.join(ALGORITHMS)} (default %(default)s)")
+    p.add_argument("--algo", default="fast_ppo", help=f"{', '.join(LEARNERS)} (default %(default)s)")
     p.add_argument("--seed", type=int, default=0, help="seed of training (default %(default)s)")
     p.add_argument("--steps", type=int, help="environment steps to train for, in all")
     p.add_argument(
@@ -93,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def open_run(args: argparse.Namespace) -> Run:
     """Return the run that the arguments ask for, or raise a UserError."""
     env = own_env(args.env)
-    check_name("algorithm", args.algo, ALGORITHMS)
+    check_name("algorithm", args.algo, LEARNERS)
     if not 0 <= args.seed < 2**31:
         raise UserError(f"--seed must lie between 0 and 2147483647, got {args.seed}")
     if args.steps is not None and args.steps < 1:
@@ -118,7 +119,7 @@ def report(run: Run, video: bool) -> None:
 
     policy = load_policy(run.folder)
     result = json.loads(run.path(RESULT).read_text())
-    learner = run.algo.upper()
+    learner = label(run.algo)
     seeds = fresh_seeds(EPISODES)
     started = time.perf_counter()
     task = make_task(run.env)

@@ -1,4 +1,7 @@
-"""Learners of Stable-Baselines3: hyperparameters, environments, interruptible training, policies."""
+"""Learners of Stable-Baselines3: hyperparameters, environments, interruptible training, policies.
+
+What has a file of its own is called from here too, so that commands need not know which is which.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import platform
 import time
 from collections.abc import Callable
 from copy import deepcopy
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -47,6 +51,9 @@ ALGORITHMS = {
     "dqn": ("stable_baselines3", "DQN"),
     "tqc": ("sb3_contrib", "TQC"),
 }
+#: Learners of our own: the module that trains each, and what tables call it.
+OWN = {"fast_ppo": ("agents.ppo", "fast PPO")}
+LEARNERS = (*ALGORITHMS, *OWN)
 #: Episodes of a test while training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
 #: Tests, and so points of the learning curve and checkpoints, of one run.
@@ -57,10 +64,13 @@ SCALE = "lag_envs.sb3.ScaledReward"
 PACKAGES = ("gymnasium", "numpy", "numba", "torch", "stable-baselines3", "sb3-contrib")
 
 
+def label(algo: str) -> str:
+    """Return what tables call a learner."""
+    return {**ALGORITHMS, **OWN}[algo][1]
+
+
 def learner(algo: str) -> type:
     """Return a learner's class."""
-    from importlib import import_module
-
     module, name = ALGORITHMS[check_name("algorithm", algo, ALGORITHMS)]
     return getattr(import_module(module), name)
 
@@ -80,7 +90,7 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
     UserError
         For an unknown algorithm, or a file without readable entry for the environment.
     """
-    check_name("algorithm", algo, ALGORITHMS)
+    check_name("algorithm", algo, LEARNERS)
     if file is None:
         return lag_envs.hyperparams.hyperparameters(algo, make_task(env_id))
     import yaml
@@ -222,6 +232,9 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     tested : callable
         Called when the policy was tested and a checkpoint written.
     """
+    if run.algo in OWN:
+        import_module(OWN[run.algo][0]).train(run, show=show, tested=tested)
+        return
     from stable_baselines3.common.callbacks import BaseCallback
 
     content = run.load_checkpoint()
@@ -229,7 +242,6 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
     model.get_env().reset()  # compiles
     # Another seed has other episodes from the first to the last, and so has one that goes on.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
-    started, before = time.perf_counter(), run.seconds
     every = run.steps / TESTS
 
     class Watch(BaseCallback):
@@ -239,8 +251,9 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 
         def _on_step(self) -> bool:
             run.trained = self.num_timesteps
-            run.seconds = before + time.perf_counter() - started
+            run.stop_clock()
             show(run)
+            run.start_clock()
             return True
 
         def _on_rollout_start(self) -> None:
@@ -249,19 +262,21 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
                 self.keep()
 
         def keep(self) -> None:
-            """Test the policy as it is, and save all."""
+            """Test the policy as it is, and save all; none of it is training."""
+            run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
             mean = play(run.env, policy_of(run, self.model), seeds).mean()
             run.trained = self.last = self.num_timesteps
-            run.seconds = before + time.perf_counter() - started
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
             run.save_checkpoint(content)
             self.logger.record("test/mean_return", mean)
             tested(run)
+            run.start_clock()
 
     watch = Watch()
     if run.trained < run.steps:
+        run.start_clock()
         # The learner adds what it has done before to the number of steps it is given.
         model.learn(
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
@@ -271,20 +286,26 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 
 
 def finish(run: Run, model: Any) -> None:
-    """Write the policy, evaluate it on fresh episodes, and write the result."""
+    """Write the policy, and evaluate it."""
     normalise = model.get_vec_normalize_env()
     file = io.BytesIO()
     model.save(file)
     write(run.path(MODEL), file.getvalue())
     if normalise is not None and normalise.norm_obs:
         write(run.path(NORMALISATION), pickle.dumps(normalise))
+    evaluate(run, policy_of(run, model))
+
+
+def evaluate(run: Run, policy: Any) -> None:
+    """Let the policy of a finished training play fresh episodes, and write the result."""
     started = time.perf_counter()
-    returns = play(run.env, policy_of(run, model), fresh_seeds(EPISODES))
+    returns = play(run.env, policy, fresh_seeds(EPISODES))
     known = known_returns(run.env)
     result = {
         **run.settings,
         "trained": run.trained,
         "wall_seconds": round(run.seconds, 2),
+        "processor_seconds": round(run.processor_seconds, 2),
         "evaluation_seconds": round(time.perf_counter() - started, 2),
         "mean_return": float(returns.mean()),
         "score": score(run.env, float(returns.mean())),
@@ -347,7 +368,7 @@ def policy_of(run: Run, model: Any) -> Policy:
     return Policy(model, bins=numbered(run.hyperparameters))
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(folder: Path) -> Any:
     """Return the policy of a finished run.
 
     Raises
@@ -357,6 +378,8 @@ def load_policy(folder: Path) -> Policy:
     """
     result = read_result(folder / RESULT)
     try:
+        if result["algo"] in OWN:
+            return import_module(OWN[result["algo"]][0]).Policy.load(folder / MODEL)
         model = learner(result["algo"]).load(folder / MODEL, device="cpu")
         file = folder / NORMALISATION
         normalise = pickle.loads(file.read_bytes()) if file.exists() else None

@@ -12,6 +12,7 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -60,9 +61,12 @@ class Run:
     #: The file or module of the user's own environment, as it was given; empty for one of the package.
     source: str = ""
     trained: int = 0
+    #: Of training alone, without compiling, tests and evaluation: on the clock, and on the processor.
     seconds: float = 0.0
+    processor_seconds: float = 0.0
     #: Steps so far, seconds so far, mean return of the policy then.
     curve: list[tuple[int, float, float]] = field(default_factory=list)
+    since: tuple[float, float] = 0.0, 0.0
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -79,11 +83,21 @@ class Run:
         """Return the path of one of the run's files."""
         return self.folder / name
 
+    def start_clock(self) -> None:
+        """Begin to count time as that of training."""
+        self.since = time.perf_counter(), time.process_time()
+
+    def stop_clock(self) -> None:
+        """Add the time since then to that of training."""
+        self.seconds += time.perf_counter() - self.since[0]
+        self.processor_seconds += time.process_time() - self.since[1]
+
     # --- files ----------------------------------------------------------------------------------------------
 
     def save_checkpoint(self, content: dict[str, Any]) -> None:
         """Write everything that is needed to go on."""
-        progress = {"trained": self.trained, "seconds": self.seconds, "curve": self.curve}
+        names = ("trained", "seconds", "processor_seconds", "curve")
+        progress = {name: getattr(self, name) for name in names}
         data = pickle.dumps({"settings": self.settings, "progress": progress, **content})
         write(self.path(CHECKPOINT), data)
 
@@ -101,8 +115,8 @@ class Run:
         try:
             content = pickle.loads(file.read_bytes())
             settings, progress = content["settings"], content["progress"]
-            self.trained, self.seconds = progress["trained"], progress["seconds"]
-            self.curve = list(progress["curve"])
+            for name in progress:
+                setattr(self, name, progress[name])
         except Exception as error:  # whatever a damaged pickle leads to
             reason = f"{type(error).__name__}: {error}"
             raise UserError(f"{file} cannot be read ({reason}); --new starts over") from error

@@ -18,12 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.learners import LEARNERS, OWN, label
 from agents.optimum import DEFAULT_FOLDER, Solution, nodes, played, solvable
 from agents.run import MODEL, UserError, check_env
 from agents.value_iteration import CacheError
 from lag_envs import TASKS
 from lag_envs.controllers import controllers
-from lag_envs.leaderboard.export import ALGORITHMS, ExportError, export, find
+from lag_envs.leaderboard.export import ExportError, export, find
 from lag_envs.leaderboard.protocol import LEARNED_POLICIES, boards
 from lag_envs.leaderboard.submission import Refused, Submission, load, write
 
@@ -112,12 +113,16 @@ def optimal(
 def learned(env_id: str, runs: Path, folder: Path) -> Submission:
     """Write the finished runs of a learner, in a folder for each seed, as a submission."""
     algo = runs.name
-    name = ALGORITHMS[algo][1] if algo in ALGORITHMS else algo
+    name = label(algo) if algo in LEARNERS else algo
+    origin = OWN[algo][0] if algo in OWN else "Stable-Baselines3"
     made, off, count = export(
         find([runs]), folder, env=env_id, name=name, authors=AUTHORS, license=LICENSE,
-        description="Stable-Baselines3, hyperparameters as `lag-envs hyperparams` prints them",
+        description=f"{origin}, hyperparameters as `lag-envs hyperparams` prints them",
     )  # fmt: skip
-    print(f"  acts as the models do: actions differ by {off:.1e} at most, over {count} observations of each")
+    if count:
+        print(
+            f"  acts as the models do: actions differ by {off:.1e} at most, over {count} observations of each"
+        )
     return made
 
 

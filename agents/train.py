@@ -14,14 +14,15 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import groupby, product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from agents.learners import ALGORITHMS, EPISODES, TESTS, hyperparameters, train
+from agents.learners import EPISODES, LEARNERS, TESTS, hyperparameters, train
 from agents.run import (
     CHECKPOINT,
     MODEL,
@@ -74,7 +75,7 @@ def parser() -> argparse.ArgumentParser:
         help="ids, module:ID, or FILE or FILE:Class of your own, whose code is run; all: the package's",
     )  # fmt: skip
     p.add_argument(
-        "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default ppo)"
+        "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(LEARNERS)} (default ppo)"
     )
     p.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds (default %(default)s)")
     p.add_argument(
@@ -119,15 +120,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 130 if stopped else 1 if failed else 0
 
 
-def plan(args: argparse.Namespace) -> list[Run]:
-    """Return the runs that are asked for, or raise a UserError."""
+def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
+    """Return the runs that are asked for, with some hyperparameters changed; or raise a UserError."""
     if "all" in args.env and len(args.env) > 1:
         raise UserError(f"all stands alone, got {' '.join(args.env)}")
     given = list(TASKS) if args.env == ["all"] else list(dict.fromkeys(args.env))
     sources = {own_env(name): "" if name in TASKS else name for name in given}
     if args.ray and any(map(is_file, given)):
         raise UserError("--ray takes ids and module:ID; a file is not on the other machines")
-    algos = [check_name("algorithm", name, ALGORITHMS) for name in dict.fromkeys(args.algo)]
+    algos = [check_name("algorithm", name, LEARNERS) for name in dict.fromkeys(args.algo)]
     for name, least in (("seeds", 1), ("first_seed", 0), ("steps", 1), ("jobs", 1)):
         value = getattr(args, name)
         if value is not None and not least <= value < 2**31:
@@ -137,7 +138,7 @@ def plan(args: argparse.Namespace) -> list[Run]:
         raise UserError(f"--output must be a folder, {args.output} is not")
     runs = []
     for (env, source), algo in product(sources.items(), algos):
-        hyper = hyperparameters(algo, env, args.config)
+        hyper = {**hyperparameters(algo, env, args.config), **changed}
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))
         except (KeyError, ValueError, TypeError):

@@ -1,25 +1,72 @@
-"""Find the few numbers of the controllers that are not derived, on seeds that no evaluation uses.
+"""Find numbers of controllers and settings of our PPO, on seeds that no evaluation uses.
 
-``python -m agents.tune ENV`` prints what it found for each controller of the environment; those
-that are the controllers' defaults were found in this way.
+``python -m agents.tune --help`` tells more.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 from scipy.optimize import differential_evolution
 
-from agents.run import UserError, check_env, reports_errors
+from agents import learners
+from agents.learners import hyperparameters, load_policy
+from agents.results import ROOT, to_json
+from agents.run import Run, UserError, check_env, reports_errors, terminable
+from lag_envs import workers
 from lag_envs.controllers import build
 from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
+from lag_envs.evaluation.statistics import rounded
+from lag_envs.host import machine
+from lag_envs.scores import score
+from lag_envs.store import write
+from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
 
 #: Evaluation has seeds from 1,000,000,000 on, learning curves from 2,000,000,000 on.
 FIRST_TUNING_SEED = 3_000_000_000
+LEARNER = "fast_ppo"
+#: What is tried of each setting. A setting that is drawn keeps its value with probability 1/2.
+CHOICES: Mapping[str, Sequence[Any]] = {
+    "learning_rate": (1e-3, 2e-3, 3e-3, 5e-3, 8e-3),
+    "n_envs": (64, 128, 256),
+    "n_steps": (32, 64, 128, 256),
+    "n_epochs": (2, 3, 5, 8),
+    "batch_size": (512, 1024, 2048),
+    "gamma": (0.97, 0.98, 0.985, 0.99, 0.995, 0.998),
+    "gae_lambda": (0.8, 0.9, 0.95, 0.98),
+    "clip_range": (0.1, 0.2, 0.3),
+    "ent_coef": (0.0, 1e-3, 3e-3, 1e-2),
+    "max_grad_norm": (0.5, 1.0, 3.0),
+    "reward_scale": (0.03, 0.1, 0.3, 1.0),
+    "episode_share": (0.5, 1.0),
+    "state_noise": (True, False),
+    "noise_steps": (1, 2, 4, 8),
+    "log_std_init": (-1.0, -0.5, 0.0, 0.5),
+    "actor": ([32, 32], [64, 64]),
+    "critic": ([64, 32], [64, 64], [128, 128]),
+    "first_layer_scale": (1.0, 2.0, 3.0),
+}
+RESULTS = ROOT / "agents" / "results" / "tuning"
+EPILOG = f"""By default the numbers of the environment's controllers are looked for, by differential evolution,
+and printed; those that are the controllers' defaults were found in this way.
+
+With --settings settings of {LEARNER} are tried: first the task's own, then others that are drawn at random,
+each with some training seeds. FILE keeps every training, so that the command can be interrupted and run again,
+also with more --settings or --seeds. What is best goes by hand into the task's `hyperparameters`.
+
+examples:
+  python -m agents.tune PivotedBar-v0 --only "energy shaping + LQR"
+  python -m agents.tune PivotedBar-v0 --settings 20 --steps 300000 --seeds 2 --jobs 2
+"""
 
 
 def tunable(env_id: str) -> dict[str, Mapping[str, tuple[float, float]]]:
@@ -41,25 +88,149 @@ def tune(env_id: str, name: str, episodes: int, generations: int) -> tuple[dict[
     return {n: float(f"{v:.3g}") for n, v in zip(ranges, found.x, strict=True)}, -float(found.fun)
 
 
-@reports_errors("agents.tune")
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, or 2 for a user's mistake."""
-    p = argparse.ArgumentParser(prog="python -m agents.tune", description=__doc__)
+# --- settings of a learner ----------------------------------------------------------------------------------
+
+
+def drawn(number: int) -> dict[str, Any]:
+    """Return what the setting of a number changes; number 0 changes nothing."""
+    rng = np.random.default_rng(number)
+    changed = {}
+    for name, values in CHOICES.items():
+        keep, which = rng.random() < 0.5, int(rng.integers(len(values)))
+        if number and not keep:
+            changed[name] = values[which]
+    return changed
+
+
+def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episodes: int) -> dict[str, Any]:
+    """Train one seed with changed settings; return how good it got, and how long it took."""
+    learners.TESTS, learners.EPISODES = 8, 1
+    hyper = {**hyperparameters(LEARNER, env_id), **changed}
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(Path(folder), env_id, LEARNER, seed, steps, hyper)
+        learners.train(run, show=lambda run: None, tested=lambda run: None)
+        seeds = range(FIRST_TUNING_SEED, FIRST_TUNING_SEED + episodes)
+        mean = float(play(env_id, load_policy(run.folder), seeds).mean())
+    return {
+        "seed": seed, "trained": run.trained, "return": mean, "score": score(env_id, mean),
+        "seconds": run.seconds, "processor_seconds": run.processor_seconds,
+        "curve": [[steps, mean] for steps, _, mean in run.curve],
+    }  # fmt: skip
+
+
+def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path) -> Any:
+    """Try settings that have not been tried, side by side; return all that was tried."""
+    about = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
+    data = read(file, about) or about | {"machine": machine(), "settings": []}
+    own = hyperparameters(LEARNER, env_id)
+    for number in range(len(data["settings"]), count):
+        changed = {name: value for name, value in drawn(number).items() if own[name] != value}
+        data["settings"].append({"number": number, "changed": changed, "runs": []})
+    with workers.processes(jobs) as submit:
+        futures = {}
+        for setting in data["settings"][:count]:
+            done = {run["seed"] for run in setting["runs"]}
+            for seed in sorted(set(range(seeds)) - done):
+                future = submit(trial, env_id, setting["changed"], seed, steps, episodes)
+                futures[future] = setting, seed
+        for (setting, seed), found in workers.outcomes(futures):
+            if isinstance(found, BaseException):
+                found = {"seed": seed, "failed": f"{type(found).__name__}: {found}".splitlines()[0]}
+            setting["runs"] = sorted([*setting["runs"], rounded(found)], key=lambda run: run["seed"])
+            write(file, to_json(data))
+            how = found.get("failed") or f"return {found['return']:.2f} in {found['seconds']:.0f} s"
+            print(f"setting {setting['number']}, seed {seed}: {how}", flush=True)
+    return data
+
+
+def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return what an earlier search left, or None; raise a UserError for another search's file."""
+    if not file.exists():
+        return None
+    try:
+        data = json.loads(file.read_text())
+        different = [name for name, value in about.items() if data[name] != value]
+        [(s["number"], s["changed"], s["runs"]) for s in data["settings"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{file} cannot be read ({error!r}); remove it, or choose another --output"
+        ) from error
+    if different:
+        what = ", ".join(f"{name} {data[name]!r}" for name in different)
+        raise UserError(f"{file} is of a search with {what}; choose another --output")
+    return data
+
+
+def ranked(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return the cells of a table, best setting first by the mean return over its seeds."""
+    rows = []
+    for setting in data["settings"]:
+        returns = [run["return"] for run in setting["runs"] if "return" in run]
+        if returns:
+            rows.append((float(np.mean(returns)), min(returns), setting))
+    cells = [("setting", "mean return", "lowest", "score", "changed")]
+    for mean, lowest, setting in sorted(rows, key=lambda row: -row[0]):
+        value = score(data["env"], mean)
+        changed = ", ".join(f"{name} {value}" for name, value in setting["changed"].items())
+        tail = "" if value is None else f"{value:.3f}"
+        cells.append((str(setting["number"]), f"{mean:.2f}", f"{lowest:.2f}", tail, changed or "nothing"))
+    return cells
+
+
+def pace(data: Mapping[str, Any]) -> float:
+    """Return how many steps a second of the processor trains, the median over all runs."""
+    runs = [run for setting in data["settings"] for run in setting["runs"] if "trained" in run]
+    return float(np.median([run["trained"] / run["processor_seconds"] for run in runs]))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    p = argparse.ArgumentParser(
+        prog="python -m agents.tune",
+        description="Find numbers of controllers or settings of a learner, on seeds that no evaluation uses.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     p.add_argument("env", metavar="ENV", help="id of an environment")
     p.add_argument("--only", metavar="NAME", help="tune this controller only")
-    p.add_argument("--episodes", type=int, default=2000, help="episodes per trial (default %(default)s)")
+    p.add_argument("--episodes", type=int, help="episodes per trial (default 2000, with --settings 200)")
     p.add_argument("--generations", type=int, default=15, help="default %(default)s")
-    args = p.parse_args(arguments)
+    p.add_argument("--settings", type=int, metavar="N", help=f"try so many settings of {LEARNER} instead")
+    p.add_argument("--steps", type=int, help="steps of each training (default n_timesteps)")
+    p.add_argument("--seeds", type=int, default=2, help="trainings with each setting (default %(default)s)")
+    p.add_argument("--jobs", type=int, default=1, help="trainings at once (default %(default)s)")
+    p.add_argument("--output", type=Path, metavar="FILE", help="default agents/results/tuning/ENV.json")
+    return p
+
+
+@reports_errors("agents.tune")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, 2 for a user's mistake, 130 when interrupted."""
+    args = parser().parse_args(arguments)
     known = tunable(check_env(args.env))
+    for name in ("episodes", "generations", "settings", "steps", "seeds", "jobs"):
+        if (value := getattr(args, name)) is not None and value < 1:
+            raise UserError(f"--{name} must be at least 1, got {value}")
+    if args.settings:
+        steps = args.steps or int(hyperparameters(LEARNER, args.env)["n_timesteps"])
+        file = args.output or RESULTS / f"{args.env}.json"
+        try:
+            with terminable():
+                data = search(
+                    args.env, args.settings, args.seeds, steps, args.episodes or 200, args.jobs, file
+                )
+        except KeyboardInterrupt:
+            print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
+            return 130
+        print("\n" + "\n".join(columns(ranked(data))))
+        print(f"{pace(data):,.0f} steps per second of the processor. Written to {file}")
+        return 0
     if args.only not in (None, *known):
         there = hint(args.only, known, "" if known else "there is nothing to tune")
         raise UserError(f"nothing of {args.only!r} can be tuned; {there}")
-    for name in ("episodes", "generations"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name} must be at least 1, got {getattr(args, name)}")
     for name in known:
         if args.only in (None, name):
-            numbers, mean = tune(args.env, name, args.episodes, args.generations)
+            numbers, mean = tune(args.env, name, args.episodes or 2000, args.generations)
             print(f"{args.env}, {name}: {numbers}, return {mean:.3f}", flush=True)
     return 0
 

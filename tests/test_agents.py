@@ -155,8 +155,8 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     assert status == 0, output
     assert "switching line" in output and "best known" in output
     comparison = json.loads((folder / "comparison.json").read_text())
-    assert {"PPO", "random", "zero", "full damping", "switching line"} <= set(comparison["agents"])
-    assert len(comparison["agents"]["PPO"]["returns"]) == len(set(comparison["evaluation_seeds"])) == 2
+    assert {"fast PPO", "random", "zero", "full damping", "switching line"} <= set(comparison["agents"])
+    assert len(comparison["agents"]["fast PPO"]["returns"]) == len(set(comparison["evaluation_seeds"])) == 2
     assert (folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "episode.mp4").stat().st_size > 1000
     assert json.loads((folder / "result.json").read_text())["trained"] >= 5000
@@ -174,7 +174,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     ("arguments", "message"),
     [
         (["--env", "PivotedBr-v0"], "did you mean PivotedBar-v0"),
-        (["--algo", "pppo"], "did you mean ppo"),
+        (["--algo", "fastppo"], "did you mean fast_ppo"),
         (["--steps", "0"], "--steps must be at least 1"),
         (["--seed", "-1"], "--seed must lie between"),
     ],

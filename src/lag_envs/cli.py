@@ -546,7 +546,7 @@ def _parsers(whole: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 def declare_hyperparams(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``hyperparams``."""
-    parser.add_argument("learner", metavar="LEARNER", help="ppo, sac, td3, tqc or dqn")
+    parser.add_argument("learner", metavar="LEARNER", help="ppo, sac, td3, tqc, dqn or fast_ppo")
 
 
 def run_hyperparams(args: argparse.Namespace) -> int:
@@ -756,7 +756,8 @@ examples:
         "hyperparams",
         "print hyperparameters for the RL Zoo",
         """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the form of
-the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with.
+the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with. Those of
+fast_ppo are for `python -m agents.ppo`, in a clone.
 
 examples:
   lag-envs hyperparams ppo > ppo.yml

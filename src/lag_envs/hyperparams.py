@@ -1,4 +1,4 @@
-"""Hyperparameters of Stable-Baselines3's learners, in the form of the RL Zoo.
+"""Hyperparameters of learners: of Stable-Baselines3's in the form of the RL Zoo, and of our own PPO.
 
 A task says what differs for it (`Task.hyperparameters`). Measured at these steps; see docs/agents.md.
 """
@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 DISCRETISE = "gymnasium.wrappers.DiscretizeAction"
+#: The learner that the Zoo does not know.
+OWN = "fast_ppo"
 _OFF_POLICY: Mapping[str, Any] = {
     "n_envs": 4,
     "n_timesteps": 4e4,
@@ -81,6 +83,30 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "env_wrapper": [{DISCRETISE: {"bins": 9}}],
         "policy_kwargs": {"net_arch": [128, 128]},
     },
+    # PPO in one file (agents/ppo.py), whose settings these are. Weights of the first layer are multiplied at
+    # the start, for otherwise observations of order one hardly bend its tanh.
+    OWN: {
+        "n_timesteps": 4e5,
+        "n_envs": 64,
+        "n_steps": 96,
+        "n_epochs": 3,
+        "batch_size": 512,
+        "learning_rate": 5e-3,
+        "gamma": 0.99,
+        "gae_lambda": 0.9,
+        "clip_range": 0.2,
+        "ent_coef": 1e-3,
+        "vf_coef": 0.5,
+        "max_grad_norm": 3.0,
+        "reward_scale": 0.1,
+        "episode_share": 0.5,
+        "state_noise": True,
+        "noise_steps": 4,
+        "log_std_init": 0.0,
+        "actor": [32, 32],
+        "critic": [64, 32],
+        "first_layer_scale": 2.0,
+    },
 }
 
 
@@ -97,10 +123,11 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
     learner : str
         One of `learners`.
     task : Task
-        The task. Where its actions are choices, none are numbered and none explored by gSDE.
+        The task. Where its actions are choices, none are numbered and none explored by gSDE; our own PPO
+        looks after that itself.
     """
     found = {**DEFAULTS[learner], **task.hyperparameters.get(learner, {})}
-    if task.formulas.choices:
+    if task.formulas.choices and learner != OWN:
         found = {name: value for name, value in found.items() if name not in ("use_sde", "sde_sample_freq")}
         wrappers = [wrapper for wrapper in found.pop("env_wrapper", []) if DISCRETISE not in wrapper]
         found |= {"env_wrapper": wrappers} if wrappers else {}
@@ -108,8 +135,9 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
 
 
 def as_yaml(learner: str, tasks: Mapping[str, Any]) -> str:
-    """Return the hyperparameters of tasks, by id, as a file of the RL Zoo."""
-    lines = [f"# {learner.upper()}, in the form of the RL Zoo."]
+    """Return the hyperparameters of tasks, by id, as a file of the RL Zoo or for ``--config``."""
+    use = "for `python -m agents.train --config`" if learner == OWN else "in the form of the RL Zoo"
+    lines = [f"# {learner.upper()}, {use}."]
     for env_id, task in tasks.items():
         lines.append(f"{env_id}:")
         lines += [f"  {name}: {_yaml(value)}" for name, value in hyperparameters(learner, task).items()]

@@ -28,6 +28,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 import lag_envs  # noqa: F401  (registers the environments)
+from lag_envs.envs.stagger import stagger
 from lag_envs.leaderboard.policies import bin_centres
 
 
@@ -66,10 +67,7 @@ class VecEnv(vec_env.VecEnv):
     env : VectorEnv
         A vector environment that resets in the same step.
     stagger : int, default 0
-        Number of steps over which the starts of the first episodes are spread; the length of an episode is a
-        good choice. A reset then takes that many steps with random actions and restarts the environments one
-        after the other. Otherwise, if episodes are equally long, a learner's roll-out sees only one phase of
-        them.
+        Number of steps over which the starts of the first episodes are spread, see `lag_envs.envs.stagger`.
 
     Raises
     ------
@@ -93,7 +91,8 @@ class VecEnv(vec_env.VecEnv):
         seeds: Any = self._seeds  # Gymnasium's types know of one seed only
         observations, infos = self.env.reset(seed=seeds, options=self._stacked_options())
         if self._stagger:
-            observations, infos = self._stagger_starts()
+            seed = None if self._seeds[0] is None else int(self._seeds[0])
+            observations, infos = stagger(self.env, self._stagger, seed)
         self.reset_infos = self._split(infos)
         self._reset_seeds()
         self._reset_options()
@@ -153,16 +152,6 @@ class VecEnv(vec_env.VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     # --- the rest -------------------------------------------------------------------------------------------
-
-    def _stagger_starts(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        last = np.arange(self.num_envs) * self._stagger // self.num_envs
-        space = self.env.action_space
-        space.seed(None if self._seeds[0] is None else int(self._seeds[0]))
-        for t in range(self._stagger):
-            if t and (last == t).any():
-                self.env.reset(options={"reset_mask": last == t})
-            observations, *_, infos = self.env.step(space.sample())
-        return observations, infos
 
     def _stacked_options(self) -> dict[str, Any] | None:
         """Return the options of the environments as arrays of the batch."""

@@ -1,6 +1,7 @@
 """Turn models of Stable-Baselines3 into a submission, and prove that both act alike.
 
-A model's file runs code when it is loaded. Export your own models; nobody else's.
+A model's file runs code when it is loaded. Export your own models; nobody else's. Networks that
+``python -m agents.ppo`` left are arrays, which are read without running anything and taken as they are.
 """
 
 from __future__ import annotations
@@ -119,6 +120,11 @@ def _algorithm(file: Path) -> str:
     return "a2c" if "a2c" in names and "n_epochs" not in data else names[0]
 
 
+def _name(file: Path, algo: str | None) -> str:
+    """Return what a model's learner is called."""
+    return "PPO" if arrays_of(file) else ALGORITHMS[algo or _algorithm(file)][1]
+
+
 def _load(source: Source, algo: str) -> tuple[Any, Any]:
     """Return model and normalisation, or None for the latter."""
     from importlib import import_module
@@ -132,6 +138,27 @@ def _load(source: Source, algo: str) -> tuple[Any, Any]:
     except Exception as error:  # whatever a file that is no model leads to
         raise ExportError(f"{source.model} cannot be read: {type(error).__name__}: {error}") from error
     return model, normalise if normalise is not None and normalise.norm_obs else None
+
+
+def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | None:
+    """Return a network's table ``[policy]`` and its arrays, where a file holds arrays and no model.
+
+    Raises
+    ------
+    ExportError
+        For a network that the leaderboard does not take.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in found if name != "choices"}
+            choices = found["choices"].tolist()
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        return None
+    if len(choices) > 1:
+        raise ExportError(f"{file}: several actions that are chosen from lists cannot be submitted yet")
+    hidden = [len(arrays[f"bias_{k}"]) for k in range(len(arrays) // 2 - 1)]
+    table = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
+    return table | ({"bins": choices[0]} if choices else {"squash": "clip"}), arrays
 
 
 # --- converting ---------------------------------------------------------------------------------------------
@@ -303,6 +330,7 @@ def export(
         For models that cannot be exported, or that do not act as their export does.
     """
     known = [s.result for s in sources if s.result]
+    name = name or _name(sources[0].model, algo)
     env = env or _same("environment", [r.get("env") for r in known], "--env")
     if env not in protocol.boards():
         raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
@@ -312,11 +340,13 @@ def export(
         raise ExportError("it is not known how long a training took; --seconds tells")
     tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
     for number, source in enumerate(sources):
-        kind = algo or _algorithm(source.model)
-        if name is None:
-            name = ALGORITHMS[kind][1]
-        model, normalise = _load(source, kind)
-        table, content = convert(model, normalise)
+        model, normalise = None, None
+        if (ready := arrays_of(source.model)) is not None:
+            table, content = ready
+        else:
+            kind = algo or _algorithm(source.model)
+            model, normalise = _load(source, kind)
+            table, content = convert(model, normalise)
         try:
             made = architecture(env, table)
             shapes = {key: value.shape for key, value in content.items()}
@@ -325,12 +355,14 @@ def export(
             agent = made.agent({k: v.astype(np.float64) for k, v in content.items()})
         except Refused as error:
             raise ExportError(f"{source.model}: {error}") from error
-        one, count = difference(model, normalise, agent, env)
+        one, count = (0.0, 0) if model is None else difference(model, normalise, agent, env)
         if not one <= DIFFERENCE:
             raise ExportError(
                 f"{source.model}: model and export differ by {one:.1e} in an action, more than {DIFFERENCE:g}"
             )
         result = source.result or {}
+        if model is None and env_steps is None and "trained" not in result:
+            raise ExportError(f"{source.model}: it is not known how long it was trained; --env-steps tells")
         seed = result.get("seed", getattr(model, "seed", None))
         seed = number if seed is None or int(seed) in arrays else int(seed)
         if seed in arrays:
@@ -338,7 +370,7 @@ def export(
         tables.append(table)
         arrays[seed] = content
         off = max(off, one)
-        steps.append(int(result.get("trained", model.num_timesteps)))
+        steps.append(int(result.get("trained", getattr(model, "num_timesteps", 0))))
         took.append(result.get("wall_seconds", 0.0))
         curves += _curve(seed, result.get("curve", []))
     for table in tables:
@@ -352,7 +384,7 @@ def export(
     }
     try:
         submission = write(
-            folder, env=env, name=name or "", authors=list(authors), license=license,
+            folder, env=env, name=name, authors=list(authors), license=license,
             policy=tables[0], arrays=arrays, training=training, code=code, description=description,
         )  # fmt: skip
     except (Refused, OSError) as error:
@@ -422,7 +454,7 @@ def run_export(args: argparse.Namespace) -> int:
         torch.set_num_threads(1)  # such networks are too small to share out
         sources = find(args.models, args.normalise)
         known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")
-        name = args.name or ALGORITHMS[args.algo or _algorithm(sources[0].model)][1]
+        name = args.name or _name(sources[0].model, args.algo)
         submission, off, count = export(
             sources, args.output or Path(f"{known}-{name}".replace(" ", "-").replace("/", "-")),
             env=args.env, name=name, authors=args.author, license=args.license, algo=args.algo,

@@ -87,7 +87,8 @@ class Task:
     reference : str
         A quick controller among them, used as a control variate where episodes differ much.
     hyperparameters : mapping
-        For a learner ("ppo", "sac", "td3", "tqc", "dqn"): what differs from `lag_envs.hyperparams.DEFAULTS`.
+        For a learner ("fast_ppo", "ppo", "sac", "td3", "tqc", "dqn"): what differs from
+        `lag_envs.hyperparams.DEFAULTS`.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional

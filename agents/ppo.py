@@ -1,0 +1,519 @@
+"""Proximal policy optimisation in one file of plain PyTorch: read it from top to bottom.
+
+``python -m agents.ppo --help`` tells more. An iteration lets the policy act in all environments
+(`Learner.collect`), estimates by how much each action was better than expected (`Learner.advantages`), and
+makes better actions more likely, within limits (`Learner.update`). The algorithm is that of [1]_, with the
+estimator of [2]_ and the exploration of [3]_.
+
+References
+----------
+.. [1] J. Schulman et al., "Proximal policy optimization algorithms", arXiv:1707.06347, 2017.
+.. [2] J. Schulman et al., "High-dimensional continuous control using generalized advantage estimation",
+   ICLR 2016.
+.. [3] A. Raffin, J. Kober, F. Stulp, "Smooth exploration for robotic reinforcement learning", CoRL 2021.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import io
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+import agents
+from agents import learners
+from agents.run import CHECKPOINT, FIRST_FRESH_SEED, MODEL, Run, UserError, reports_errors, terminable
+from agents.train import command, plan, summarise
+from lag_envs.envs.stagger import stagger
+from lag_envs.errors import hint
+from lag_envs.evaluation.rollout import play
+from lag_envs.scores import score
+from lag_envs.store import write
+from lag_envs.tasks.registration import make_task
+
+NAME = "fast_ppo"  #: see `agents.learners.OWN`
+Array = NDArray[np.float32]
+
+
+# --- settings -----------------------------------------------------------------------------------------------
+
+
+def setting(text: str, least: float = -math.inf, most: float = math.inf) -> Any:
+    """Declare a setting: what it is, and between which values it lies."""
+    return dataclasses.field(metadata={"help": text, "range": (least, most)})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What a training is made with; `lag_envs.hyperparams` has the values.
+
+    Raises
+    ------
+    UserError
+        For a value that is out of its range, or of another kind.
+    """
+
+    n_timesteps: float = setting("steps of all environments together", 1)
+    n_envs: int = setting("environments stepped together", 1)
+    n_steps: int = setting("steps of each environment between updates", 1)
+    n_epochs: int = setting("passes over these steps in an update", 1)
+    batch_size: int = setting("steps of a minibatch", 2)
+    learning_rate: float = setting("of Adam at the start; it falls linearly to 0", 0.0)
+    gamma: float = setting("discount of a step", 0.0, 1.0)
+    gae_lambda: float = setting("decay of the advantage's weights", 0.0, 1.0)
+    clip_range: float = setting("how far an action's probability moves in an update, relatively", 0.0)
+    ent_coef: float = setting("weight of the entropy in the loss", 0.0)
+    vf_coef: float = setting("weight of the critic's squared error in the loss", 0.0)
+    max_grad_norm: float = setting("largest norm of a gradient", 0.0)
+    reward_scale: float = setting("what rewards are multiplied by", 0.0)
+    episode_share: float = setting("part of its length after which an episode is truncated", 0.0, 1.0)
+    state_noise: bool = setting("whether the noise of continuous actions depends on the state (gSDE)")
+    noise_steps: int = setting("steps for which that noise is held", 1)
+    log_std_init: float = setting("its log standard deviation at the start")
+    actor: Sequence[int] = setting("widths of the policy's hidden layers", 1)
+    critic: Sequence[int] = setting("widths of the value function's hidden layers", 1)
+    first_layer_scale: float = setting("what the first layers' weights are multiplied by at the start", 0.0)
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value, (least, most) = getattr(self, field.name), field.metadata["range"]
+            kind = {"float": (int, float), "int": int, "bool": bool}.get(str(field.type), (list, tuple))
+            if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
+                raise UserError(f"{field.name} must be {field.type}, got {value!r}")
+            for number in value if isinstance(value, list | tuple) else [value]:
+                if not isinstance(number, int | float) or not least <= number <= most:
+                    raise UserError(f"{field.name} must lie between {least:g} and {most:g}, got {value!r}")
+        if self.n_envs * self.n_steps % self.batch_size:
+            size = self.n_envs * self.n_steps
+            raise UserError(f"batch_size must divide n_envs * n_steps = {size}, got {self.batch_size}")
+
+    @classmethod
+    def of(cls, hyperparameters: Mapping[str, Any]) -> Settings:
+        """Return settings by name, or raise a UserError that knows which name was meant."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        for name in hyperparameters:
+            if name not in names:
+                raise UserError(f"{NAME} has no setting {name!r}; {hint(name, names)}")
+        if missing := [name for name in names if name not in hyperparameters]:
+            raise UserError(f"{NAME} needs a value of {', '.join(missing)}")
+        return cls(**hyperparameters)
+
+
+# --- the policy ---------------------------------------------------------------------------------------------
+
+
+def network(widths: Sequence[int], scale: float) -> nn.Sequential:
+    """Return linear layers with tanh between them, the first one's weights multiplied by `scale`."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), nn.Tanh()]
+    with torch.no_grad():
+        layers[0].weight.mul_(scale)  # type: ignore[operator]
+    return nn.Sequential(*layers[:-1])
+
+
+class Policy:
+    """What acts: a network's weights as NumPy sees them. For small batches that is faster than PyTorch.
+
+    Parameters
+    ----------
+    layers : sequence of (weight, bias)
+        Arrays (out, in) and (out,) of each layer.
+    choices : tuple of int
+        How many values each action is chosen from; empty where actions are numbers in [-1, 1].
+    """
+
+    def __init__(self, layers: Sequence[tuple[Array, Array]], choices: tuple[int, ...]) -> None:
+        self.layers, self.choices = layers, choices
+
+    def outputs(self, observation: NDArray) -> tuple[Array, Array]:
+        """Return the last hidden layer (n, width) and the last layer (n, outputs)."""
+        hidden = observation
+        for weight, bias in self.layers[:-1]:
+            hidden = np.tanh(hidden @ weight.T + bias)
+        weight, bias = self.layers[-1]
+        return hidden, hidden @ weight.T + bias
+
+    def chosen(self, preferences: Array) -> NDArray[np.int64]:
+        """Return which value of each action is preferred, (n, actions), or (n,) for a single one."""
+        parts = np.split(preferences, np.cumsum(self.choices)[:-1], axis=-1)
+        values = [part.argmax(axis=-1) for part in parts]
+        return values[0] if len(values) == 1 else np.stack(values, axis=-1)
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray, Any]:
+        """Return the best action for each observation."""
+        last = self.outputs(np.asarray(observation, np.float32))[1]
+        return self.chosen(last) if self.choices else np.clip(last, -1.0, 1.0), state
+
+    def save(self, path: Path) -> None:
+        """Write the weights as the leaderboard has them, in a zip that `numpy.load` reads."""
+        file = io.BytesIO()
+        layers = [{f"weight_{k}": w, f"bias_{k}": b} for k, (w, b) in enumerate(self.layers)]
+        arrays = {name: array for layer in layers for name, array in layer.items()}
+        np.savez(file, choices=np.array(self.choices, np.int64), **arrays)  # type: ignore[arg-type]
+        write(path, file.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> Policy:
+        """Return what `save` wrote."""
+        with np.load(path, allow_pickle=False) as found:
+            count = sum(name.startswith("weight_") for name in found)
+            layers = [(found[f"weight_{k}"], found[f"bias_{k}"]) for k in range(count)]
+            return cls(layers, tuple(found["choices"].tolist()))
+
+
+class Continuous:
+    """Actions that are numbers: Gaussian around the actor's outputs, with noise held for some steps.
+
+    The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
+    entry. Features are the actor's last hidden layer (gSDE), or 1, so that the noise does not depend on the
+    state. Beyond [-1, 1] the environment clips.
+    """
+
+    def __init__(self, settings: Settings, actions: int) -> None:
+        self.by_state, self.steps = settings.state_noise, settings.noise_steps
+        shape = settings.actor[-1] if self.by_state else 1, actions
+        self.log_std = nn.Parameter(torch.full(shape, float(settings.log_std_init)))
+        self.parameters = [self.log_std]
+        self.exploration = np.zeros((0, *shape), np.float32)
+
+    def sample(self, rng: np.random.Generator, t: int, features: Array, means: Array) -> Array:
+        """Return actions for step t of a roll-out, (n, actions)."""
+        if t % self.steps == 0:
+            draws = rng.standard_normal((len(means), *self.log_std.shape), np.float32)
+            self.exploration = draws * np.exp(self.log_std.detach().numpy())
+        features = features if self.by_state else np.ones_like(features[:, :1])
+        return means + np.einsum("nf,nfa->na", features, self.exploration)
+
+    def log_prob(self, features: Tensor, means: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the actions' log probability density and the entropy, but for constants, (n,) each."""
+        features = features.detach() if self.by_state else torch.ones_like(features[:, :1])
+        variance = features.square() @ (2.0 * self.log_std).exp() + 1e-6
+        log = variance.log()
+        return -0.5 * ((actions - means).square() / variance + log).sum(1), 0.5 * log.sum(1)
+
+
+class Choices:
+    """Actions that are chosen from lists: the actor puts out a logit for each value of each list."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.parameters: list[nn.Parameter] = []
+
+    def sample(self, rng: np.random.Generator, t: int, features: Array, logits: Array) -> NDArray[np.int64]:
+        """Return values, (n, actions)."""
+        gumbel = rng.gumbel(size=logits.shape)  # the largest sum is distributed as softmax(logits)
+        return self.policy.chosen(logits + gumbel).reshape(len(logits), -1)
+
+    def log_prob(self, features: Tensor, logits: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the values' log probability and the entropy, (n,) each."""
+        parts = [part.log_softmax(1) for part in logits.split(self.policy.choices, dim=1)]
+        taken = [part.gather(1, a[:, None])[:, 0] for part, a in zip(parts, actions.unbind(1), strict=True)]
+        return sum(taken), sum(-(part.exp() * part).sum(1) for part in parts)  # type: ignore[return-value]
+
+
+# --- learning -----------------------------------------------------------------------------------------------
+
+
+class Rollout(NamedTuple):
+    """What n environments did in T steps; `next_values` is filled in where an episode was truncated."""
+
+    observations: Array  #: (T + 1, n, n_observation)
+    actions: NDArray  #: (T, n, n_actions)
+    rewards: Array  #: (T, n)
+    terminated: NDArray[np.bool_]  #: (T, n)
+    over: NDArray[np.bool_]  #: (T, n)
+    final: Array  #: (T, n, n_observation); last observations of episodes, where they are over
+
+
+class Learner:
+    """Environments, networks and optimiser.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of the environment.
+    settings : Settings
+        The settings.
+    seed : int
+        Decides everything that is random.
+    steps : int
+        Steps to train for; with them the learning rate is 0.
+    """
+
+    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
+        torch.set_num_threads(1)  # the networks are too small to share out
+        torch.manual_seed(seed)
+        self.settings, self.steps, self.trained = settings, steps, 0
+        self.rng = np.random.default_rng(seed)
+        limit = make_task(env_id).limit
+        if limit == math.inf:
+            raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
+        limit = max(1, round(settings.episode_share * limit))
+        self.envs: Any = gym.make_vec(
+            env_id, settings.n_envs, autoreset_mode="SameStep", max_episode_steps=limit
+        )
+        first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
+        self.envs.reset(seed=first)
+        self.observation, _ = stagger(self.envs, limit, first)
+
+        formulas = make_task(env_id).formulas
+        if not formulas.actions:
+            raise UserError(f"{env_id} has no control: there is nothing to learn")
+        (inputs,), outputs = (
+            self.envs.single_observation_space.shape,
+            sum(formulas.choices) or formulas.actions,
+        )
+        self.actions, self.shape = formulas.actions, self.envs.action_space.shape
+        self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
+        self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
+        self.policy = Policy([], formulas.choices)
+        self.head = Choices(self.policy) if formulas.choices else Continuous(settings, formulas.actions)
+        # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
+        parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
+        self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
+        self.parameters.grad = torch.zeros_like(self.parameters)
+        sizes = [p.numel() for p in parts]
+        for p, values, gradients in zip(
+            parts, self.parameters.data.split(sizes), self.parameters.grad.split(sizes), strict=True
+        ):
+            p.data, p.grad = values.view_as(p), gradients.view_as(p)
+        self.adam = torch.optim.Adam([self.parameters], eps=1e-5, fused=True)
+        linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
+        self.policy.layers = [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
+
+    def iterate(self) -> None:
+        """Collect experience and learn from it."""
+        rollout = self.collect()
+        self.update(rollout, *self.advantages(rollout))
+        self.trained += rollout.rewards.size
+
+    def collect(self) -> Rollout:
+        """Let the policy act."""
+        steps, n = self.settings.n_steps, self.settings.n_envs
+        wide = self.observation.shape[1]
+        kind = np.int64 if self.policy.choices else np.float32
+        found = Rollout(
+            np.empty((steps + 1, n, wide), np.float32), np.empty((steps, n, self.actions), kind),
+            np.empty((steps, n), np.float32), np.empty((steps, n), np.bool_), np.empty((steps, n), np.bool_),
+            np.zeros((steps, n, wide), np.float32),
+        )  # fmt: skip
+        for t in range(steps):
+            found.observations[t] = self.observation
+            found.actions[t] = self.head.sample(self.rng, t, *self.policy.outputs(self.observation))
+            self.observation, reward, found.terminated[t], truncated, infos = self.envs.step(
+                found.actions[t].reshape(self.shape)
+            )
+            found.rewards[t] = self.settings.reward_scale * reward
+            over = found.over[t] = found.terminated[t] | truncated
+            if over.any():
+                found.final[t, over] = np.stack(infos["final_obs"][over])
+        found.observations[steps] = self.observation
+        return found
+
+    @torch.no_grad()
+    def advantages(self, found: Rollout) -> tuple[Array, Array]:
+        """Return the advantages of the actions and what the critic should have said, (T, n) each.
+
+        An episode that is truncated would have gone on: its last observation's value stands for the rest.
+        """
+        values = self.critic(torch.from_numpy(found.observations)).numpy()[..., 0]
+        following = values[1:].copy()
+        if found.over.any():
+            following[found.over] = self.critic(torch.from_numpy(found.final[found.over])).numpy()[:, 0]
+        following[found.terminated] = 0.0
+        gamma, decay = self.settings.gamma, self.settings.gamma * self.settings.gae_lambda
+        surprise = found.rewards + gamma * following - values[:-1]
+        advantages, later = np.empty_like(surprise), np.zeros_like(surprise[0])
+        for t in reversed(range(len(surprise))):
+            later = advantages[t] = surprise[t] + decay * ~found.over[t] * later
+        return advantages, advantages + values[:-1]
+
+    def update(self, found: Rollout, advantages: Array, targets: Array) -> None:
+        """Improve actor and critic by some epochs of Adam on what was collected."""
+        s, body, last = self.settings, self.actor[:-1], self.actor[-1]
+        self.adam.param_groups[0]["lr"] = s.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
+        observations = torch.from_numpy(found.observations[:-1].reshape(advantages.size, -1))
+        actions = torch.from_numpy(found.actions.reshape(advantages.size, -1))
+        advantage, target = (torch.from_numpy(x.reshape(-1)) for x in (advantages, targets))
+        with torch.no_grad():
+            features = body(observations)
+            before, _ = self.head.log_prob(features, last(features), actions)
+        gradient = self.parameters.grad
+        assert gradient is not None
+        for _ in range(s.n_epochs):
+            for batch in torch.from_numpy(self.rng.permutation(advantages.size)).split(s.batch_size):
+                seen, gain = observations[batch], advantage[batch]
+                gain = (gain - gain.mean()) / (gain.std() + 1e-8)
+                features = body(seen)
+                log_prob, entropy = self.head.log_prob(features, last(features), actions[batch])
+                ratio = (log_prob - before[batch]).exp()
+                limited = ratio.clamp(1.0 - s.clip_range, 1.0 + s.clip_range)
+                better = torch.min(ratio * gain, limited * gain).mean()
+                off = (self.critic(seen)[:, 0] - target[batch]).square().mean()
+                gradient.zero_()
+                (s.vf_coef * off - better - s.ent_coef * entropy.mean()).backward()
+                gradient.mul_((s.max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0))
+                self.adam.step()
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that changes, for a checkpoint."""
+        return {
+            "trained": self.trained, "parameters": self.parameters.detach().numpy(),
+            "adam": self.adam.state_dict(), "rng": self.rng, "envs": self.envs,
+            "observation": self.observation,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` returned; the same will follow, bit for bit."""
+        with torch.no_grad():
+            self.parameters.copy_(torch.from_numpy(state["parameters"]))
+        self.adam.load_state_dict(state["adam"])
+        for name in ("trained", "rng", "envs", "observation"):
+            setattr(self, name, state[name])
+
+
+# --- a training run -----------------------------------------------------------------------------------------
+
+
+def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
+    """Train a run as far as it has not been trained, and write its result; see `agents.learners.train`.
+
+    Tests on the way show how it goes. They neither stop the training nor choose what is kept of it.
+    """
+    content = run.load_checkpoint()
+    learner = Learner(run.env, Settings.of(run.hyperparameters), run.seed, run.steps)
+    if content is not None:
+        learner.restore(content["learner"])
+    every = run.steps / learners.TESTS
+
+    def test() -> None:
+        seeds = range(learners.FIRST_TEST_SEED, learners.FIRST_TEST_SEED + learners.TEST_EPISODES)
+        mean = float(play(run.env, learner.policy, seeds).mean())
+        run.curve.append((run.trained, round(run.seconds, 3), mean))
+        run.save_checkpoint({"learner": learner.state()})
+        tested(run)
+
+    if not run.curve:
+        test()
+    while learner.trained < run.steps:
+        run.start_clock()
+        learner.iterate()
+        run.stop_clock()
+        run.trained = learner.trained
+        show(run)
+        if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
+            test()
+    learner.policy.save(run.path(MODEL))
+    learners.evaluate(run, learner.policy)
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+EPILOG = f"""what is left in FOLDER/ENV/{NAME}/seed<K>:
+  result.json          returns on 100 fresh episodes, score, learning curve, settings, versions, times
+  model.zip            the network's weights: numpy.load reads it, agents.learners.load_policy plays it
+  {CHECKPOINT}       while the run is not finished: all that is needed to go on
+
+The same seed gives the same policy, bit for bit, also where the training was interrupted (by Ctrl-C or by a
+kill) and the command run again. Settings are those of `lag-envs hyperparams {NAME}`, where no option changes
+them. `python -m agents.train ENV --algo {NAME}` trains several seeds side by side, or on a Ray cluster.
+
+examples:
+  python -m agents.ppo PivotedBar-v0                       one seed, in some seconds
+  python -m agents.ppo PivotedBar-v0 --seeds 5 --first-seed 10
+  python -m agents.ppo PivotedBar-v0 --gamma 0.98 --actor 64 64 --output runs/wide
+  python -m agents.ppo examples/ball_on_beam.py            a task of your own; this runs the file
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    p = argparse.ArgumentParser(
+        prog="python -m agents.ppo",
+        description="Train PPO, in one file of plain PyTorch, and evaluate it over fresh episodes.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("env", nargs="+", metavar="ENV", help="ids, module:ID, or FILE or FILE:Class of your own")
+    p.add_argument("--seeds", type=int, default=1, metavar="N", help="how many, in turn (default 1)")
+    p.add_argument("--first-seed", type=int, default=0, metavar="K", help="the first one (default 0)")
+    p.add_argument("--steps", type=int, metavar="N", help="environment steps per seed (default n_timesteps)")
+    p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
+    p.add_argument("--new", action="store_true", help="start anew, overwriting what these seeds have left")
+    group = p.add_argument_group("settings, of which each task has its own")
+    for field in dataclasses.fields(Settings)[1:]:
+        kind = {"int": int, "float": float, "bool": truth}.get(str(field.type), int)
+        many = {"nargs": "+"} if "Sequence" in str(field.type) else {}
+        option = "--" + field.name.replace("_", "-")
+        group.add_argument(option, type=kind, metavar="X", help=field.metadata["help"], **many)  # type: ignore[arg-type]
+    return p
+
+
+def truth(text: str) -> bool:
+    """Return what yes or no means."""
+    if text not in ("yes", "no"):
+        raise argparse.ArgumentTypeError(f"must be yes or no, got {text!r}")
+    return text == "yes"
+
+
+@reports_errors("agents.ppo")
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return 0, 2 for a user's mistake, 130 when interrupted."""
+    from tqdm import tqdm
+
+    args = parser().parse_args(arguments)
+    names = [field.name for field in dataclasses.fields(Settings)[1:]]
+    changed = {name: value for name in names if (value := getattr(args, name)) is not None}
+    args.algo, args.config, args.ray, args.jobs = [NAME], None, None, None
+    runs = plan(args, changed)
+    for run in runs:
+        Settings.of(run.hyperparameters)  # better now than when another seed is trained
+    try:
+        with terminable():
+            for run in runs:
+                if run.load_result() is not None:
+                    print(f"{run.name}: finished before")
+                    continue
+                with tqdm(total=run.steps, unit=" steps", unit_scale=True, disable=None) as bar:
+
+                    def show(run: Run, bar: Any = bar) -> None:
+                        bar.update(min(run.trained, run.steps) - bar.n)
+
+                    def tested(run: Run, bar: Any = bar) -> None:
+                        trained, seconds, mean = run.curve[-1]
+                        value = score(run.env, mean)
+                        tail = "" if value is None else f", score {value:.3f}"
+                        bar.write(
+                            f"{run.name}: {trained:>9,} steps, {seconds:5.1f} s, return {mean:.2f}{tail}"
+                        )
+                        sys.stdout.flush()
+
+                    train(run, show=show, tested=tested)
+    except KeyboardInterrupt:
+        print(f"\nTo go on:  {command('agents.ppo', arguments)}")
+        return 130
+    summarise(runs)
+    print(
+        f"Since the command began, with imports, compiling, tests and evaluation: "
+        f"{time.perf_counter() - agents.STARTED:.1f} s, {time.process_time():.1f} s of them on the processor"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,366 @@
+"""PPO in one file: it learns, repeats and resumes bit for bit, and takes every kind of action."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import lag_envs
+from agents import learners, ppo, submit, train
+from agents.learners import hyperparameters, load_policy
+from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
+from lag_envs.evaluation.rollout import play
+from lag_envs.leaderboard.submission import load
+from lag_envs.scenes import Scene
+from lag_envs.scores import score
+from lag_envs.tasks import Task, pivoted_bar
+
+ROOT = Path(__file__).parents[1]
+ENV = pivoted_bar.SwingUpFree.id
+#: For a training that takes a fraction of a second.
+SHORT = {"n_envs": 8, "n_steps": 16, "n_epochs": 2, "batch_size": 64}
+
+
+class Puck(Scene):
+    """A point mass on a table, pushed along both of its sides."""
+
+    coordinates = {"x": "m", "y": "m"}
+    controls = {"along": "N", "across": "N"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * (v.x**2 + v.y**2)
+
+    def potential(self, q, xp):
+        return 0.0
+
+    def applied(self, q, v, u, xp):
+        return {"x": u.along, "y": u.across}
+
+
+class Centre(Task):
+    """Bring the puck to the middle."""
+
+    id = "OwnCentre-v0"
+    scene = Puck
+    interval, steps = 0.1, 30
+    action = {"along": 2.0, "across": 2.0}
+    start = {"x": 1.0, "y": 1.0}
+
+    def observe(self, after, target, xp):
+        return {name: after[name] for name in self.scene.state_names}
+
+    def reward(self, before, after, control, target, dt, xp):
+        return xp.exp(-(after.x**2) - after.y**2)
+
+
+class Jerky(Centre):
+    """The same by a few pushes to choose from, not equally many to both sides."""
+
+    id = "OwnJerky-v0"
+    action = {"along": [-1.0, 0.0, 1.0], "across": [-1.0, 1.0]}
+
+
+class Row(Centre):
+    """The same on a line."""
+
+    id = "OwnRow-v0"
+    action = {"along": [-1.0, 0.0, 1.0]}
+    start = {"x": 1.0}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(learners, "EPISODES", 20)
+    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
+    monkeypatch.setattr(learners, "TESTS", 3)
+
+
+@pytest.fixture
+def own():
+    """Register the tasks of this file."""
+    for task in (Centre, Jerky, Row):
+        lag_envs.register(task)
+    yield
+    for task in (Centre, Jerky, Row):
+        gym.registry.pop(task.id)
+
+
+def make_run(folder, env_id=ENV, seed=3, steps=768, **more):
+    return Run(Path(folder), env_id, ppo.NAME, seed, steps, hyperparameters(ppo.NAME, env_id) | SHORT | more)
+
+
+def go(run, until=10**9):
+    """Train until so many steps are done; return whether the run is finished."""
+
+    def show(run):
+        if until <= run.trained < run.steps:
+            raise KeyboardInterrupt
+
+    try:
+        learners.train(run, show=show, tested=lambda run: None)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def learnt(run):
+    """Return all that a finished run has decided, without times."""
+    result = json.loads(run.path(RESULT).read_text())
+    with np.load(run.path(MODEL)) as found:
+        weights = {name: found[name].tobytes() for name in found}
+    return (
+        weights,
+        result["evaluation"]["returns"],
+        [(s, r) for s, _, r in result["curve"]],
+        result["trained"],
+    )
+
+
+# --- runs ---
+
+
+def test_a_seed_decides_everything_with_interruptions_or_without(tmp_path):
+    whole, again, other = make_run(tmp_path / "a"), make_run(tmp_path / "b"), make_run(tmp_path / "c", seed=4)
+    assert go(whole) and go(again) and go(other)
+    assert learnt(whole) == learnt(again) != learnt(other)
+    cut, before = make_run(tmp_path / "d"), 0
+    for until in (384, 640):  # in the middle of episodes, each time a step behind the last checkpoint
+        assert not go(cut, until)
+        cut = make_run(tmp_path / "d")
+        assert cut.load_checkpoint() is not None and before < cut.trained <= until
+        before = cut.trained
+    torch.manual_seed(0)
+    assert go(cut) and not cut.path(CHECKPOINT).exists()
+    assert learnt(cut) == learnt(whole)
+    assert cut.seconds > 0.0
+
+
+def test_the_policy_that_was_written_is_the_one_that_was_evaluated(tmp_path):
+    run = make_run(tmp_path)
+    go(run)
+    policy = load_policy(tmp_path)
+    result = json.loads(run.path(RESULT).read_text())
+    assert play(ENV, policy, fresh_seeds(20)).tolist() == result["evaluation"]["returns"]
+    assert result["versions"]["torch"] and result["hyperparameters"] == run.hyperparameters
+    run.path(MODEL).write_bytes(b"nonsense")
+    with pytest.raises(UserError, match=r"the policy in .* cannot be read"):
+        load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "space"),
+    [
+        (Centre.id, gym.spaces.Box(-1.0, 1.0, (2,), np.float32)),
+        (Jerky.id, gym.spaces.MultiDiscrete([3, 2])),
+        (Row.id, gym.spaces.Discrete(3)),
+    ],
+)
+def test_it_learns_with_any_actions(env_id, space, own, tmp_path):
+    """A second of training does more than half of what there is between idling and the best."""
+    assert gym.make_vec(env_id, 2).single_action_space == space
+    settings = {"n_envs": 16, "n_steps": 32, "batch_size": 128, "n_epochs": 5, "episode_share": 1.0}
+    run = make_run(tmp_path, env_id, steps=10_000, **settings)
+    learner = ppo.Learner(env_id, ppo.Settings.of(run.hyperparameters), 0, run.steps)
+    before = play(env_id, learner.policy, fresh_seeds(100)).mean()
+    while learner.trained < run.steps:
+        learner.iterate()
+    after = play(env_id, learner.policy, fresh_seeds(100)).mean()
+    assert after > before + 0.5 * (Centre.steps - before), (before, after)
+
+
+@pytest.mark.slow
+def test_it_swings_the_bar_up(tmp_path, monkeypatch):
+    """Seeds that nothing was tuned on; one of the five may fail."""
+    monkeypatch.setattr(learners, "EPISODES", 100)
+    env_id = pivoted_bar.SwingUp.id
+    scores = []
+    for seed in range(300, 305):
+        hyper = hyperparameters(ppo.NAME, env_id)
+        run = Run(tmp_path / str(seed), env_id, ppo.NAME, seed, int(hyper["n_timesteps"]), hyper)
+        go(run)
+        scores.append(score(env_id, json.loads(run.path(RESULT).read_text())["mean_return"]))
+    assert sorted(scores)[1] > 0.97, scores
+
+
+# --- parts ---
+
+
+def make_learner(env_id=ENV, **more):
+    settings = ppo.Settings.of(hyperparameters(ppo.NAME, env_id) | SHORT | more)
+    return ppo.Learner(env_id, settings, 0, 10_000)
+
+
+def test_advantages_are_sums_of_later_surprises():
+    """Against the definition, with episodes that are terminated, truncated and cut by the roll-out."""
+    learner = make_learner(n_steps=6, n_envs=2, batch_size=4, gamma=0.9, gae_lambda=0.8)
+    rng = np.random.default_rng(0)
+    shape, wide = (6, 2), learner.observation.shape[1]
+    over, terminated = np.zeros(shape, bool), np.zeros(shape, bool)
+    over[2, 0] = over[3, 1] = terminated[3, 1] = True
+    draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
+    found = ppo.Rollout(draw(7, 2, wide), draw(*shape, 1), draw(*shape), terminated, over, draw(*shape, wide))
+    advantages, targets = learner.advantages(found)
+
+    def value(observation):
+        return learner.critic(torch.from_numpy(observation)).item()
+
+    for i in range(2):
+        for t in range(6):
+            total, weight = 0.0, 1.0
+            for k in range(t, 6):
+                after = found.final[k, i] if over[k, i] else found.observations[k + 1, i]
+                rest = 0.0 if terminated[k, i] else 0.9 * value(after)
+                total += weight * (found.rewards[k, i] + rest - value(found.observations[k, i]))
+                weight *= 0.9 * 0.8
+                if over[k, i]:
+                    break
+            assert advantages[t, i] == pytest.approx(total, abs=1e-5)
+            assert targets[t, i] == pytest.approx(total + value(found.observations[t, i]), abs=1e-5)
+
+
+def test_rollouts_are_what_happened():
+    learner = make_learner(episode_share=0.02)  # episodes of ten steps
+    first = learner.observation.copy()
+    found = learner.collect()
+    assert np.array_equal(found.observations[0], first)
+    assert np.array_equal(found.observations[-1], learner.observation)
+    assert found.over.sum() in range(8, 17) and not found.terminated.any()
+    assert (found.final[found.over] != 0.0).any(axis=1).all() and not found.final[~found.over].any()
+    # The final observation ends the old episode, the next one begins the new.
+    t, i = np.argwhere(found.over[:-1])[0]
+    assert not np.array_equal(found.final[t, i], found.observations[t + 1, i])
+    assert len({tuple(np.flatnonzero(row)) for row in found.over}) > 2  # staggered
+
+
+@pytest.mark.parametrize("by_state", [True, False])
+def test_noise_has_the_probability_that_is_told(by_state):
+    learner = make_learner(state_noise=by_state, noise_steps=3)
+    head, rng = learner.head, np.random.default_rng(0)
+    hidden, means = (x.repeat(50_000, axis=0) for x in learner.policy.outputs(learner.observation[:1]))
+    actions = head.sample(rng, 0, hidden, means)
+    log_prob, entropy = (
+        x.detach().double() for x in head.log_prob(*map(torch.from_numpy, (hidden, means, actions)))
+    )
+    # But for a constant the entropy is the mean of -log p, and both are those of a normal distribution.
+    spread, mean = float(actions.std()), float(means[0, 0])
+    normal = torch.distributions.Normal(mean, spread).log_prob(torch.from_numpy(actions[:, 0]))
+    constant = 0.5 * np.log(2.0 * np.pi)
+    assert abs(entropy[0].item() - np.log(spread)) < 0.02
+    np.testing.assert_allclose(log_prob - constant, normal, atol=0.1)
+    # Held for three steps, then drawn anew.
+    held = [head.sample(rng, t, hidden[:5], means[:5]) for t in range(6)]
+    assert all(np.array_equal(held[t], held[0]) for t in (1, 2)) and not np.array_equal(held[3], held[2])
+
+
+def test_choices_have_the_probability_that_is_told(own):
+    learner = make_learner(Jerky.id)
+    logits = np.array([[0.5, -1.0, 0.2, 1.5, 0.3]], np.float32)
+    actions = learner.head.sample(np.random.default_rng(0), 0, logits, logits.repeat(100_000, axis=0))
+    both, counts = np.unique(actions, axis=0, return_counts=True)
+    assert len(both) == 6
+    given = torch.from_numpy(logits.repeat(6, axis=0))
+    log_prob, entropy = learner.head.log_prob(given, given, torch.from_numpy(both))
+    np.testing.assert_allclose(log_prob.exp(), counts / 100_000, atol=0.006)
+    np.testing.assert_allclose(entropy[0], -(log_prob.exp() * log_prob).sum(), rtol=1e-5)
+
+
+def test_the_network_that_acts_is_the_one_that_learns():
+    learner = make_learner()
+    learner.iterate()
+    seen = learner.observation
+    by_torch = learner.actor(torch.from_numpy(seen)).detach().numpy()
+    np.testing.assert_allclose(learner.policy.outputs(seen)[1], by_torch, atol=1e-5)
+
+
+# --- the command, and what comes after it ---
+
+
+def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, capsys):
+    given = [ENV, "--output", str(tmp_path), "--steps", "256", "--seeds", "2", "--gamma", "0.9"]
+    for name, value in SHORT.items():
+        given += ["--" + name.replace("_", "-"), str(value)]
+    assert ppo.main(given) == 0
+    output = capsys.readouterr().out
+    assert "256 steps" in output and ", score " in output and "with imports, compiling" in output
+    result = json.loads((tmp_path / ENV / ppo.NAME / "seed1" / RESULT).read_text())
+    assert result["hyperparameters"]["gamma"] == 0.9 and result["trained"] == 256
+    assert ppo.main(given) == 0 and capsys.readouterr().out.count("finished before") == 2
+    # The command for all learners takes it too.
+    assert ppo.main([ENV, "--output", str(tmp_path), "--steps", "256"]) == 2
+    assert "other hyperparameters (" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["PivotedBra-v0"], "did you mean PivotedBar-v0"),
+        ([ENV, "--gamma", "1.5"], "gamma must lie between 0 and 1, got 1.5"),
+        ([ENV, "--actor", "0"], r"actor must lie between 1 and inf, got [0]"),
+        ([ENV, "--batch-size", "1000"], "batch_size must divide n_envs * n_steps = "),
+    ],
+)
+def test_mistakes_are_named(given, message, tmp_path, capsys):
+    assert ppo.main([*given, "--output", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_settings_of_another_kind_are_refused():
+    good = hyperparameters(ppo.NAME, ENV)
+    for changes, message in (
+        ({"gama": 0.9}, "did you mean gamma"),
+        ({"state_noise": 1}, "state_noise must be bool, got 1"),
+        ({"n_steps": 2.5}, "n_steps must be int, got 2.5"),
+        ({"actor": 32}, "actor must be .*, got 32"),
+        ({"gamma": "x"}, "gamma must be float, got 'x'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            ppo.Settings.of(good | changes)
+    del good["gamma"]
+    with pytest.raises(UserError, match="fast_ppo needs a value of gamma"):
+        ppo.Settings.of(good)
+
+
+def test_without_an_end_or_a_control_there_is_nothing_to_learn(monkeypatch):
+    settings = ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | SHORT)
+    lag_envs.register(pivoted_bar.SwingUpFree, id="OwnEndless-v0", duration=float("inf"))
+    try:
+        with pytest.raises(UserError, match="have no end; give it a duration"):
+            ppo.Learner("OwnEndless-v0", settings, 0, 100)
+    finally:
+        gym.registry.pop("OwnEndless-v0")
+
+
+def test_five_seeds_are_a_submission(tmp_path):
+    for seed in range(5):
+        go(make_run(tmp_path / "runs" / ENV / ppo.NAME / f"seed{seed}", seed=seed))
+    made = submit.learned(ENV, tmp_path / "runs" / ENV / ppo.NAME, tmp_path / "out")
+    assert made.name == "fast PPO" and len(load(tmp_path / "out").policies) == 5
+    seen = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
+    ours = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
+    theirs = dict(load(tmp_path / "out").policies)[2].agent()
+    np.testing.assert_allclose(ours.predict(seen)[0], theirs.predict(seen)[0], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_killed_and_interrupted_runs_go_on(tmp_path):
+    arguments = [sys.executable, "-m", "agents.ppo", ENV, "--steps", "200000", "--output", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    for number in (signal.SIGKILL, signal.SIGINT):
+        process = subprocess.Popen(
+            arguments, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        for line in process.stdout:
+            if " steps, " in line and ":         0 steps" not in line:
+                break
+        process.send_signal(number)
+        output = process.communicate(timeout=60)[0]
+    assert process.returncode == 130, output
+    assert "To go on:" in output and f"agents.ppo {ENV}" in output
+    assert train.main([ENV, "--algo", ppo.NAME, "--steps", "200000", "--output", str(tmp_path)]) == 0
