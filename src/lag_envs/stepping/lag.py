@@ -12,6 +12,7 @@ from typing import Any
 
 from lag_envs.mechanics.algebra import Atom, Expr
 from lag_envs.mechanics.equations import velocity
+from lag_envs.mechanics.motion import Mechanics
 from lag_envs.stepping.elementary import fading
 from lag_envs.stepping.general import SeriesStepper
 from lag_envs.stepping.lowering import CLOCK, FADING, Lowering
@@ -87,7 +88,7 @@ class LaggedStepper(SeriesStepper):
         return [start for start, *_ in self._split(xp, u)]
 
     def _inputs(self, xp: Any, u: Sequence) -> dict[str, Any]:
-        found = {}
+        found: dict[str, Any] = {}
         for name, (_, command, gap, decay) in zip(self._layout.controls, self._split(xp, u), strict=True):
             found |= {f"command_{name}": command, f"gap_{name}": gap, f"decay_{name}": decay}
         return found
@@ -121,3 +122,13 @@ class LaggedStepper(SeriesStepper):
             elif p.level == "rate" and p.name in given:
                 after[p.name] = given[p.name] + dt * self._by(p, once)
         return after, ends
+
+
+_steppers: dict[str, LaggedStepper] = {}
+
+
+def lagged_stepper(mechanics: Mechanics) -> LaggedStepper:
+    """Return the stepper of these equations of motion with lagged controls; equal ones share it."""
+    if mechanics.key not in _steppers:
+        _steppers[mechanics.key] = LaggedStepper(mechanics)
+    return _steppers[mechanics.key]

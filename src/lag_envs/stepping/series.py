@@ -43,6 +43,8 @@ SMALLEST_ORDER, LARGEST_ORDER = 4, 24
 TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
+#: While a control that lags is still far from its command, a substep is at most so many time constants.
+REACH = 2.0
 #: How often a step is shortened before it counts as failed.
 TRIES = 4
 #: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
@@ -583,6 +585,21 @@ class Series:
             done = t.both(done, t.less(t.abs(x), t.number(math.inf)))
         return done, h, q, v, bounds
 
+    def _within_lags(self, t: Target, inputs: dict[str, Any], h: Any) -> Any:
+        """Return a step that lagged controls do not make hopeless, h at most.
+
+        With z = h/τ, an exponential's coefficients sum up to e^z times its size. It has died out as far as
+        e^(-z) after a time of z, so steps may double. Much longer ones would not be certified, and terms that
+        cancel would be taken for large velocities.
+        """
+        for name in self.record.inputs:
+            if name.startswith("decay_"):
+                gap = inputs[f"gap_{name.removeprefix('decay_')}"]
+                reach = t.add(inputs[ELAPSED], t.div(t.number(REACH), inputs[name]))
+                shorter = t.both(t.less(reach, h), t.less(t.number(0.0), t.abs(gap)))
+                h = t.select(shorter, reach, h)
+        return h
+
     def substep(
         self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any, order: Any, tolerance: Any
     ) -> tuple[Lane, list]:
@@ -599,9 +616,8 @@ class Series:
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
         wanted = t.less(zero, lane.left)
-        done, tried, q, v, bounds = self.attempt(
-            t, inputs, lane.q, lane.v, lane.wish, order, tolerance, wanted
-        )
+        wish = self._within_lags(t, inputs, lane.wish)
+        done, tried, q, v, bounds = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
