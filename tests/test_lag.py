@@ -6,6 +6,7 @@ import itertools
 import math
 import types
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import mpmath
@@ -17,14 +18,18 @@ from test_series import advance_in_python, in_python
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
+from lag_envs.scenes.checks import SMALLEST_LAG
 from lag_envs.stepping import driver, general
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.driver import compile_advance_block
 from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.lag import LaggedStepper
 from lag_envs.stepping.machine import Layout
-from lag_envs.stepping.series import Certificate, Plain, Series
+from lag_envs.stepping.series import REACH, Certificate, Plain, Series
 from lag_envs.stepping.tracing import evaluate
+
+#: Of a control step, relative to the entry or to 1.
+LARGEST_ERROR = 2e-13
 
 # --- systems whose actuators are coordinates ----------------------------------------------------------------
 #
@@ -202,7 +207,7 @@ def test_step_is_that_of_a_system_with_actuators(name):
 def test_step_at_any_lag(name, part, dt):
     case = CASES[name]
     lags = [part * dt, 3.0 * part * dt][: len(case.applied)]
-    assert worst(case, lags, dt) < 2e-13
+    assert worst(case, lags, dt) < LARGEST_ERROR
 
 
 # --- any scene, held against itself -------------------------------------------------------------------------
@@ -454,3 +459,23 @@ def test_refusal_brings_what_went_before():
     with pytest.raises(StepRefused, match=r"step 0 of 2 .* could not be certified") as refusal:
         bar.simulate([2.0, 0.0], [1.0, 2.0], 0.02, lag=0.1)
     np.testing.assert_array_equal(refusal.value.trajectory, [[2.0, 0.0]])
+
+
+@pytest.mark.slow
+def test_numbers_in_the_documentation():
+    path = Path(__file__).parents[1] / "docs" / "engine.md"
+    text = " ".join(path.read_text(encoding="utf-8").split())
+    counts = [
+        [case.step([part * 0.02] * len(case.applied), 0.02)[1] for case in CASES.values()]
+        for part in (1.0, 0.1, SMALLEST_LAG)
+    ]
+    spans = [f"{min(span)} to {max(span)}" for span in counts]
+    smallest = f"{SMALLEST_LAG:.0e}".replace("e-0", "e-")
+    said = [
+        f"a substep is at most {REACH:g} τ longer than the time that has passed",
+        f"six scenes take {spans[0]} attempts at τ = dt = 0.02 s, {spans[1]} at τ = dt/10, and",
+        f"and {spans[2]} at τ = {smallest} dt",
+        f"at least {smallest} of the control step",
+        f"below {LARGEST_ERROR:g} of the entry",
+    ]
+    assert [words for words in said if words not in text] == []
