@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import sympy
 
     from lag_envs.stepping.general import SeriesStepper, StepBound
+    from lag_envs.stepping.lag import LaggedStepper
     from lag_envs.stepping.normal_forms import NormalForm
 
 Array = NDArray[np.float64]
@@ -391,45 +392,65 @@ class Scene(metaclass=SceneType):
         return stepper_of(self.mechanics)
 
     @property
+    def _lagged(self) -> LaggedStepper:
+        """What steps the equations of motion, closed forms too, where controls are lagged."""
+        from lag_envs.stepping.lag import lagged_stepper
+
+        return lagged_stepper(self.mechanics)
+
+    @property
     def _form(self) -> NormalForm | None:
         """The equation of motion where it has an exact flow of its own, else None."""
         from lag_envs.stepping.normal_forms import normal_form
 
         return normal_form(self.mechanics)
 
-    def _constants(self) -> dict[str, float]:
+    def _constants(self, lagged: bool = False) -> dict[str, float]:
         """Return the numbers that a step needs, made from the parameters."""
-        found = vars(self).get("_cached_constants")
+        kept = "_cached_lagged_constants" if lagged else "_cached_constants"
+        found = vars(self).get(kept)
         if found is None:
-            source = self._form or self._stepper
+            source = self._lagged if lagged else self._form or self._stepper
             found = source.constants({name: getattr(self, name) for name in self._numbers()})
             for name, value in found.items():
                 if not math.isfinite(value):
                     raise ValueError(
                         f"these parameters make a coefficient of the motion, {name}, {value}: {self}"
                     )
-            vars(self)["_cached_constants"] = found
+            vars(self)[kept] = found
         return found
 
-    def _order(self, dt: float) -> int:
-        """Return the order of the series for a control step; 0 for a closed form."""
+    def _order(self, dt: float, lagged: bool = False) -> int:
+        """Return the order of the series for a control step; 0 for a closed form, which no lagged one is."""
         from lag_envs.stepping.general import usual_order
 
-        if self._form:
+        if self._form and not lagged:
             return self._form.order(dt)
         return vars(self).get(ORDER) or usual_order(dt)
 
-    def _limit(self, dt: float) -> float:
+    def _limit(self, dt: float, lagged: bool = False) -> float:
         """Return what a step takes besides dt: the largest x of one series, or the order of the series."""
-        return self._form.largest_majorant(dt) if self._form else float(self._order(dt))
+        if self._form and not lagged:
+            return self._form.largest_majorant(dt)
+        return float(self._order(dt, lagged))
 
-    def _code(self, dt: float) -> Any:
+    def _code(self, dt: float, lagged: bool = False) -> Any:
         """Return the code of a control step."""
-        absent = frozenset(name for name, value in self._constants().items() if value == 0.0)
+        absent = frozenset(name for name, value in self._constants(lagged).items() if value == 0.0)
+        if lagged:
+            return self._lagged.code(absent)
         return self._form.stepper(dt, absent) if self._form else self._stepper.code(absent)
 
-    def simulate(self, state: ArrayLike, controls: ArrayLike | int, dt: float) -> Array:
-        """Step the equations of motion with each control held for one step.
+    def simulate(
+        self,
+        state: ArrayLike,
+        controls: ArrayLike | int,
+        dt: float,
+        *,
+        lag: float | Mapping[str, float] | None = None,
+        applied: ArrayLike | None = None,
+    ) -> Array:
+        """Step the equations of motion with each control held for one step, or lagging behind.
 
         Parameters
         ----------
@@ -439,6 +460,12 @@ class Scene(metaclass=SceneType):
             One set of controls per step, neither clipped nor guarded; or the number of steps.
         dt : float
             Length of a step [s].
+        lag : float or mapping from str to float, optional
+            Time constant τ of the actuators [s], or of each by the control's name: the control u that is
+            applied follows the given one, w, by u' = (w - u)/τ. 0 is none, and other times are at least
+            1e-6 dt. Every scene, one with a closed form too, is then stepped by the general series.
+        applied : array_like, shape (n_controls,) or (), optional
+            Lagged controls at the start; by default they are 0.
 
         Returns
         -------
@@ -448,14 +475,23 @@ class Scene(metaclass=SceneType):
         Raises
         ------
         ValueError
-            For a state, control or step that is not finite or has the wrong shape, or a step not above 0.
+            For a state, control, step or lag that is not finite or has the wrong shape, a step not above 0,
+            or a lag that is too short or has an unknown name.
         StepRefused
             Where a step cannot be certified within the cap on substeps, or has no finite result. Its
             attribute `trajectory` holds the rows before that.
         """
-        return steps.simulate(self, state, controls, dt)
+        return steps.simulate(self, state, controls, dt, lag, applied)
 
-    def step_bound(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> StepBound:
+    def step_bound(
+        self,
+        state: ArrayLike,
+        control: ArrayLike = 0.0,
+        dt: float = 0.02,
+        *,
+        lag: float | Mapping[str, float] | None = None,
+        applied: ArrayLike | None = None,
+    ) -> StepBound:
         """Return how a control step is divided, and what its series leave out at most.
 
         Parameters
@@ -466,6 +502,8 @@ class Scene(metaclass=SceneType):
             The controls that are held.
         dt : float
             Length of the step [s].
+        lag, applied
+            As for `simulate`; a lagged step is one of the general series.
 
         Returns
         -------
@@ -481,7 +519,7 @@ class Scene(metaclass=SceneType):
         ValueError, StepRefused
             As `simulate` does.
         """
-        return steps.step_bound(self, state, control, dt)
+        return steps.step_bound(self, state, control, dt, lag, applied)
 
     truncation_bound = step_bound
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.scenes.checks import (
     StepRefused,
+    check_applied,
     check_both,
     check_controls,
+    check_lags,
     check_sequence,
     check_state,
     check_step,
@@ -25,17 +28,30 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def simulate(scene: Scene, state: ArrayLike, controls: ArrayLike | int, dt: float) -> Array:
+def simulate(
+    scene: Scene,
+    state: ArrayLike,
+    controls: ArrayLike | int,
+    dt: float,
+    lag: float | Mapping[str, float] | None = None,
+    applied: ArrayLike | None = None,
+) -> Array:
     """See `Scene.simulate`."""
     start, dt = check_state(scene, state), check_step(dt)
-    given = check_sequence(scene, controls)
+    given, n = check_sequence(scene, controls), len(start)
+    decays, reached = _lagging(scene, lag, applied, dt)
+    lagged, each = decays is not None, given
+    if decays is not None:
+        start = np.concatenate([start, reached])
+        each = np.concatenate([given, np.broadcast_to(decays, given.shape)], axis=1)
     trajectory = np.empty((len(given) + 1, len(start)))
     trajectory[0] = start
-    code, constants = scene._code(dt), scene._constants()
-    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-    row = code.simulation(trajectory, given, dt, scene._limit(dt), *numbers)
+    code = scene._code(dt, lagged)
+    row = code.simulation(trajectory, each, dt, scene._limit(dt, lagged), *_numbers(scene, code, lagged))
     if not row and not np.isfinite(trajectory[-1]).all():
         row = int(np.argmin(np.isfinite(trajectory).all(axis=1)))
+    if lagged:
+        trajectory = np.ascontiguousarray(trajectory[:, :n])
     if row:
         raise refusal(
             scene,
@@ -44,24 +60,47 @@ def simulate(scene: Scene, state: ArrayLike, controls: ArrayLike | int, dt: floa
             dt,
             trajectory[:row],
             f"step {row - 1} of {len(given)}",
+            lagged=lagged,
         )
     return trajectory
 
 
-def step_bound(scene: Scene, state: ArrayLike, control: ArrayLike, dt: float) -> StepBound:
+def _lagging(scene: Scene, lag: Any, applied: Any, dt: float) -> tuple[Array | None, Array]:
+    """Return 1/τ of the controls, or None where none lags, and where they start."""
+    names = scene.control_names
+    decays = np.zeros(len(names)) if lag is None else check_lags(names, lag, dt)
+    reached = np.zeros(len(names)) if applied is None else check_applied(names, applied, decays)
+    return decays if decays.any() else None, reached
+
+
+def _numbers(scene: Scene, code: Any, lagged: bool) -> list[float]:
+    """Return the constants that the code of a step takes."""
+    constants = scene._constants(lagged)
+    return [constants[name.removeprefix("k_")] for name in code.constants]
+
+
+def step_bound(
+    scene: Scene,
+    state: ArrayLike,
+    control: ArrayLike,
+    dt: float,
+    lag: float | Mapping[str, float] | None = None,
+    applied: ArrayLike | None = None,
+) -> StepBound:
     """See `Scene.step_bound`."""
     from lag_envs.stepping.general import StepBound
 
     start, dt = check_state(scene, state), check_step(dt)
     held = check_controls(scene, control, 1).reshape(-1)
-    if scene._form:
+    decays, reached = _lagging(scene, lag, applied, dt)
+    lagged = decays is not None
+    if scene._form and not lagged:
         return scene._form.step_bound(start, list(held), dt, scene._constants())
-    code, constants = scene._code(dt), scene._constants()
-    numbers = [constants[name.removeprefix("k_")] for name in code.constants]
-    order = scene._order(dt)
-    status, bounds = code.bounded(start.tolist(), held.tolist(), dt, order, numbers)
+    code, order = scene._code(dt, lagged), scene._order(dt, lagged)
+    given = held.tolist() if decays is None else [*reached.tolist(), *held.tolist(), *decays.tolist()]
+    status, bounds = code.bounded(start.tolist(), given, dt, order, _numbers(scene, code, lagged))
     if status < 0:
-        raise refusal(scene, start, held, dt, None, "the step")
+        raise refusal(scene, start, held, dt, None, "the step", lagged=lagged)
     of = {("place", name): bounds[0][i] for i, name in enumerate(scene._layout.free)}
     of |= {("velocity", name): bounds[1][i] for i, name in enumerate(scene._layout.free)}
     by_state = {e.name: float(of.get((e.kind, e.coordinate), 0.0)) for e in scene._layout.state}
@@ -112,13 +151,19 @@ def energy_balance(
 
 
 def refusal(
-    scene: Scene, state: Array, control: ArrayLike, dt: float, trajectory: Array | None, where: str
+    scene: Scene,
+    state: Array,
+    control: ArrayLike,
+    dt: float,
+    trajectory: Array | None,
+    where: str,
+    lagged: bool = False,
 ) -> StepRefused:
     """Return the error for a step that was refused."""
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     held = zip(scene.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
     why = "it could not be certified within the largest number of substeps"
-    if scene._form is not None:
+    if scene._form is not None and not lagged:
         why = f"it would need more than {MAX_SUBSTEPS:,} substeps"
     error = StepRefused(
         f"{where} was refused: from ({start}) with "

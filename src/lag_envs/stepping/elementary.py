@@ -91,6 +91,8 @@ _ATAN = (
     0.020101696639889047,
     -0.006288527189559517,
 )
+# φ₂ of `fading` in x, 0 <= x <= 1; what is left out is below 1/20! = 4e-19.
+_PHI2 = tuple((-1.0) ** k / math.factorial(k + 2) for k in range(18))
 
 
 def sincos(x: Any, xp: Any) -> tuple[Any, Any]:
@@ -168,6 +170,16 @@ def atan(x: Any, xp: Any) -> Any:
     z = t * t
     rest = t * z * polynomial(_ATAN, z) + base * 3.8981718325193755e-17  # what pi/2 lost, as a part of it
     return xp.copysign(base + (t + rest), x)
+
+
+def fading(x: Any, xp: Any) -> tuple[Any, Any, Any]:
+    """Return e^-x and its integrals φ₁ = (1 - e^-x)/x and φ₂ = (1 - φ₁)/x, for x >= 0."""
+    fade = xp.exp(-x)
+    early = x < 1.0  # where the differences would cancel
+    small = polynomial(_PHI2, xp.where(early, x, 0.0))
+    divisor = xp.where(early, 1.0, x)
+    once = xp.where(early, 1.0 - x * small, (1.0 - fade) / divisor)
+    return fade, once, xp.where(early, small, (1.0 - once) / divisor)
 
 
 class ElementaryTrace(Trace):

@@ -17,6 +17,7 @@ import numpy as np
 from lag_envs.mechanics.algebra import Atom, Expr, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import eliminated, exactly
+from lag_envs.mechanics.layout import Prescribed
 from lag_envs.mechanics.motion import Mechanics
 from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping.compiling import compile_function, record_block
@@ -38,12 +39,16 @@ class SeriesStepper:
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
         self._layout = mechanics.layout
-        self._lowering = Lowering(self._layout.free, self._moving())
-        self._parts = self._lowering.parts(mechanics.mass, mechanics.force)
+        self._lowering, self._parts = self._lowered()
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
         self._codes: dict[tuple[frozenset[str], bool], StepCode] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
+
+    def _lowered(self, tangents: bool = False) -> tuple[Lowering, tuple[list[int], dict]]:
+        """Return what the equations have become, and its parts."""
+        lowering = Lowering(self._layout.free, self._moving(), tangents)
+        return lowering, lowering.parts(self.mechanics.mass, self.mechanics.force)
 
     def _moving(self) -> dict[str, list[Expr]]:
         """Return the moving prescribed coordinates as polynomials in time."""
@@ -71,25 +76,42 @@ class SeriesStepper:
 
     # --- from the state and back ----------------------------------------------------------------------------
 
-    def _values(self, y: Sequence, u: Sequence) -> dict[str, Any]:
-        """Return entries of the state and controls by name."""
-        return dict(zip((e.name for e in self._layout.state), y, strict=True)) | dict(
-            zip(self._layout.controls, u, strict=True)
-        )
+    @property
+    def arguments(self) -> list[str]:
+        """Names of what the code takes for the controls."""
+        return [f"u{i}" for i in range(len(self._layout.controls))]
+
+    @property
+    def applied(self) -> list[str]:
+        """Names of what `followed` returns."""
+        return []
+
+    def followed(self, xp: Any, u: Sequence, dt: Any) -> list:
+        """Return what became of the controls; nothing, where they are held."""
+        return []
+
+    def _state(self, y: Sequence) -> dict[str, Any]:
+        """Return the state's entries by name."""
+        return dict(zip((e.name for e in self._layout.state), y, strict=True))
+
+    def _starting(self, xp: Any, u: Sequence) -> Sequence:
+        """Return the controls at the step's start."""
+        return u
+
+    def _inputs(self, xp: Any, u: Sequence) -> dict[str, Any]:
+        """Return the inputs that follow from the controls."""
+        return {f"control_{name}": value for name, value in zip(self._layout.controls, u, strict=True)}
 
     def prepare(self, xp: Any, y: Sequence, u: Sequence, k: Mapping[str, Any]) -> dict[str, Any]:
         """Return the inputs of the series by name, and places ``q0``, ... and velocities ``v0``, ...."""
-        given = self._values(y, u)
-        inputs: dict[str, Any] = {}
-        for name in self._whole.inputs:
-            if name.startswith("control_"):
-                inputs[name] = given[name.removeprefix("control_")]
-            elif name.startswith("start_"):
-                inputs[name] = given[name.removeprefix("start_")]
+        given = self._state(y)
+        known = {f"start_{name}": value for name, value in given.items()} | self._inputs(xp, u)
+        inputs = {name: known[name] for name in self._whole.inputs if name in known}
         q = [
             given.get(name, 0.0) for name in self._layout.free
         ]  # where one is left out, nothing depends on it
-        shift = self._shift(xp, q, {p.name: given.get(p.name) for p in self._layout.prescribed}, u, k)
+        driven = {p.name: given.get(p.name) for p in self._layout.prescribed}
+        shift = self._shift(xp, q, driven, self._starting(xp, u), k)
         for i, name in enumerate(self._layout.free):
             inputs[f"q{i}"] = q[i]
             inputs[f"v{i}"] = self._rate(given, name, shift[i])
@@ -109,35 +131,24 @@ class SeriesStepper:
         n = len(m.free)
         if not m.coupling:
             return [0.0] * n
-        held = dict(zip(self._layout.controls, u, strict=True))
         values: dict[Atom, Any] = {parameter(name): k[f"p_{name}"] for name in self._parameters}
         values |= {place(name): value for name, value in zip(m.free, q, strict=True)}
         values |= {place(name): value for name, value in s.items() if value is not None}
-        values |= {control(name): value for name, value in held.items()}
-        levels = self._layout.at("rate")
-        values |= {velocity(p.name): held[p.control or ""] for p in levels}
+        values |= {control(name): value for name, value in zip(self._layout.controls, u, strict=True)}
+        rates = {p.name: self._by(p, u) for p in self._layout.at("rate")}
+        values |= {velocity(name): rate for name, rate in rates.items()}
         entries = evaluate(m.entries(), values, xp)
         right: list[Any] = [0.0] * n
         for (i, name), entry in sorted(m.coupling.items()):
             (weight,) = evaluate([entry], values, xp)
-            by = next(p.control for p in levels if p.name == name)
-            right[i] = right[i] + weight * held[by or ""]
+            right[i] = right[i] + weight * rates[name]
         return eliminated([entries[i * n : (i + 1) * n] for i in range(n)], right)
 
     def finish(
         self, xp: Any, q: Sequence, v: Sequence, y: Sequence, u: Sequence, dt: Any, k: Mapping[str, Any]
     ) -> list:
         """Return the state at the step's end."""
-        given = self._values(y, u)
-        after: dict[str, Any] = {}
-        for p in self._layout.prescribed:
-            if p.level == "acceleration" and f"{p.name}_dot" in given:
-                held, rate = given[p.control or ""], given[f"{p.name}_dot"]
-                if p.name in given:
-                    after[p.name] = given[p.name] + dt * (rate + 0.5 * dt * held)
-                after[f"{p.name}_dot"] = rate + dt * held
-            elif p.level == "rate" and p.name in given:
-                after[p.name] = given[p.name] + dt * given[p.control or ""]
+        after, u = self._driven(xp, self._state(y), u, dt)
         shift = self._shift(xp, q, {p.name: after.get(p.name) for p in self._layout.prescribed}, u, k)
         for entry in self._layout.state:
             if entry.coordinate in self._layout.free:
@@ -148,12 +159,30 @@ class SeriesStepper:
                     after[entry.name] = v[i] if entry.kind == "velocity" else v[i] + shift[i]
         return [after[entry.name] for entry in self._layout.state]
 
+    def _driven(
+        self, xp: Any, given: Mapping[str, Any], u: Sequence, dt: Any
+    ) -> tuple[dict[str, Any], Sequence]:
+        """Return the state of the prescribed coordinates at the step's end, and the controls there."""
+        after: dict[str, Any] = {}
+        for p in self._layout.prescribed:
+            if p.level == "acceleration" and f"{p.name}_dot" in given:
+                held, rate = self._by(p, u), given[f"{p.name}_dot"]
+                if p.name in given:
+                    after[p.name] = given[p.name] + dt * (rate + 0.5 * dt * held)
+                after[f"{p.name}_dot"] = rate + dt * held
+            elif p.level == "rate" and p.name in given:
+                after[p.name] = given[p.name] + dt * self._by(p, u)
+        return after, u
+
+    def _by(self, p: Prescribed, numbers: Sequence) -> Any:
+        """Return, of one number for each control, that of the control which moves a prescribed coordinate."""
+        return numbers[self._layout.controls.index(p.control or "")]
+
     # --- derivatives ---------------------------------------------------------------------------------------
 
     @cached_property
     def _tangents(self) -> tuple[Lowering, tuple[list[int], dict]]:
-        lowering = Lowering(self._layout.free, self._moving(), tangents=True)
-        return lowering, lowering.parts(self.mechanics.mass, self.mechanics.force)
+        return self._lowered(tangents=True)
 
     def tangent(self, parameters: Mapping[str, float]) -> SeriesTangent:
         """Return what differentiates steps of a scene with these parameters."""
@@ -225,7 +254,7 @@ class SeriesTangent:
         self._free = [i for i in self._still if ("velocity", i) not in seen]
         self._moving = [*(f"q{i}" for i in range(n)), *(f"v{i}" for i in range(n))]
         without = {*(f"q{i}" for i in self._still), *(f"v{i}" for i in self._free)}
-        inputs = [name for name in record.given if name.startswith(("control_", "start_"))]
+        inputs = [name for name in record.given if name not in record.constants]
         self._columns = tuple(name for name in [*self._moving, *inputs] if name not in without)
         self._first = np.zeros((2 * n, slots_for(len(self._columns))))
         for i, name in enumerate(self._moving):
@@ -318,7 +347,9 @@ class StepCode:
     start, end : list of str
         Names of the state's entries before and after the step.
     controls : list of str
-        Names of the controls.
+        Names of the controls, or of what they follow from.
+    applied : list of str
+        Names of what `compile` returns about lagged controls.
     constants : list of str
         Names of the constants that the code uses.
     rows : list of str
@@ -333,16 +364,15 @@ class StepCode:
         self.record, self._fused = record, fused
         self.start = [f"y{i}" for i in range(len(layout.state))]
         self.end = [f"z{i}" for i in range(len(layout.state))]
-        self.controls = [f"u{i}" for i in range(len(layout.controls))]
+        self.controls = stepper.arguments
+        self.applied = stepper.applied
         n = record.size
         self._n = n
         names = [*stepper._whole.constants, *(f"p_{name}" for name in stepper._parameters)]
         given: dict[str, Any] = {name: 0.0 if name in absent else f"k_{name}" for name in names}
         q, v = [f"q{i}" for i in range(n)], [f"v{i}" for i in range(n)]
-        self._inputs = [
-            name if name.startswith(("control_", "start_")) else f"k_{name}" for name in record.given
-        ]
-        wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
+        self._inputs = [f"k_{name}" if name in record.constants else name for name in record.given]
+        wanted = [name for name in record.given if name not in record.constants]
 
         def run(formula: Callable, inputs: Sequence[str]) -> tuple[list[str], list]:
             trace = ElementaryTrace()
@@ -363,16 +393,10 @@ class StepCode:
 
         def finish(xp: Any, values: Sequence, k: Mapping) -> dict[str, Any]:
             rest = values[2 * n :]
-            ends = stepper.finish(
-                xp,
-                values[:n],
-                values[n : 2 * n],
-                rest[:states],
-                rest[states : states + controls],
-                rest[-1],
-                k,
-            )
-            return dict(zip(self.end, ends, strict=True))
+            given = rest[states : states + controls]
+            ends = stepper.finish(xp, values[:n], values[n : 2 * n], rest[:states], given, rest[-1], k)
+            found = dict(zip(self.end, ends, strict=True))
+            return found | dict(zip(self.applied, stepper.followed(xp, given, rest[-1]), strict=True))
 
         self.prepare, prepared = run(prepare, [*self.start, *self.controls])
         self.prepare += [
@@ -382,7 +406,9 @@ class StepCode:
         ]
         self.finish, finished = run(finish, [*q, *v, *self.start, *self.controls, "dt"])
         self.finish += [
-            f"{name} = {value}" for name, value in zip(self.end, finished, strict=True) if name != value
+            f"{name} = {value}"
+            for name, value in zip([*self.end, *self.applied], finished, strict=True)
+            if name != value
         ]
         used = " ".join([*self.prepare, *self.finish, *self._inputs])
         self.constants = [
@@ -411,7 +437,7 @@ class StepCode:
         return ", ".join(["rows", *self.start, *self.controls, "dt", "order", *self.constants])
 
     def compile(self, tolerance: float = TOLERANCE) -> Callable:
-        """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., status)``.
+        """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., applied..., status)``.
 
         The status is the number of attempts, or negative where the step is refused. In `rows`, `scratch`
         numbers long, the sums of the substeps' bounds on places and velocities are left at the end.
@@ -431,7 +457,7 @@ class StepCode:
             *(f"q{i} = rows[{layout.q + i}]" for i in range(n)),
             *(f"v{i} = rows[{layout.v + i}]" for i in range(n)),
             *self.finish,
-            f"return {', '.join(self.end)}, status",
+            f"return {', '.join([*self.end, *self.applied])}, status",
         ]
         helper = compile_advance(self.record, tolerance, self._fused)
         return compile_function("advance", "\n    ".join(body) + "\n", helper)
@@ -468,20 +494,24 @@ class StepCode:
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, order, constants...)``.
 
-        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0.
+        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0. A row
+        is the state, and what lagged controls have reached; `controls` holds what is given for each step.
         """
         extra = "".join(f", {name}" for name in self.constants)
+        reached = [name.removesuffix("_end") for name in self.applied if name.endswith("_end")]
+        carried = [*self.start, *reached]
+        given = [name for name in self.controls if name not in reached]
         loop = [
-            *(f"{u} = controls[i, {j}]" for j, u in enumerate(self.controls)),
-            f"{', '.join(self.start)}, status = advance({self.arguments})",
+            *(f"{u} = controls[i, {j}]" for j, u in enumerate(given)),
+            f"{', '.join([*carried, *self.applied[len(reached) :]])}, status = advance({self.arguments})",
             "if status < 0:",
             "    return i + 1",
-            *(f"trajectory[i + 1, {i}] = {y}" for i, y in enumerate(self.start)),
+            *(f"trajectory[i + 1, {i}] = {y}" for i, y in enumerate(carried)),
         ]
         body = [
             f"def simulate(trajectory, controls, dt, order{extra}):",
             f"rows = np.zeros({self.scratch})",
-            *(f"{y} = trajectory[0, {i}]" for i, y in enumerate(self.start)),
+            *(f"{y} = trajectory[0, {i}]" for i, y in enumerate(carried)),
             "for i in range(controls.shape[0]):",
             *("    " + line for line in loop),
             "return 0",

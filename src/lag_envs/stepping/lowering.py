@@ -17,10 +17,11 @@ import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 from lag_envs.mechanics.algebra import Atom, Expr, derivative
-from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.elementary import ElementaryTrace, fading
 from lag_envs.stepping.tracing import Number, Operation, Trace
 
 #: A weight in a sum: a scalar's name, or a number.
@@ -28,11 +29,16 @@ Weight = str | float
 
 #: Kinds of symbols that change within a step.
 VARYING = frozenset({"place", "velocity"})
+#: Kinds of symbols for what `fading` makes of the time since the control step began, as a part of the lag.
+FADING = ("fading_0", "fading_1", "fading_2")
 
 #: The time since the control step began, as a symbol of the places of prescribed coordinates, and as an
 #: input.
 CLOCK = Atom("clock", "elapsed")
 ELAPSED = "clock_elapsed"
+
+#: Nodes whose series are known from the start.
+KNOWN = frozenset({"polynomial", "decay"})
 
 #: Functions that are integrated along their argument.
 FUNCTIONS = frozenset({"sin", "cos", "exp", "log", "atan", "tanh"})
@@ -43,7 +49,9 @@ class Node:
     """A series in time.
 
     ``op`` is one of ``place``, ``velocity`` (of the free coordinate `index`), ``polynomial`` (known from the
-    start: `weights` are its coefficients in powers of t), ``sum`` (`weights` times `args`, and a constant
+    start: `weights` are its coefficients in powers of t), ``decay`` (a polynomial and
+    an exponential: `weights` are the first coefficients c_k, four at most, and then a rate, by which all
+    further ones are c_k = c_{k-1} rate/k), ``sum`` (`weights` times `args`, and a constant
     `weights[-1]`), ``product``, ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These
     obey z' = w x', and their `args` are x, w (of a cosine: -w), and x' where x is a weighted sum of places.
     """
@@ -126,12 +134,23 @@ class Lowering:
         kind ``control`` (held), ``start`` (its place and rate when the control step begins) and `CLOCK`.
     tangents : bool, default False
         Whether scalars come with their derivatives by controls and starts.
+    rates : mapping from str to Expr
+        Where controls are lagged: for each of them, and for each coordinate that it moves, the rate of its
+        exponential. Then `prescribed` holds the controls too, and coefficients as a node ``decay`` has them,
+        in symbols of kind ``command``, ``gap``, ``decay`` and `FADING` in place of ``control``.
     """
 
     def __init__(
-        self, free: Sequence[str], prescribed: Mapping[str, Sequence[Expr]], tangents: bool = False
+        self,
+        free: Sequence[str],
+        prescribed: Mapping[str, Sequence[Expr]],
+        tangents: bool = False,
+        rates: Mapping[str, Expr] = MappingProxyType({}),
     ) -> None:
         self._wanted = tangents
+        self._rates = rates
+        self._varying = VARYING | {"control"} if rates else VARYING
+        self._faded: dict[str, tuple] = {}
         self._slopes: dict[str, dict[str, Any]] = {}
         self._free = list(free)
         self._prescribed = dict(prescribed)
@@ -188,6 +207,11 @@ class Lowering:
         return self._scalars[expr.text]
 
     def _held(self, atom: Atom) -> Any:
+        if atom.kind in FADING:
+            if atom.name not in self._faded:
+                parts = self._input(ELAPSED) * self._input(f"decay_{atom.name}")
+                self._faded[atom.name] = fading(parts, self._trace)
+            return self._faded[atom.name][FADING.index(atom.kind)]
         if atom.argument is None:
             return self._input(f"{atom.kind}_{atom.name}")
         inner = self.scalar(atom.argument)
@@ -207,6 +231,11 @@ class Lowering:
     def _product(self, a: int, b: int) -> int:
         return self._node("product", (min(a, b), max(a, b)))
 
+    def _varies(self, atom: Atom) -> bool:
+        if atom.argument is None:
+            return atom.kind in self._varying
+        return any(s.kind in self._varying for s in atom.argument.symbols())
+
     def _atom(self, atom: Atom) -> int:
         """Return the node of an atom that changes within a step."""
         if atom not in self._atoms:
@@ -219,6 +248,8 @@ class Lowering:
                 terms = list(self._prescribed[atom.name])
                 if atom.kind == "velocity":
                     terms = [e * k for k, e in enumerate(terms)][1:]
+                if atom.name in self._rates:
+                    return self._node("decay", (), [self.scalar(e) for e in (*terms, self._rates[atom.name])])
                 return self._node("polynomial", (), [self.scalar(e) for e in terms])
             return self._node(atom.kind, index=self._free.index(atom.name))
         if atom.function == "sum":
@@ -252,7 +283,7 @@ class Lowering:
         """Return the node of an argument's rate if it is a weighted sum of places, else nothing."""
         total = Expr({})
         for monomial, c in argument.terms.items():
-            varying = [(atom, n) for atom, n in monomial if _varies(atom)]
+            varying = [(atom, n) for atom, n in monomial if self._varies(atom)]
             if varying:
                 ((atom, n), *more) = varying
                 if more or n != 1 or atom.argument is not None or atom.kind != "place":
@@ -268,7 +299,7 @@ class Lowering:
             factors: Counter[int] = Counter()
             rest = []
             for atom, n in monomial:
-                if _varies(atom):
+                if self._varies(atom):
                     node = self._atom(atom)
                     factors[node if n > 0 else self._node("reciprocal", (node,))] += abs(n)
                 else:
@@ -355,7 +386,7 @@ class Lowering:
         right = [self.series(e) if e.terms else -1 for e in force]
         entries: dict[tuple[int, int], tuple[int, Any]] = {}
         for where, e in sorted(mass.items()):
-            varying = any(_varies(a) for a in e.atoms())
+            varying = any(self._varies(a) for a in e.atoms())
             entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))  # node, constant
         return right, entries
 
@@ -415,7 +446,7 @@ class Lowering:
                     )
                 continue
             if (op == "product" and any(now[a] < 0 for a in args)) or (
-                op == "polynomial" and all(w == 0.0 for w in numbers)
+                op in KNOWN and all(w == 0.0 for w in numbers[: len(numbers) - (op == "decay")])
             ):
                 vanish(i)
                 continue
@@ -488,9 +519,3 @@ def _is_constant(atom: Atom) -> bool:
     if atom.argument is None:
         return atom.kind == "parameter"
     return all(s.kind == "parameter" for s in atom.argument.symbols())
-
-
-def _varies(atom: Atom) -> bool:
-    if atom.argument is None:
-        return atom.kind in VARYING
-    return any(s.kind in VARYING for s in atom.argument.symbols())

@@ -33,7 +33,7 @@ from functools import cache
 from typing import Any, NamedTuple, Protocol
 
 from lag_envs.stepping.elementary import ElementaryTrace
-from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, Node, SeriesRecord
+from lag_envs.stepping.lowering import ELAPSED, FUNCTIONS, KNOWN, Node, SeriesRecord
 from lag_envs.stepping.tracing import MAGIC, Operation, evaluate
 
 #: The orders that a series may have.
@@ -43,6 +43,8 @@ SMALLEST_ORDER, LARGEST_ORDER = 4, 24
 TOLERANCE = 1e-14
 #: Sizes below this count as this: √(kg m²) m/s or what the mass matrix's units make of it.
 SMALLEST_SIZE = 1e-12
+#: While a control that lags is still far from its command, a substep is at most so many time constants.
+REACH = 2.0
 #: How often a step is shortened before it counts as failed.
 TRIES = 4
 #: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
@@ -228,7 +230,7 @@ class Series:
             self._pairs[n] = self._factor(n), self._factor(n)
         elif node.op in FUNCTIONS:
             self._pairs[n] = self._slope(n), self._factor(node.args[1])
-        elif node.op == "polynomial":
+        elif node.op in KNOWN:
             self._factor(n)
 
     # --- the series ----------------------------------------------------------------------------------------
@@ -262,7 +264,7 @@ class Series:
                 t.store(self._slots["d", n], t.index(0), zero)
             if node.op == "sqrt":
                 halves[n] = t.div(t.number(0.5), known[n])
-            if node.op == "polynomial" and n in self._live:
+            if node.op in KNOWN and n in self._live:
                 self._lay_out(t, n, node, scalars, h, order)
         for i in range(self.size):
             t.store(self._slots["v", i], t.index(0), v[i])
@@ -303,7 +305,10 @@ class Series:
         return scalars[weight] if isinstance(weight, str) else t.number(weight)
 
     def _lay_out(self, t: Target, n: int, node: Node, scalars: dict, h: Any, order: Any) -> None:
-        """Store the coefficients of a polynomial in time."""
+        """Store the coefficients of a series that is known, up to the order N."""
+        if node.op == "decay":
+            self._lay_out_decay(t, n, node, scalars, h, order)
+            return
         slot, power = self._slots["x", n], h
         zero = t.number(0.0)
 
@@ -316,6 +321,23 @@ class Series:
             t.store(slot, t.index(k), t.mul(power, self._weight(t, scalars, w)))
             power = t.mul(power, h)
 
+    def _lay_out_decay(self, t: Target, n: int, node: Node, scalars: dict, h: Any, order: Any) -> None:
+        slot, power = self._slots["x", n], h
+        *first, rate = (self._weight(t, scalars, w) for w in node.weights)
+        last = first[0]
+        for k, w in enumerate(first[1:], 1):
+            last = t.mul(power, w)
+            t.store(slot, t.index(k), last)
+            power = t.mul(power, h)
+        step = t.mul(h, rate)
+
+        def further(k: Any, carried: Sequence) -> list:
+            last = t.mul(carried[0], t.mul(step, t.reciprocal(k)))
+            t.store(slot, k, last)
+            return [last]
+
+        t.loop(t.index(len(first)), t.plus(order, 1), [last], further)
+
     def _first(self, t: Target, node: Node, zero: dict, scalars: dict, q: Sequence, v: Sequence) -> Any:
         """Return a node's coefficient of order 0, its value."""
         op, args = node.op, node.args
@@ -323,7 +345,7 @@ class Series:
             return q[node.index]
         if op == "velocity":
             return v[node.index]
-        if op == "polynomial":
+        if op in KNOWN:
             return self._weight(t, scalars, node.weights[0])
         if op == "sum":
             constant = node.weights[-1]
@@ -417,7 +439,7 @@ class Series:
             op, args = node.op, node.args
             if op == "place":
                 return t.mul(step, t.load(self._slots["v", node.index], before))
-            if op in ("velocity", "polynomial"):
+            if op == "velocity" or op in KNOWN:
                 return self._factor(n).load(t, k)
             if op == "sum":
                 return self._weighted(t, node, values, start.scalars, None)
@@ -440,7 +462,7 @@ class Series:
 
         for n in self._live:
             values[n] = compute(n, record.nodes[n])
-            if record.nodes[n].op != "polynomial":
+            if record.nodes[n].op not in KNOWN:
                 self._keep(t, n, k, values[n])
             if ("d", n) in self._slots:
                 t.store(self._slots["d", n], k, t.mul(t.real(k), values[n]))
@@ -563,6 +585,21 @@ class Series:
             done = t.both(done, t.less(t.abs(x), t.number(math.inf)))
         return done, h, q, v, bounds
 
+    def _within_lags(self, t: Target, inputs: dict[str, Any], h: Any) -> Any:
+        """Return a step that lagged controls do not make hopeless, h at most.
+
+        With z = h/τ, an exponential's coefficients sum up to e^z times its size. It has died out as far as
+        e^(-z) after a time of z, so steps may double. Much longer ones would not be certified, and terms that
+        cancel would be taken for large velocities.
+        """
+        for name in self.record.inputs:
+            if name.startswith("decay_"):
+                gap = inputs[f"gap_{name.removeprefix('decay_')}"]
+                reach = t.add(inputs[ELAPSED], t.div(t.number(REACH), inputs[name]))
+                shorter = t.both(t.less(reach, h), t.less(t.number(0.0), t.abs(gap)))
+                h = t.select(shorter, reach, h)
+        return h
+
     def substep(
         self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any, order: Any, tolerance: Any
     ) -> tuple[Lane, list]:
@@ -579,9 +616,8 @@ class Series:
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
         wanted = t.less(zero, lane.left)
-        done, tried, q, v, bounds = self.attempt(
-            t, inputs, lane.q, lane.v, lane.wish, order, tolerance, wanted
-        )
+        wish = self._within_lags(t, inputs, lane.wish)
+        done, tried, q, v, bounds = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
@@ -659,6 +695,8 @@ class Certificate:
     without order 0:
 
     * velocity: |v_N| + E_v. Place: h(|v_{N-1}| + |v_N| + E_v)/N.
+    * decay: c_{k+1} = -c_k z/(k+1) from N - 1 on, z = h/τ, leaves |c_N| (1 + z/(N+1) + ...). That is at most
+      |c_N| / (1 - b) <= |c_N| (1 + 2b) where b = z/(N+1) <= 1/2, and always at most |c_N| e^z.
     * product: H(X, Y) + |X| E_Y + |Y| E_X + E_X E_Y.
     * reciprocal z of x: x z = 1 leaves E_z = (H(x, z) + |z| E_x) / p where p = |x_0| - Σ'|x| - E_x > 0.
     * sqrt z of x: (ẑ + e)² = x leaves e² + 2ẑe = R, |R| <= E_x + H(z, z), so E_z = R/(p + √(p² - R)) where
@@ -848,6 +886,8 @@ class Certificate:
             return tail if op == "velocity" else self._integrated(slot, tail)
         if op == "polynomial":
             return t.number(0.0)
+        if op == "decay":
+            return self._tail_of_decay(n, node)
         if op == "sum":
             total = None
             for a, w in zip(args, node.weights[:-1], strict=True):
@@ -882,6 +922,18 @@ class Certificate:
         room = t.sub(t.mul(p, p), r)
         self._require(t.both(t.less(zero, p), t.less(zero, room)))
         return t.add(p, t.sqrt(t.select(t.less(zero, room), room, zero)))
+
+    def _tail_of_decay(self, n: int, node: Node) -> Any:
+        t, series = self._t, self._series
+        last = self._powered(self._size(series._slots["x", n], self._order))
+        rate = t.abs(series._weight(t, self._start.scalars, node.weights[-1]))
+        z = t.mul(rate, self._h)
+        b = t.mul(z, self._per_next)
+        grown = t.select(
+            t.less(b, t.number(0.5)), t.fma(t.number(2.0), b, t.number(1.0)), t.elementary("exp", z)
+        )
+        # What has died out leaves nothing, over any time.
+        return t.select(t.less(t.number(0.0), last), t.mul(last, grown), last)
 
     def _tail_of_function(self, n: int, op: str, args: tuple[int, ...]) -> Any:
         t, series = self._t, self._series
