@@ -45,8 +45,8 @@ def easier(
             return wanted
 
         def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-            a = control.s_ddot * (1.0 / self.largest)
-            stop = after.s + after.s_dot * xp.abs(after.s_dot) * (0.5 / self.largest)
+            a = control.s_ddot * (1.0 / task.largest)
+            stop = after.s + after.s_dot * xp.abs(after.s_dot) * (0.5 / task.largest)
             over = xp.maximum(xp.abs(stop) * (1.0 / self.length) - edge, 0.0)
             height = self.height(after, xp)
             return 0.1 * (height * height) - effort * (a * a) - 300.0 * (over * over)

@@ -9,7 +9,7 @@ from typing import Any
 from lag_envs.scenes import Chain
 from lag_envs.scenes.shapes import Bodies, Polygon
 from lag_envs.tasks.base import FASTEST_START
-from lag_envs.tasks.record import Examples, Goal, Plans
+from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
@@ -134,6 +134,11 @@ class SwingUp(GuardedTrack, _Chain):
         "good",
         arrival="upright",
     )
+    controllers = {
+        "LQR": Controller("lag_envs.controllers.tracking:hold"),
+        "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
+        "iLQR": Controller("lag_envs.controllers.chain:replan", plans=True),
+    }
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0]},
         moving=[0.1, -0.2, 2.0, 12.0, 2.5, -20.0],
@@ -329,6 +334,26 @@ class Balance(_Chain):
     goal = Goal(
         "success: neither a bar nor the support leaves its limits in 10 s; there is no time", None, None
     )
+    reference = "LQR"
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.linear:BalanceLQR",
+            {"effort": 0.03, "slide": 0.67, "turn": 1.04},
+            tune={"effort": (1e-3, 1.0), "slide": (0.0, 2.0), "turn": (0.0, 2.0)},
+        ),
+        "linear feedback": Controller(
+            "lag_envs.controllers.basic:feedback",
+            {"s": -0.5, "s_dot": -0.75, "e_1": -20.7, "e_2": 23.0, "theta_1_dot": -0.75, "theta_2_dot": 2.2},
+            tune={
+                "s": (-3.0, 0.0),
+                "s_dot": (-3.0, 0.0),
+                "e_1": (-40.0, 0.0),
+                "e_2": (0.0, 40.0),
+                "theta_1_dot": (-4.0, 2.0),
+                "theta_2_dot": (0.0, 6.0),
+            },
+        ),
+    }
     examples = Examples(
         start={"state": [0.1, -0.2, 3.0, 0.5, 3.2, -0.5]},
         refused=[
