@@ -161,7 +161,7 @@ Best known is planning anew for each start. One recorded plan with time-varying 
 for all starts are near to each other.
 """
 
-    steps_of_plan, batch, iterations, price, share = 75, 32, 120, 0.05, 0.9
+    steps_of_plan, steps_of_quick, batch, iterations, price, share = 65, 68, 32, 120, 0.05, 0.95
 
     @property
     def plans(self) -> Plans:
@@ -173,6 +173,7 @@ for all starts are near to each other.
             "lag_envs.controllers.chain:easier",
             {"effort": self.price, "share": self.share},
             steps=self.steps_of_plan,
+            quick={"steps": self.steps_of_quick, "batch": 64, "share": 1.0, "edge": 0.97, "effort": 0.02},
             batch=self.batch,
             iterations=self.iterations,
             rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
@@ -233,7 +234,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     id = "DoubleBarWeak-v0"
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
-    steps_of_plan = 115
+    steps_of_plan, steps_of_quick, share = 115, 108, 0.9
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -246,7 +247,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     id = "TripleBar-v0"
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
-    steps_of_plan, batch, iterations, price, share = 150, 28, 180, 0.02, 0.85
+    steps_of_plan, steps_of_quick, batch, iterations, price, share = 150, 140, 28, 180, 0.02, 0.85
 
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0, 1.0, 2.0]},
@@ -334,16 +335,23 @@ class Balance(_Chain):
     goal = Goal(
         "success: neither a bar nor the support leaves its limits in 10 s; there is no time", None, None
     )
-    reference = "LQR"
+    reference = "linear feedback"
     controllers = {
         "LQR": Controller(
             "lag_envs.controllers.linear:BalanceLQR",
-            {"effort": 0.03, "slide": 0.67, "turn": 1.04},
-            tune={"effort": (1e-3, 1.0), "slide": (0.0, 2.0), "turn": (0.0, 2.0)},
+            {"effort": 5.71, "slide": 0.016, "turn": 0.23},
+            tune={"effort": (0.1, 30.0), "slide": (0.0, 5.0), "turn": (0.0, 20.0)},
         ),
         "linear feedback": Controller(
             "lag_envs.controllers.basic:feedback",
-            {"s": -0.5, "s_dot": -0.75, "e_1": -20.7, "e_2": 23.0, "theta_1_dot": -0.75, "theta_2_dot": 2.2},
+            {
+                "s": -1.48,
+                "s_dot": -0.71,
+                "e_1": -28.2,
+                "e_2": 35.2,
+                "theta_1_dot": -0.985,
+                "theta_2_dot": 2.67,
+            },
             tune={
                 "s": (-3.0, 0.0),
                 "s_dot": (-3.0, 0.0),
