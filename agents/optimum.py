@@ -38,6 +38,7 @@ from lag_envs.host import machine
 from lag_envs.store import write
 from lag_envs.tasks import resolve
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.measured import FILE
 from lag_envs.tasks.record import Axis, ValueIteration
 
 Array = NDArray[np.float64]
@@ -67,6 +68,17 @@ how to read the numbers:
                 three show; its error bar is what the last halving of the cells changed. An ESTIMATE, no
                 bound. There is none where its own greedy policy gets more.
   bound         what no policy can exceed, proved; crude but where the optimum is known.
+A task with plans (`Task.plans`) is planned instead, by iLQR from random guesses, minutes per id:
+  src/lag_envs/controllers/plans/ID-followed.npz
+                a plan that is followed from any start by feedback; of those found, the one with the best
+                mean return over 200 fresh starts
+  src/lag_envs/controllers/plans/ID-quick.npz
+                a quicker one, from which each episode is planned anew
+  src/lag_envs/tasks/measured.json
+                what both get, by python -m agents.scale: means over fresh starts with standard errors; the
+                best of them is the best known, a lower bound
+With --quick plans of one seed are written to FOLDER and nothing is measured.
+
 Of a state of 4 dimensions an easier task is solved, such as the one without a track: its value is from above;
 lower is what the best agent gets, see the agents' results.
 
@@ -538,10 +550,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         # What others are relaxed to comes first, so that it is there.
         known = {env_id: task.value_iteration for env_id, task in TASKS.items()}
-        ids = [check_env(name) for name in args.env] or sorted(
-            (env_id for env_id, problem in known.items() if problem),
-            key=lambda env_id: bool(known[env_id].relaxed),
-        )
+        able = [env_id for env_id, problem in known.items() if problem or TASKS[env_id].plans is not None]
+        last = {env_id for env_id in able if known[env_id] and known[env_id].relaxed}
+        ids = [check_env(name) for name in args.env] or sorted(able, key=last.__contains__)
         for env_id in dict.fromkeys(ids):
             work(env_id, args)
     except (UserError, CacheError, OSError) as error:
@@ -560,7 +571,14 @@ def _interrupt(number: int, frame: Any) -> None:
 
 
 def work(env_id: str, args: argparse.Namespace) -> None:
-    """Compute, write and draw one environment's optimum."""
+    """Compute, write and draw one environment's optimum; plan where there is no grid to compute it on."""
+    if TASKS[env_id].plans is not None:
+        from agents import plans, scale  # they play what is found here
+
+        plans.find(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
+        if not args.quick:
+            scale.main([env_id, "--batches", "1", "--output", str(FILE)])
+        return
     results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
     result = compute(env_id, args.folder, quick=args.quick, new=args.new)
     write(results / f"{env_id}.json", json.dumps(result, indent=2, ensure_ascii=False) + "\n")

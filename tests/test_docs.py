@@ -34,6 +34,7 @@ from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.measured import measured
 from tools.docs import environments, pictures
 from tools.docs.__main__ import generated as from_records
+from tools.docs.equations import symbol
 
 ROOT = Path(__file__).parents[1]
 each_id = pytest.mark.parametrize("env_id", covering())
@@ -158,31 +159,47 @@ def test_argument_table(env_id, page):
     assert again.limit == task.limit
 
 
+def as_python(latex):
+    """Return a formula of the page as Python: with stars in products, theta_1 for theta_{1}, _dot for a dot."""
+    for pattern, text in (
+        (r"\\(d+)ot\{\\?(\w+)\}(?:_\{(\d)\})?", lambda m: "_".join(filter(None, (m[2], m[3], f"{m[1]}ot")))),
+        (r"\\mathrm\{(\w+)\}", r"\1"),
+        (r"_\{(\d)\}", r"_\1"),
+        (r"\\(?=theta|phi|psi|sin|cos)", ""),
+        (r"(sin|cos)\^\{2\} ?\{(.*?)\}", r"\1(\2)**2"),
+        (r"\^\{2\}", "**2"),
+        (r"(sin|cos) ?\{(.*?)\}", r"\1(\2)"),
+        (r"(?<=[\w)]) (?=[\w(])", " * "),
+    ):
+        latex = re.sub(pattern, text, latex)
+    return latex
+
+
 @each_id
 def test_equations(env_id, page):
-    """The formula with numbers is the scene's acceleration."""
+    """The equations hold for the scene's accelerations, and the formula with numbers is the acceleration."""
     scene = make(env_id).scene
-    latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
-    assert len(latex) == 3 and latex[0].startswith(r"\mathcal{L} = ") and latex[1].endswith("= 0")
-    (free,) = scene._layout.free
+    head, *latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
+    free = scene._layout.free
+    assert head.startswith(r"\mathcal{L} = ") and all(one.endswith("= 0") for one in latex[: len(free)])
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
-    found = scene.acceleration(state, 0.7)[free]
+    found = {name: float(value) for name, value in scene.acceleration(state, 0.7).items()}
     values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
     if "w" in values:  # the momentum's speed stands for the place's rate
         values["x_dot"] = values["w"] - scene.radius * values["phi_dot"]
-    stated = latex[2].partition("=")[2]
-    for pattern, text in (
-        (r"\\ddot\{\\?(\w+)\}", r"\1_ddot"),
-        (r"\\dot\{\\?(\w+)\}", r"\1_dot"),
-        (r"\\mathrm\{(\w+)\}", r"\1"),
-        (r"\\(?=theta|phi|psi|sin|cos)", ""),
-        (r"\^\{2\}", "**2"),
-        (r"(sin|cos) \{(\w+)\}", r"\1(\2)"),
-        (r"(?<=[\w)2]) (?=\w)", " * "),
-    ):
-        stated = re.sub(pattern, text, stated)
     values |= {"sin": math.sin, "cos": math.cos, "phi_ddot": 0.0}
-    assert eval(stated, values) == pytest.approx(float(found), rel=1e-4)
+    if len(free) == 1:
+        assert len(latex) == 2
+        stated = eval(as_python(latex[1].partition("=")[2]), values)
+        assert stated == pytest.approx(found[free[0]], rel=1e-4)
+        return
+    assert len(latex) == len(free)
+    letters = {as_python(symbol(type(scene), name)): getattr(scene, name) for name in scene._numbers()}
+    values |= letters | {f"{name}_ddot": value for name, value in found.items()}
+    for one in latex:
+        left = as_python(one.removesuffix("= 0"))
+        assert abs(eval(left, values)) < 1e-12
+        assert abs(eval(left, values | {f"{free[0]}_ddot": 0.0})) > 1e-6
 
 
 @each_id
@@ -209,8 +226,8 @@ def test_certified_speed(env_id, page):
     stated = re.search(r"\|`theta_dot`\| is at most ([\d.]+) rad/s", text)
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
-    if not order:
-        assert stated is None and certified is None
+    if certified is None:  # a closed form, or a series that is certified when the step is known
+        assert stated is None and (not order or scene._form is None)
         return
     assert f"order {order}." in text
     assert stated[1] == f"{math.floor(10.0 * certified) / 10.0:.1f}"
@@ -236,7 +253,7 @@ def test_certified_speed(env_id, page):
 def test_measured_error(env_id):
     """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
-    Here some steps of an episode of random actions; the report's tests take all of them.
+    Where several bars whip, a step makes much of a rounding; it errs by that many times as much. Here some steps of an episode of random actions; the report's tests take all of them.
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
@@ -253,7 +270,9 @@ def test_measured_error(env_id):
             after = scene.simulate(before, [control], env.task.dt)[1]  # without a kick
         exact = flow(scene, before, control, env.task.dt)
         errors = [abs(float(a - b)) / size for a, b, size in zip(exact, after, sizes, strict=True)]
-        assert max(errors) < LARGEST_STEP
+        grown = np.abs(scene.jacobian(before, control, env.task.dt)[0]) * sizes / sizes[:, None]
+        condition = 1.0 if scene._form else max(1.0, grown.sum(axis=1).max())
+        assert max(errors) < LARGEST_STEP * condition
 
 
 def scale(env_id):

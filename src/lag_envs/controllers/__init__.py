@@ -19,8 +19,10 @@ from lag_envs.controllers.basic import Constant, Random, do_nothing
 from lag_envs.controllers.cylinder_in_cylinder import BrakingLine, EnergyPump, TiltLQR, plan_pumping
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.incline import SwitchingLine, TiltCascade, optimal_return
+from lag_envs.controllers.linear import BalanceLQR
 from lag_envs.controllers.pd import PD
-from lag_envs.controllers.pivoted_bar import BalanceLQR, EnergyShapingLQR, lqr, plan_swing_up
+from lag_envs.controllers.pivoted_bar import EnergyShapingLQR, lqr, plan_swing_up
+from lag_envs.controllers.tracking import Tracking
 from lag_envs.errors import hint
 from lag_envs.tasks import TASKS, resolve
 from lag_envs.tasks.record import Controller
@@ -39,6 +41,7 @@ __all__ = [
     "SwitchingLine",
     "TiltCascade",
     "TiltLQR",
+    "Tracking",
     "build",
     "controllers",
     "do_nothing",

@@ -64,6 +64,14 @@ class Feedback:
         return np.clip(observation @ self.gain.T, -1.0, 1.0).astype(np.float32), state
 
 
+def feedback(task: Task, **gains: float) -> Feedback:
+    """Return linear feedback for a task with one control; gains by the observation's entries."""
+    for name in gains:
+        if name not in task.observation:
+            raise ValueError(f"there is no observation {name!r}, only {', '.join(task.observation)}")
+    return Feedback(task, gain=[[gains.get(name, 0.0) for name in task.observation]])
+
+
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
     """Return the agent of zero control: where the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lag_envs.controllers.basic import Array
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import regulator
-from lag_envs.controllers.tracking import hold, recorded
+from lag_envs.controllers.tracking import Tracking, hold, recorded
 from lag_envs.tasks.chain import SwingUp
 
 
@@ -45,8 +45,8 @@ def easier(
             return wanted
 
         def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-            a = control.s_ddot * (1.0 / self.largest)
-            stop = after.s + after.s_dot * xp.abs(after.s_dot) * (0.5 / self.largest)
+            a = control.s_ddot * (1.0 / task.largest)
+            stop = after.s + after.s_dot * xp.abs(after.s_dot) * (0.5 / task.largest)
             over = xp.maximum(xp.abs(stop) * (1.0 / self.length) - edge, 0.0)
             height = self.height(after, xp)
             return 0.1 * (height * height) - effort * (a * a) - 300.0 * (over * over)
@@ -61,24 +61,31 @@ def easier(
     return Easier(dt=task.dt, duration=task.duration, **parameters), end
 
 
-def replan(task: SwingUp, *, steps: float = 1.6) -> ILQR:
-    """Return an iLQR that plans each episode anew, from the recorded plan and its mirror image.
+def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:
+    """Return an iLQR that plans each episode anew.
+
+    It begins from what two recorded plans and their mirror images would do: the one that is followed from any
+    start, and a quick one that leaves nothing for corrections.
 
     Parameters
     ----------
     task : SwingUp
         The task, ``env.unwrapped.task``.
-    steps : float
-        How far to plan, in lengths of the recorded plan.
+    guesses : sequence of Tracking, optional
+        What to begin from in place of that.
+    beyond : float
+        How far to plan, in lengths of the longest of them.
     """
-    follow = recorded(task)
-    rest = np.array(task.plans.rest)
+    if not guesses:
+        own = [recorded(task), recorded(task, "quick")]
+        guesses = [one for plan in own for one in (plan, plan.mirrored())]
+    read, rest = guesses[0].read, np.array(task.plans.rest)
     # The reward does not mind where on the track the bars stand; something has to call the support back.
     _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
 
     def lost(states: Array) -> Array:
-        off = follow.read.difference(states, rest)
+        off = read.difference(states, rest)
         return np.einsum("...i,ij,...j->...", off, cost, off)
 
-    ahead = round(steps * len(follow.actions))
-    return ILQR(task, [follow, follow.mirrored()], after=hold(task), tail=lost, steps=ahead)
+    ahead = round(beyond * max(len(plan.actions) for plan in guesses))
+    return ILQR(task, guesses, after=hold(task), tail=lost, steps=ahead)

@@ -100,7 +100,7 @@ class ILQR:
                 fresh |= np.asarray(episode_start, np.bool_).reshape(n)
         plan = self._blank(n) if state is None else state
         if fresh.any():
-            new = self.plan(x[fresh], target[fresh])
+            new, _ = self.plan(x[fresh], target[fresh])
             plan = plan._replace(**{name: getattr(plan, name).copy() for name in plan._fields[:4]})
             for name in ("states", "actions", "gains"):
                 getattr(plan, name)[fresh] = getattr(new, name)
@@ -121,8 +121,8 @@ class ILQR:
 
     # --- planning ------------------------------------------------------------------------------------------
 
-    def plan(self, starts: Array, targets: Array) -> Plan:
-        """Return the best plan for each start (n, n_state) and target (n,)."""
+    def plan(self, starts: Array, targets: Array) -> tuple[Plan, Array]:
+        """Return the best plan for each start (n, n_state) and target (n,), and what `improve` says of it."""
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)
         for guess in self.guesses:
@@ -136,7 +136,7 @@ class ILQR:
                 getattr(best, name)[better] = getattr(plan, name)[better]
             most = np.maximum(most, returns)
         assert best is not None
-        return best
+        return best, most
 
     def _step(self, x: Array, actions: Array, targets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Step the model for arrays of any leading shape."""

@@ -14,6 +14,7 @@ import sympy
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from lag_envs.controllers.basic import FeedbackController
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
 
@@ -130,3 +131,31 @@ def time_varying(
         gains[t], closed = k[0], a - b @ k
         p = q + k.T @ r @ k + closed.T @ p @ closed
     return gains, hold
+
+
+class BalanceLQR(FeedbackController):
+    """Keep what moves on a support upright by a linear-quadratic regulator, in spite of kicks.
+
+    The reward alone would have the control as hard as can be; what is added has the regulator ready for
+    the next kick. The weights are what ``python -m agents.tune`` finds.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``; its examples tell the upright rest.
+    effort : float
+        Weight of (u/U)².
+    slide, turn : float
+        Weights of s'² [s²/m²] and of the angles' rates squared [s²].
+    """
+
+    def __init__(self, task: Task, *, effort: float = 0.03, slide: float = 0.67, turn: float = 1.04) -> None:
+        super().__init__(task)
+        self.rest = np.array(task.examples.rest)
+        rates = {f"{name}_dot": turn for name in task.scene._layout.free}
+        extra = {"u": effort / task.limit_control**2, "s_dot": slide, **rates}
+        self.gain, self.cost = regulator(task, self.rest, extra=extra)
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return the support's acceleration."""
+        return -(state - self.rest) @ self.gain

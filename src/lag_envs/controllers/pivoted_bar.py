@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lag_envs.controllers.basic import Array, FeedbackController, ObservationDecoder, as_actions
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
 from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
-from lag_envs.tasks.pivoted_bar import Balance, SwingUp
+from lag_envs.tasks.pivoted_bar import SwingUp
 
 #: What upright is, behind the support's place and speed, if those are states.
 UPRIGHT = (0.0, 0.0, math.pi, 0.0)
@@ -95,34 +95,6 @@ class EnergyShapingLQR:
         if self.task.has_track:
             u -= self.centring * x[..., 0] + 2.0 * math.sqrt(self.centring) * x[..., 1]
         return u
-
-
-class BalanceLQR(FeedbackController):
-    """Keep a bar upright by a linear-quadratic regulator.
-
-    The reward alone would have the control as hard as can be; what is added has the regulator ready for
-    the next kick. The weights are what ``python -m agents.tune`` found.
-
-    Parameters
-    ----------
-    task : Balance
-        The task, ``env.unwrapped.task``.
-    effort : float
-        Weight of (u/U)².
-    slide, turn : float
-        Weights of s'² [s²/m²] and of θ'² [s²].
-    """
-
-    def __init__(
-        self, task: Balance, *, effort: float = 0.03, slide: float = 0.67, turn: float = 1.04
-    ) -> None:
-        super().__init__(task)
-        extra = {"u": effort / task.limit_control**2, "s_dot": slide, "theta_dot": turn}
-        self.gain, self.cost = regulator(task, UPRIGHT, extra=extra)
-
-    def control(self, state: Array, target: Array) -> Array:
-        """Return the support's acceleration."""
-        return -(state - UPRIGHT) @ self.gain
 
 
 def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16) -> ILQR:

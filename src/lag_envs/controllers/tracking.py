@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +111,14 @@ class Tracking(Clocked):
         return np.append(self.actions, 0.0)[step] - np.einsum("ij,ij->i", gains, off)
 
 
-def recorded(task: Task) -> Tracking:
+def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
+    """Return where a task's plan is kept: the one to follow, or the "quick" one to begin planning from."""
+    return (folder or FOLDER) / f"{task.id}-{kind}.npz"
+
+
+def recorded(task: Task, kind: str = "followed") -> Tracking:
     """Return the controller that follows the plan that was recorded for a task's id."""
-    return Tracking.load(task, FOLDER / f"{task.id}.npz")
+    return Tracking.load(task, file_of(task, kind))
 
 
 def hold(task: Task) -> Tracking:
@@ -135,7 +140,7 @@ def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
     return np.clip(np.sum(size * np.sin(turn + phase), axis=0), -1.0, 1.0)
 
 
-def search(task: Task, seed: int = 0, start: Sequence[float] | None = None) -> Iterator[Tracking]:
+def search(task: Task, seed: int = 0, **changes: Any) -> Iterator[Tracking]:
     """Plan from random guesses at once, by iLQR on an easier task, and yield what follows each plan.
 
     The most promising plan comes first.
@@ -146,15 +151,16 @@ def search(task: Task, seed: int = 0, start: Sequence[float] | None = None) -> I
         The task; its `plans` say how.
     seed : int
         Seed of the guesses.
-    start : sequence of float, optional
-        Where the plans start; the centre of the task's starts by default.
+    **changes
+        What is different, see `Plans.quick`.
     """
     plans: Plans = task.plans
-    easier, tail = resolve(plans.place)(task, **plans.numbers)
-    planner = ILQR(easier, [], tail=tail, steps=plans.steps, iterations=plans.iterations)
-    guesses = waves(np.random.default_rng(seed), plans.batch, plans.steps, task.dt)
-    starts = np.tile(np.asarray(task.centre if start is None else start, np.float64), (plans.batch, 1))
-    found, values = planner.improve(starts, np.zeros(plans.batch), guesses)
+    size = {name: changes.pop(name, getattr(plans, name)) for name in ("steps", "batch", "iterations")}
+    easier, tail = resolve(plans.place)(task, **(dict(plans.numbers) | changes))
+    planner = ILQR(easier, [], tail=tail, steps=size["steps"], iterations=size["iterations"])
+    guesses = waves(np.random.default_rng(seed), size["batch"], size["steps"], task.dt)
+    starts = np.tile(np.asarray(task.centre, np.float64), (len(guesses), 1))
+    found, values = planner.improve(starts, np.zeros(len(guesses)), guesses)
     shares: Any = easier.limit_control / task.limit_control
     for i in np.argsort(-values):
         states = task.scene.simulate(starts[i], easier.wanted(found.actions[i])[:, 0], task.dt)

@@ -9,7 +9,7 @@ from typing import Any
 from lag_envs.scenes import Chain
 from lag_envs.scenes.shapes import Bodies, Polygon
 from lag_envs.tasks.base import FASTEST_START
-from lag_envs.tasks.record import Examples, Goal, Plans
+from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
@@ -134,6 +134,11 @@ class SwingUp(GuardedTrack, _Chain):
         "good",
         arrival="upright",
     )
+    controllers = {
+        "LQR": Controller("lag_envs.controllers.tracking:hold"),
+        "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
+        "iLQR": Controller("lag_envs.controllers.chain:replan", plans=True),
+    }
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0]},
         moving=[0.1, -0.2, 2.0, 12.0, 2.5, -20.0],
@@ -156,7 +161,7 @@ Best known is planning anew for each start. One recorded plan with time-varying 
 for all starts are near to each other.
 """
 
-    steps_of_plan, batch, iterations, price, share = 75, 32, 120, 0.05, 0.9
+    steps_of_plan, steps_of_quick, batch, iterations, price, share = 65, 68, 32, 120, 0.05, 0.95
 
     @property
     def plans(self) -> Plans:
@@ -168,6 +173,7 @@ for all starts are near to each other.
             "lag_envs.controllers.chain:easier",
             {"effort": self.price, "share": self.share},
             steps=self.steps_of_plan,
+            quick={"steps": self.steps_of_quick, "batch": 64, "share": 1.0, "edge": 0.97, "effort": 0.02},
             batch=self.batch,
             iterations=self.iterations,
             rest=(0.0, 0.0, *(math.pi, 0.0) * self.scene.bars),
@@ -228,7 +234,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     id = "DoubleBarWeak-v0"
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
-    steps_of_plan = 115
+    steps_of_plan, steps_of_quick, share = 115, 108, 0.9
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -241,7 +247,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     id = "TripleBar-v0"
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
-    steps_of_plan, batch, iterations, price, share = 150, 28, 180, 0.02, 0.85
+    steps_of_plan, steps_of_quick, batch, iterations, price, share = 150, 140, 28, 180, 0.02, 0.85
 
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0, 1.0, 2.0]},
@@ -329,6 +335,33 @@ class Balance(_Chain):
     goal = Goal(
         "success: neither a bar nor the support leaves its limits in 10 s; there is no time", None, None
     )
+    reference = "linear feedback"
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.linear:BalanceLQR",
+            {"effort": 5.71, "slide": 0.016, "turn": 0.23},
+            tune={"effort": (0.1, 30.0), "slide": (0.0, 5.0), "turn": (0.0, 20.0)},
+        ),
+        "linear feedback": Controller(
+            "lag_envs.controllers.basic:feedback",
+            {
+                "s": -1.48,
+                "s_dot": -0.71,
+                "e_1": -28.2,
+                "e_2": 35.2,
+                "theta_1_dot": -0.985,
+                "theta_2_dot": 2.67,
+            },
+            tune={
+                "s": (-3.0, 0.0),
+                "s_dot": (-3.0, 0.0),
+                "e_1": (-40.0, 0.0),
+                "e_2": (0.0, 40.0),
+                "theta_1_dot": (-4.0, 2.0),
+                "theta_2_dot": (0.0, 6.0),
+            },
+        ),
+    }
     examples = Examples(
         start={"state": [0.1, -0.2, 3.0, 0.5, 3.2, -0.5]},
         refused=[

@@ -320,7 +320,7 @@ class Balance(_Bar):
     reference = "LQR"
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.pivoted_bar:BalanceLQR",
+            "lag_envs.controllers.linear:BalanceLQR",
             tune={"effort": (1e-3, 0.1), "slide": (0.05, 2.0), "turn": (0.05, 2.0)},
         )
     }

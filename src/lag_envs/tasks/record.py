@@ -68,7 +68,10 @@ class Plans:
     numbers : mapping
         Its keyword arguments.
     steps : int
-        Steps of a plan.
+        Steps of a plan that is followed.
+    quick : mapping
+        What is different for a plan that is not followed, but that each episode's own plan begins from: other
+        `numbers`, ``steps``, ``batch`` or ``iterations``.
     batch : int
         Guesses that are improved at once.
     iterations : int
@@ -84,6 +87,7 @@ class Plans:
     place: str
     numbers: Mapping[str, Any]
     steps: int
+    quick: Mapping[str, Any]
     batch: int
     iterations: int
     rest: Sequence[float]

@@ -1,0 +1,57 @@
+"""Plans for tasks that no grid can solve: found from random guesses, and chosen by what they get.
+
+``python -m agents.optimum`` calls this for tasks that have `Task.plans`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lag_envs import TASKS
+from lag_envs.controllers.chain import replan
+from lag_envs.controllers.tracking import Tracking, file_of, search
+from lag_envs.evaluation.rollout import Rollout, play
+from lag_envs.evaluation.statistics import mean_and_error
+
+#: Seeds of the guesses, and how many plans from each are tried: the most promising ones.
+SEEDS, PROMISING = range(3), 6
+#: Seeds of nobody else's episodes, and how many of them decide which plan is kept.
+FIRST_SEED, EPISODES = 3_500_000_000, 200
+#: Starts that decide which plan is the best to begin planning from.
+STARTS = 8
+
+
+def candidates(env_id: str, seeds: Iterable[int], **changes: Any) -> Iterable[Tracking]:
+    """Yield the most promising plans from each seed, as what follows them."""
+    for seed in seeds:
+        yield from islice(search(TASKS[env_id](), seed, **changes), PROMISING)
+
+
+def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) -> None:
+    """Find an environment's plans, and write them where controllers read them, or into a folder.
+
+    One is for following from any start, and the one with the best mean over fresh starts is kept. The other
+    is the best to begin from where each episode is planned anew.
+    """
+    task, began = TASKS[env_id](), time.monotonic()
+    found = []
+    for agent in candidates(env_id, seeds):
+        mean, error = mean_and_error(play(env_id, agent, range(FIRST_SEED, FIRST_SEED + EPISODES)))
+        found.append((mean, error, agent))
+    mean, error, best = max(found, key=lambda entry: entry[0])
+    best.save(file_of(task, folder=folder))
+    seconds = time.monotonic() - began
+    print(f"{env_id}: followed, {mean:.2f} ± {error:.2f} in {EPISODES} episodes, {seconds:.0f} s", flush=True)
+
+    starts = Rollout(env_id, None, range(FIRST_SEED, FIRST_SEED + STARTS)).state
+    guesses = [best, *candidates(env_id, seeds, **task.plans.quick)]
+    gains = [replan(task, guesses=[agent]).plan(starts, np.zeros(STARTS))[1].mean() for agent in guesses]
+    guesses[int(np.argmax(gains))].save(file_of(task, "quick", folder))
+    seconds = time.monotonic() - began
+    print(f"{env_id}: best of {len(guesses)} plans to begin planning from, {seconds:.0f} s", flush=True)
