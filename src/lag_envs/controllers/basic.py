@@ -53,7 +53,7 @@ class Feedback:
     """
 
     def __init__(self, task: Task, *, gain: ArrayLike) -> None:
-        self.gain = np.atleast_2d(np.asarray(gain, np.float64))
+        self.gain, self.largest = np.atleast_2d(np.asarray(gain, np.float64)), task.formulas.largest
         if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
             raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
 
@@ -61,7 +61,7 @@ class Feedback:
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action, for each observation."""
-        return np.clip(observation @ self.gain.T, -1.0, 1.0).astype(np.float32), state
+        return np.clip(observation @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
@@ -83,7 +83,7 @@ class Choice:
 
     def __init__(self, task: Task, rng: np.random.Generator | None = None) -> None:
         self.task, self.rng = task, rng
-        self.shape = Actions(task.formulas.actions, task.formulas.choices).shape
+        self.shape = Actions(task.formulas).shape
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -105,24 +105,26 @@ class Random:
         Seed of the actions.
     count : int
         How many controls an action has.
+    largest : float
+        The largest action.
     """
 
-    def __init__(self, seed: int, count: int = 1) -> None:
-        self.rng, self.count = np.random.default_rng(seed), count
+    def __init__(self, seed: int, count: int = 1, largest: float = 1.0) -> None:
+        self.rng, self.count, self.largest = np.random.default_rng(seed), count, largest
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return an action for each observation."""
         shape = (*np.shape(observation)[:-1], self.count)
-        return self.rng.uniform(-1.0, 1.0, shape).astype(np.float32), state
+        return self.rng.uniform(-self.largest, self.largest, shape).astype(np.float32), state
 
 
 def at_random(task: Task, seed: int = 0) -> Random | Choice:
     """Return the agent of random actions."""
     if task.formulas.choices:
         return Choice(task, np.random.default_rng(seed))
-    return Random(seed, task.formulas.actions)
+    return Random(seed, task.formulas.actions, task.formulas.largest)
 
 
 class FeedbackController(ABC):
@@ -142,18 +144,39 @@ class FeedbackController(ABC):
 
     @abstractmethod
     def control(self, state: Array, target: Array) -> Array:
-        """Return the control [SI unit] for states (..., n_state) and targets (...)."""
+        """Return controls [SI units] for states (..., n_state) and targets (...): see `actions_for`."""
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], Any]:
+    ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
-        return as_actions(self.task.formulas.action(self.control(*self.read(observation)))), state
+        return actions_for(self.task, self.control(*self.read(observation))), state
 
 
-def as_actions(values: Array) -> NDArray[np.float32]:
-    """Return numbers (...) as actions (..., 1) in [-1, 1]."""
-    return np.clip(values, -1.0, 1.0)[..., None].astype(np.float32)
+def actions_for(task: Task, controls: Array) -> NDArray:
+    """Return the actions that ask for controls, or for the nearest to them that there are.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    controls : ndarray, shape (...) or (..., n_actions)
+        The controls that actions set [SI units]: without a last axis where there is one only.
+    """
+    formulas = task.formulas
+    if formulas.choices:
+        (acting,) = formulas.acting
+        return np.abs(controls[..., None] - np.array(acting.values)).argmin(axis=-1)
+    if formulas.actions == 1:
+        return as_actions(formulas.action(controls), formulas.largest)
+    low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
+    shares = 2.0 * (controls - low) / (high - low) - 1.0
+    return (formulas.largest * np.clip(shares, -1.0, 1.0)).astype(np.float32)
+
+
+def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:
+    """Return numbers (...) as actions (..., 1), none of them beyond the largest."""
+    return np.clip(values, -largest, largest)[..., None].astype(np.float32)
 
 
 class ObservationDecoder:
