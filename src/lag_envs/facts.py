@@ -69,7 +69,9 @@ def _controls(task: Task) -> list[tuple[str, ...]]:
             given = f"{', '.join(f'{v:g}' for v in acting.values)} {unit}"
             rows.append((acting.control, given, f"actions 0 to {len(acting.values) - 1}"))
         else:
-            rows.append((acting.control, f"{acting.low:g} to {acting.high:g} {unit}", f"actions {-top:g} to {top:g}"))
+            rows.append(
+                (acting.control, f"{acting.low:g} to {acting.high:g} {unit}", f"actions {-top:g} to {top:g}")
+            )
     return rows + [(name, f"0 {unit}", "no action sets it") for name, unit in units.items()]
 
 

@@ -177,7 +177,12 @@ def _actions(task: Task) -> str:
         rows.append([str(i), f"`{acting.control}`", units[acting.control], *values])
     top = task.formulas.largest
     listed = any(acting.values for acting in task.formulas.acting)
-    head = ["Num", "Control", "Unit", *(("Values, by action", "") if listed else (f"At {number(-top)}", f"At {number(top)}"))]
+    head = [
+        "Num",
+        "Control",
+        "Unit",
+        *(("Values, by action", "") if listed else (f"At {number(-top)}", f"At {number(top)}")),
+    ]
     return table(head, rows)
 
 

@@ -183,18 +183,16 @@ class ObservationDecoder:
     """Reads states and targets from observations.
 
     What a task observes is linear in the state, in cosine and sine of its angles, and in the target; so it is
-    inverted from the values at zero and at the unit vectors.
+    inverted from the values at zero and at the unit vectors, or shorter ones where an entry is clipped.
 
     Parameters
     ----------
     task : Task
-        The task, with one target at most.
+        The task.
     """
 
     def __init__(self, task: Task) -> None:
         formulas, form = task.formulas, task.scene._form
-        if formulas.targets > 1:
-            raise ValueError(f"{type(task).__name__} has {formulas.targets} targets; one at most can be read")
         k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
         entries = enumerate(task.scene._layout.state)
@@ -208,11 +206,18 @@ class ObservationDecoder:
             known = [(state[i], *circle) for i, circle in zip(angles, circles, strict=True)]
             if form is not None and form.angle is not None:
                 state += circles[angles.index(form.angle)].tolist()
-            return formulas.observe(Lifted(np, known), state, [row[-1]] * formulas.targets, k)
+            return formulas.observe(Lifted(np, known), state, list(row[self._width :][: formulas.targets]), k)
 
-        rows = np.vstack([np.zeros(self._width + 1), np.eye(self._width + 1)])
-        values = np.array([seen(row) for row in rows])
-        self._zero, slopes = values[0], values[1:] - values[0]
+        width = self._width + max(formulas.targets, 1)
+        self._zero = np.array(seen(np.zeros(width)))
+
+        def risen(size: float) -> NDArray[np.float64]:
+            return np.array([seen(row) for row in size * np.eye(width)]) - self._zero
+
+        size = 1.0
+        while not np.allclose(risen(size), 2.0 * risen(0.5 * size)):
+            size *= 0.5
+        slopes = risen(size) / size
         self._inverse = np.linalg.pinv(slopes)
         #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
@@ -220,7 +225,10 @@ class ObservationDecoder:
         self.wrapped = [i for i, _ in self._pairs]
 
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
-        """Return states (..., n_state) and targets (...) for observations (..., n)."""
+        """Return states (..., n_state) and targets for observations (..., n).
+
+        Targets have the shape (...), being 0 where there are none, or (..., n_targets) where there are more.
+        """
         values = np.asarray(observation, np.float64)
         if values.shape[-1:] != self._zero.shape:
             raise ValueError(
@@ -231,7 +239,8 @@ class ObservationDecoder:
         state = lifted[..., : self._n].copy()
         for i, j in self._pairs:
             state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])
-        return state, lifted[..., self._width]
+        targets = lifted[..., self._width :]
+        return state, targets[..., 0] if targets.shape[-1] == 1 else targets
 
     def difference(self, states: Array, others: Array) -> Array:
         """Return states (..., n_state) minus others, the shorter way around where only that is seen."""

@@ -127,7 +127,7 @@ class Model:
 
         The motion's derivatives are those of the scene's control step. Guard and reward have kinks, of which
         a planner should see as much as lies within reach: their formulas are expanded by central differences
-        of `REACH`, along the motion so linearised. That actions outside their space are clipped is left aside.
+        of `REACH`, along the motion so linearised. That actions beyond their space are clipped is left out.
 
         Parameters
         ----------

@@ -13,9 +13,9 @@ With l₁ from shoulder to elbow, centres of mass at c₁ and c₂ along the lin
     T = (m₁ c₁² + I₁ + m₂ l₁²) theta_1'²/2 + (m₂ c₂² + I₂) w²/2 + m₂ l₁ c₂ theta_1' w cos(theta_2)
     V = -(m₁ c₁ + m₂ l₁) g cos(theta_1) - m₂ c₂ g cos(theta_1 + theta_2)
 
-Friction in each joint is b v + c atan(100 v): viscous, and a rounded step that stands for dry friction. Motors
-with rotors of inertia J behind gears of ratio n, the elbow's being carried by the first link, add
-J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2.
+Friction in each joint is b v + c atan(100 v): viscous, and a rounded step that stands for dry friction.
+Motors with rotors of inertia J behind gears of ratio n, the elbow's being carried by the first link, add
+J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2 to T.
 """
 
 from __future__ import annotations

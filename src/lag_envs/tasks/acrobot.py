@@ -41,7 +41,7 @@ _ANGLES = {
 
 
 class AcrobotExact(Task):
-    """Lift the tip of two links above a line by a torque at the elbow: Gymnasium's Acrobot-v1, stepped exactly.
+    """Lift the tip of two links above a line by the elbow's motor: Gymnasium's Acrobot-v1, stepped exactly.
 
     ## Description
 
@@ -119,7 +119,7 @@ class AcrobotExact(Task):
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.1)
     fastest_seen = {"theta_1_dot": 4.0 * math.pi, "theta_2_dot": 9.0 * math.pi}  # [rad/s]
 
-    controllers = {"pump": Controller("lag_envs.controllers.energy:Pump")}
+    controllers = {"pump": Controller("lag_envs.controllers.energy:Pump", {"rate": "theta_2_dot"})}
     reference = "pump"
     hyperparameters = {"ppo": {"gamma": 0.99}}
     examples = Examples(
@@ -164,8 +164,9 @@ class AcrobotReal(Task):
 
     Parameters, torque limit, control interval, length of an episode and criterion of success are those of the
     project's published leaderboards [1]_: `design_C.1`, `model_1.0`, 6 N m, 0.002 s and 10 s. Its simulations
-    leave friction and rotors out, its machine has them; both are in here. Set `damping`, `damping_2`,
-    `dry_friction`, `dry_friction_2` and `rotor_inertia` to 0 for the simulated one.
+    leave friction and rotors out, its machine has them; so has this one. The driven joint's friction is that
+    which was identified. The idle joint's is 0, for on the machine the idle motor compensates it: it may give
+    0.5 N m for that, and friction takes half as much at most.
 
     .. [1] F. Wiebe et al., "Open Source Dual-Purpose Acrobot and Pendubot Platform", IEEE Robotics &
        Automation Magazine 31 (2024); github.com/dfki-ric-underactuated-lab/double_pendulum, folders
@@ -196,7 +197,9 @@ class AcrobotReal(Task):
     ## Arguments
 
     Any combination of values in these ranges is allowed. Anything else is an error that names the value.
-    Inertias are about the centres of mass, those of the project's files about the joints.
+    Inertias are about the centres of mass, those of the project's files about the joints. The shoulder's
+    identified friction is `damping=0.001` and `dry_friction=0.16`, the elbow's `damping_2=0.001` and
+    `dry_friction_2=0.12`; with `rotor_inertia=0` and without any friction it is the project's simulation.
 
     ## Equations
 
@@ -237,9 +240,9 @@ class AcrobotReal(Task):
         "com_distance_2": 0.25569305436052964,
         "inertia_1": 0.031887199591513114 - 0.5234602302310271 * 0.2**2,
         "inertia_2": 0.05086984812807257 - 0.6255677234174437 * 0.25569305436052964**2,
-        "damping": 0.001,
+        "damping": 0.0,
         "damping_2": 0.001,
-        "dry_friction": 0.16,
+        "dry_friction": 0.0,
         "dry_friction_2": 0.12,
         "rotor_inertia": 6.287203962819607e-05,
         "gear_ratio": 6.0,
@@ -257,7 +260,9 @@ class AcrobotReal(Task):
         arrival="up",
     )
     controllers = {
-        "LQR": Controller("lag_envs.controllers.energy:PublishedLQR", {"robot": "acrobot"}),
+        "LQR": Controller(
+            "lag_envs.controllers.energy:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
+        ),
     }
     hyperparameters = {"ppo": {"gamma": 0.999}}
     examples = Examples(
@@ -271,8 +276,8 @@ class AcrobotReal(Task):
         "and 500 decisions a second leave little time for each."
     )
     note = (
-        "The LQR is that of the project's leaderboard. It holds the links where it finds them upright; hanging "
-        "links it leaves alone."
+        "The LQR is that of the project's leaderboard. It holds the links where it finds them upright; "
+        "hanging links it leaves alone."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -295,7 +300,7 @@ class AcrobotReal(Task):
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return 0.02 h⁴ (1 - 0.1 a²)."""
         height = 0.5 + 0.5 * self.tip(after, xp)
-        effort = sum(u * u for u in control) * (1.0 / self.limit_control**2)
+        effort = sum((control[name] * (1.0 / most)) ** 2 for name, most in self.action.items())
         return 0.02 * height**4 * (1.0 - 0.1 * effort)
 
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
@@ -310,8 +315,18 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of bot
         .replace("only the elbow driven", "only the shoulder driven")
     )
     id = "PendubotReal-v0"
-    defaults = {**AcrobotReal.defaults, "control": "shoulder"}
+    defaults = {
+        **AcrobotReal.defaults,
+        "control": "shoulder",
+        "damping": 0.001,
+        "damping_2": 0.0,
+        "dry_friction": 0.16,
+        "dry_friction_2": 0.0,
+    }
     action = {"shoulder_torque": 6.0}
     controllers = {
-        "LQR": Controller("lag_envs.controllers.energy:PublishedLQR", {"robot": "pendubot"}),
+        "LQR": Controller(
+            "lag_envs.controllers.energy:PublishedLQR",
+            {"weights": (0.00125, 0.65, 0.000688, 0.000936), "effort": 25.0},
+        ),
     }

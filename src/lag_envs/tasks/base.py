@@ -443,7 +443,7 @@ class Task:
     def wanted(self, actions: ArrayLike) -> NDArray[np.float64]:
         """Return the controls that actions (n,) or (n, n_actions) ask for, shape (n, n_controls)."""
         columns = np.reshape(np.asarray(actions, np.float64), (-1, len(self.formulas.acting))).T
-        columns = np.asarray(self.formulas.shares(columns))
+        columns = np.asarray(self.formulas.shares([*columns]))
         names, found = self.scene.control_names, np.zeros((columns.shape[-1], len(self.scene.control_names)))
         for acting, numbers in zip(self.formulas.acting, columns, strict=True):
             found[:, names.index(acting.control)] = _control(acting, numbers, np)
@@ -572,7 +572,8 @@ class TaskFormulas:
         self.largest = float(task.largest_action)
         if not 0.0 < self.largest < math.inf:
             raise FormulaError(
-                f"{type(task).__name__}.largest_action must be above 0 and finite, got {task.largest_action!r}"
+                f"{type(task).__name__}.largest_action must be above 0 and finite, "
+                f"got {task.largest_action!r}"
             )
         self.target_boxes = _target_boxes(task)
         self.targets = len(self.target_boxes)

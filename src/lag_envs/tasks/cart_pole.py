@@ -125,7 +125,7 @@ class CartPoleExact(_OnTrack):
 
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.linear:Regulator",
+            "lag_envs.controllers.energy:Regulator",
             {"weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1}, "effort": 0.01},
         )
     }
@@ -235,7 +235,7 @@ class CartPoleContinuous(_OnTrack):
     goal = Goal("success: not fallen, and on the track", hold=None, arrival="")
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.linear:Regulator",
+            "lag_envs.controllers.energy:Regulator",
             {"weights": {"x": 0.1, "x_dot": 0.02, "theta": 20.0, "theta_dot": 0.02}, "effort": 0.001},
             tune={"effort": (1e-4, 1.0)},
         )
@@ -355,7 +355,22 @@ class CartPoleSwingUp(_OnTrack):
         "success: within 0.2 rad of upright throughout the last second; time: until it is so for good",
         arrival="upright",
     )
-    controllers = {"energy shaping + LQR": Controller("lag_envs.controllers.energy:CartPoleEnergyLQR")}
+    controllers = {
+        "energy shaping + LQR": Controller(
+            "lag_envs.controllers.energy:PivotEnergyLQR",
+            {
+                "pivot": "x",
+                "angle": "theta",
+                "pump": 8.0,
+                "centring": 2.0,
+                "catch": 10.0,
+                "lose": 60.0,
+                "weights": {"x": 0.1, "x_dot": 0.01, "theta": 1.0, "theta_dot": 0.01},
+                "effort": 0.1,
+            },
+            tune={"pump": (1.0, 30.0), "centring": (0.2, 10.0), "catch": (1.0, 60.0), "lose": (10.0, 300.0)},
+        )
+    }
     hyperparameters = {"ppo": {"gamma": 0.99}}
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},
