@@ -107,12 +107,21 @@ def test_headings(env_id, page):
 def test_action_table(env_id, page):
     """The controls at both ends of the action are those that a step applies."""
     env = make(env_id)
-    ((name, row),) = rows(page, "Action Space", "Control").items()
-    for column, action in (("At -1", -1.0), ("At 1", 1.0)):
+    found, space = rows(page, "Action Space", "Control"), env.action_space
+    assert tuple(found) == tuple(env.task.action)
+    assert {row["Unit"] for row in found.values()} <= set(env.scene.control_units)
+    if env.task.formulas.choices:
+        (text,) = (row["Values, by action"] for row in found.values())
+        columns = [[float(value)] for value in text.split(", ")]
+        actions = [space.dtype.type(i) for i in range(space.n)]
+    else:
+        top = f"{env.task.largest_action:g}"
+        columns = [[float(row[f"At {sign}{top}"]) for row in found.values()] for sign in ("-", "")]
+        actions = [space.low, space.high]
+    for action, controls in zip(actions, columns, strict=True):
         env.reset(seed=0, options={"state": env.task.centre})
-        env.step(np.array([action]))
-        assert env.control == float(row[column])
-    assert (name,) == env.scene.control_names and row["Unit"] in env.scene.control_units
+        env.step(action)
+        assert np.atleast_1d(env.control).tolist() == controls
 
 
 @each_id
@@ -123,8 +132,12 @@ def test_observation_table(env_id, page):
     for row, low, high in zip(
         found.values(), env.observation_space.low, env.observation_space.high, strict=True
     ):
-        assert float(row["Min"]) == pytest.approx(low, rel=1e-3)
-        assert float(row["Max"]) == pytest.approx(high, rel=1e-3)
+        for column, bound in (("Min", low), ("Max", high)):
+            none = abs(bound) >= np.finfo(np.float32).max
+            stated = row[column].replace("∞", "inf")
+            assert float(stated) == (
+                math.copysign(math.inf, bound) if none else pytest.approx(bound, rel=1e-3)
+            )
         assert row["Unit"] and row["Meaning"]
 
 
@@ -163,8 +176,12 @@ def test_equations(env_id, page):
     """The formula with numbers is the scene's acceleration."""
     scene = make(env_id).scene
     latex = re.findall(r"application/x-tex\">(.*?)</annotation>", page)
-    assert len(latex) == 3 and latex[0].startswith(r"\mathcal{L} = ") and latex[1].endswith("= 0")
+    assert latex[0].startswith(r"\mathcal{L} = ") and latex[1].endswith("= 0")
+    if len(scene._layout.free) > 1:
+        assert len(latex) == 1 + len(scene._layout.free)
+        return
     (free,) = scene._layout.free
+    assert len(latex) == 3
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
     found = scene.acceleration(state, 0.7)[free]
     values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
@@ -209,7 +226,7 @@ def test_certified_speed(env_id, page):
     stated = re.search(r"\|`theta_dot`\| is at most ([\d.]+) rad/s", text)
     certified = task.certified_speed()
     order = scene.step_bound(task.centre, 0.0, task.dt).order
-    if not order:
+    if not order or scene._form is None:
         assert stated is None and certified is None
         return
     assert f"order {order}." in text
@@ -232,7 +249,7 @@ def test_certified_speed(env_id, page):
     assert max(bound.substeps for bound in bounds(certified * (1.0 + 1e-9))) > 1
 
 
-@each_id
+@pytest.mark.parametrize("env_id", covering(i for i, kind in TASKS.items() if kind().scene._form))
 def test_measured_error(env_id):
     """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 

@@ -3,8 +3,8 @@
 ``python -m tools.double_pendulum CHECKOUT`` needs a checkout of
 github.com/dfki-ric-underactuated-lab/double_pendulum, and SciPy, SymPy and PyYAML. It compares parameters and
 accelerations, and runs the project's own LQR, with its friction compensation, from near upright on both: on
-its simulator, which takes a Runge-Kutta step in each control interval, and on ours. It fails where they differ
-by more than that integrator's error.
+its simulator, which takes a Runge-Kutta step in each control interval, and on ours. It fails where they
+differ by more than that integrator's error.
 """
 
 from __future__ import annotations
@@ -85,8 +85,11 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
     end = np.array(ours)
     our_time = swing(get_swingup_time, np.arange(len(end)) * env.task.dt, end, theirs)
     apart = np.abs(end - path[: len(end)]).max()
-    print(f"  the LQR on both: {apart:.1e} apart at most, up after {their_time:.3f} s there, {our_time:.3f} s here")
-    print(f"  return here {total:.2f}; |off upright| at the end {np.abs(end[-1] - [np.pi, 0, 0, 0]).max():.1e}")
+    print(f"  the LQR on both: {apart:.1e} apart at most")
+    print(f"  up after {their_time:.3f} s there, {our_time:.3f} s here")
+    print(
+        f"  return here {total:.2f}; |off upright| at the end {np.abs(end[-1] - [np.pi, 0, 0, 0]).max():.1e}"
+    )
     return bool(worst < 1e-9 and local < 1e-6 and abs(our_time - their_time) < 0.01)
 
 

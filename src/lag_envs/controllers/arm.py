@@ -81,7 +81,7 @@ class ComputedTorque(Springs):
         Their damping ratio.
     """
 
-    def __init__(self, task: Reach, *, frequency: float = 10.0, damping: float = 1.0) -> None:
+    def __init__(self, task: Reach, *, frequency: float = 16.0, damping: float = 1.0) -> None:
         super().__init__(task)
         self.frequency, self.ratio = frequency, damping
 

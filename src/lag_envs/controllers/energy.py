@@ -273,9 +273,9 @@ class OwnLaw(FeedbackController):
         return self.task.law(_named(self.task, state), np)
 
 
-def value_at_start(task: PendulumRegret, states: Array) -> Array:
-    """Return V of states (n, 2): what no policy exceeds."""
-    return task.value(_named(task, states), np)
+def value_at_start(task: PendulumRegret, *state: Array) -> Array:
+    """Return V of states, given by their entries (n,): what no policy exceeds."""
+    return task.value(_named(task, np.stack(state, axis=-1)), np)
 
 
 def _named(task: Task, states: Array) -> Values:

@@ -126,7 +126,7 @@ class AcrobotExact(Task):
         start={"state": [0.5, -1.0, 0.8, 1.0]},
         moving=[1.0, 3.0, -1.0, 5.0],
         ending=([2.6, 1.0, 0.0, 0.0], 1),
-        batch={"mass_2": [1.0, 0.2, 3.0], "damping": [0.0, 0.1, 1.0]},
+        batch={"mass_2": [1.0, 0.2, 3.0, 1.0, 0.2, 1.0, 3.0], "damping": [0.0, 0.1, 1.0, 0.0, 0.1, 0.0, 1.0]},
     )
     difficulty = "The elbow's torque is far too weak to lift the links, so they have to be swung."
     note = "The pump pushes the elbow the way it turns, which always adds energy; it never plans ahead."
@@ -269,7 +269,10 @@ class AcrobotReal(Task):
         start={"state": [2.8, -1.0, 0.3, 1.0]},
         moving=[1.0, 8.0, -1.0, -9.0],
         rest=[math.pi, 0.0, 0.0, 0.0],
-        batch={"mass_2": [0.6, 0.3, 1.2], "gravity": [9.81, 3.7, 0.0]},
+        batch={
+            "mass_2": [0.6, 0.3, 1.2, 0.6, 0.3, 0.6, 1.2],
+            "gravity": [9.81, 3.7, 0.0, 9.81, 3.7, 9.81, 0.0],
+        },
     )
     difficulty = (
         "One motor for two joints, and friction that eats what is pumped in; the upright rest is unstable, "

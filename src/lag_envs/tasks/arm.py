@@ -114,15 +114,18 @@ class Reach(Task):
         start={"state": [-1.0, 1.0, 0.5, -1.0], "target": [0.4, 0.1]},
         moving=[-1.0, 6.0, 0.5, -9.0],
         rest=[-0.5 * math.pi, 0.0, 0.0, 0.0],
-        batch={"load": [0.0, 0.2, 1.0], "gravity": [9.81, 1.6, 0.0]},
+        batch={
+            "load": [0.0, 0.2, 1.0, 0.0, 0.2, 0.0, 1.0],
+            "gravity": [9.81, 1.6, 0.0, 9.81, 1.6, 9.81, 0.0],
+        },
     )
     difficulty = (
         "Torques are scarce, the links act on each other, and a posture that cannot be held must be left "
         "alone."
     )
     note = (
-        "Springs that pull towards the joint angles of the posture hang short of them, for gravity pulls too. "
-        "The computed torque takes gravity and links' coupling out, and picks the posture that costs "
+        "Springs that pull towards the joint angles of the posture hang short of them, for gravity pulls "
+        "too. The computed torque takes gravity and links' coupling out, and picks the posture that costs "
         "less to hold."
     )
 

@@ -136,7 +136,10 @@ class CartPoleExact(_OnTrack):
         moving=[0.5, 2.0, 0.1, -3.0],
         refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
         ending=([2.39, 2.0, 0.0, 0.0], 1),
-        batch={"half_length": [0.5, 0.1, 2.0], "friction": [0.0, 0.1, 5.0]},
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
     )
     difficulty = "The pole falls within a second unless it is caught, and there is no push of strength zero."
     note = "An LQR whose sign is the push is as good as can be."
@@ -236,7 +239,7 @@ class CartPoleContinuous(_OnTrack):
     controllers = {
         "LQR": Controller(
             "lag_envs.controllers.energy:Regulator",
-            {"weights": {"x": 0.1, "x_dot": 0.02, "theta": 20.0, "theta_dot": 0.02}, "effort": 0.001},
+            {"weights": {"x": 0.03, "x_dot": 0.03, "theta": 10.0, "theta_dot": 0.21}, "effort": 5e-4},
             tune={"effort": (1e-4, 1.0)},
         )
     }
@@ -247,7 +250,10 @@ class CartPoleContinuous(_OnTrack):
         moving=[0.5, 2.0, 0.1, -3.0],
         refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
         ending=([2.39, 2.0, 0.0, 0.0], 1.0),
-        batch={"half_length": [0.5, 0.1, 2.0], "friction": [0.0, 0.1, 5.0]},
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
     )
     difficulty = (
         "To bring the cart to the middle it must first be pushed away from it, and each kick has to be met "
@@ -361,14 +367,14 @@ class CartPoleSwingUp(_OnTrack):
             {
                 "pivot": "x",
                 "angle": "theta",
-                "pump": 8.0,
-                "centring": 2.0,
-                "catch": 10.0,
-                "lose": 60.0,
-                "weights": {"x": 0.1, "x_dot": 0.01, "theta": 1.0, "theta_dot": 0.01},
-                "effort": 0.1,
+                "pump": 28.0,
+                "centring": 10.0,
+                "catch": 31.0,
+                "lose": 36.0,
+                "weights": {"x": 0.06, "x_dot": 0.046, "theta": 1.0, "theta_dot": 0.0165},
+                "effort": 0.013,
             },
-            tune={"pump": (1.0, 30.0), "centring": (0.2, 10.0), "catch": (1.0, 60.0), "lose": (10.0, 300.0)},
+            tune={"pump": (1.0, 60.0), "centring": (0.2, 20.0), "catch": (1.0, 60.0), "lose": (10.0, 300.0)},
         )
     }
     hyperparameters = {"ppo": {"gamma": 0.99}}
@@ -378,7 +384,10 @@ class CartPoleSwingUp(_OnTrack):
         ending=([2.39, 2.0, 3.0, 0.0], 1.0),
         reach=12.0,
         rest=[0.0, 0.0, 0.0, 0.0],
-        batch={"half_length": [0.5, 0.1, 2.0], "friction": [0.0, 0.1, 5.0]},
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
     )
     difficulty = "The pole must be pumped, caught, and the cart kept on its track meanwhile."
     note = "Energy shaping pumps with the cart's acceleration, then hands over to an LQR."

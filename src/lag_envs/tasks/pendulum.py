@@ -109,7 +109,10 @@ class PendulumExact(Task):
         moving=[2.0, 12.0],
         reach=12.0,
         rest=[0.0, 0.0],
-        batch={"length": [1.0, 0.1, 5.0], "damping": [0.0, 0.1, 10.0]},
+        batch={
+            "length": [1.0, 0.1, 5.0, 1.0, 0.1, 1.0, 5.0],
+            "damping": [0.0, 0.1, 10.0, 0.0, 0.1, 0.0, 10.0],
+        },
     )
     difficulty = (
         "The motor holds the rod only within some 24 degrees of upright, so energy has to be pumped in first."
@@ -235,7 +238,7 @@ class PendulumRegret(Task):
         "pump the energy up, then act as a damped spring; V(start), which nobody exceeds",
     )
     controllers = {
-        "optimal": Controller("lag_envs.controllers.energy:OwnLaw"),
+        "optimal law": Controller("lag_envs.controllers.energy:OwnLaw"),
         "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
@@ -245,7 +248,10 @@ class PendulumRegret(Task):
         moving=[2.0, 12.0],
         reach=12.0,
         rest=[0.0, 0.0],
-        batch={"length": [1.0, 0.5, 2.0], "damping": [0.0, 0.01, 0.1]},
+        batch={
+            "length": [1.0, 0.5, 2.0, 1.0, 0.5, 1.0, 2.0],
+            "damping": [0.0, 0.01, 0.1, 0.0, 0.01, 0.0, 0.1],
+        },
     )
     difficulty = (
         "The reward of a step misleads: it pays for a height that is lost again, and pumping first costs."

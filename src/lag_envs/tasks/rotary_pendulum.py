@@ -100,8 +100,8 @@ class RotarySwingUp(Task):
             "lag_envs.controllers.energy:PivotEnergyLQR",
             {
                 "pivot": "phi", "angle": "theta", "at": {"theta": math.pi},
-                "pump": 100.0, "centring": 10.0, "catch": 20.0, "lose": 100.0,
-                "weights": {"phi": 0.1, "phi_dot": 0.01, "theta": 1.0, "theta_dot": 0.01}, "effort": 0.1,
+                "pump": 162.0, "centring": 5.5, "catch": 18.0, "lose": 600.0,
+                "weights": {"phi": 0.0235, "phi_dot": 7e-4, "theta": 1.0, "theta_dot": 6e-4}, "effort": 0.08,
             },
             tune={"pump": (10.0, 1e3), "centring": (0.5, 50.0), "catch": (1.0, 60.0), "lose": (10.0, 1e3)},
         )
@@ -112,7 +112,10 @@ class RotarySwingUp(Task):
         moving=[0.3, -8.0, 2.0, 12.0],
         reach=20.0,
         rest=[0.0, 0.0, math.pi, 0.0],
-        batch={"mass": [0.1, 0.05, 0.3], "damping": [0.0, 1e-4, 1e-2]},
+        batch={
+            "mass": [0.1, 0.05, 0.3, 0.1, 0.05, 0.1, 0.3],
+            "damping": [0.0, 1e-4, 1e-2, 0.0, 1e-4, 0.0, 1e-2],
+        },
     )
     difficulty = (
         "The motor is too weak to lift the pendulum in one go, and arm and pendulum push each other, the "
