@@ -46,7 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.scale", description=__doc__)
     p.add_argument("env", nargs="*", metavar="ID", help="ids of environments (default: all)")
-    p.add_argument("--batches", type=int, default=8, help=f"of {BATCH:,} episodes (default %(default)s)")
+    p.add_argument("--batches", type=int, default=8, help="of episodes (default %(default)s)")
+    p.add_argument(
+        "--size", type=int, default=BATCH, metavar="N", help="episodes of a batch (default %(default)s)"
+    )
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
     p.add_argument(
         "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
@@ -55,11 +58,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     envs = [check_env(name) for name in args.env] or list(TASKS)
     if args.batches < 1:
         raise UserError(f"--batches must be at least 1, got {args.batches}")
+    if not 1 <= args.size <= BATCH:
+        raise UserError(f"--size must lie between 1 and {BATCH}, got {args.size}")
     kept: dict[str, Any] = {}
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-        kept[env_id] = measured(env_id, args.batches, args.quick, kept.get(env_id, of_package(env_id)))
+        kept[env_id] = measured(
+            env_id, args.batches, args.quick, kept.get(env_id, of_package(env_id)), args.size
+        )
         if args.output:
             about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
             about["machine"] = machine()
@@ -69,7 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None = None) -> dict[str, Any]:
+def measured(
+    env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None = None, size: int = BATCH
+) -> dict[str, Any]:
     """Measure an environment's policies, and print a line for each.
 
     Parameters
@@ -77,11 +86,13 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
     env_id : str
         The environment.
     batches : int
-        Of `BATCH` episodes.
+        Of `size` episodes.
     quick : bool
         Whether to leave out policies that take long.
     kept : dict, optional
         What `lag_envs.tasks.measured` has of it.
+    size : int
+        Episodes of a batch, `BATCH` at most.
 
     Returns
     -------
@@ -107,19 +118,19 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
         if name not in slow:
-            returns = many(env_id, name, batches)
+            returns = many(env_id, name, batches, size)
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
             agent = Optimal(env_id) if name == "optimal" else build(task, name)
             returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
-            same = many(env_id, task.reference, batches) if task.reference else None
+            same = many(env_id, task.reference, batches, size) if task.reference else None
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
-        returns = many(env_id, task.reference, batches, REFERENCE_SEED)
+        returns = many(env_id, task.reference, batches, size, REFERENCE_SEED)
         show("reference", *mean_and_error(returns), len(returns), used)
         kept.setdefault("reference", found["reference"])
     if task.optimum:
-        best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH) for k in range(batches)])
+        best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH, size) for k in range(batches)])
         show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
@@ -129,16 +140,16 @@ def measured(env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None
     return {"scale": scale} | kept | {"measured": found}
 
 
-def many(env_id: str, name: str, batches: int, first: int = FIRST_SEED) -> Array:
+def many(env_id: str, name: str, batches: int, size: int, first: int = FIRST_SEED) -> Array:
     """Return a quick controller's returns."""
     agent = make_controller(env_id, name)
     firsts = (first + k * BATCH for k in range(batches))
-    return np.concatenate([play(env_id, agent, range(first, first + BATCH)) for first in firsts])
+    return np.concatenate([play(env_id, agent, range(first, first + size)) for first in firsts])
 
 
-def optima(env_id: str, first: int) -> Array:
+def optima(env_id: str, first: int, size: int) -> Array:
     """Return the largest returns of a batch of episodes."""
-    rollout = Rollout(env_id, None, range(first, first + BATCH))
+    rollout = Rollout(env_id, None, range(first, first + size))
     return resolve(rollout.task.optimum.place)(rollout.task, *rollout.state.T)
 
 

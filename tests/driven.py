@@ -23,7 +23,7 @@ def at_random(task, seed):
     """Return actions without sense, those beyond their limits too."""
     rng, formulas = np.random.default_rng(seed), task.formulas
     if formulas.choices:
-        space = Actions(formulas.actions, formulas.choices).space
+        space = Actions(formulas).space
         space.seed(seed)
         return lambda env, i: space.sample()
     return lambda env, i: rng.uniform(-1.2, 1.2, formulas.actions).astype(np.float32)

@@ -11,8 +11,17 @@ from lag_envs.tasks import TASKS
 from lag_envs.tasks.pivoted_bar import SwingUpFree
 
 IDS = list(TASKS)
-#: Those with one control and one target at most: tests by hand know what an action means there.
-SINGLE = [i for i, t in TASKS.items() if len(t().formulas.acting) == 1 and t().formulas.targets <= 1]
+
+
+def _plain(task):
+    formulas = task.formulas
+    return (
+        formulas.actions == 1 and formulas.targets <= 1 and not formulas.choices and formulas.largest == 1.0
+    )
+
+
+#: Those with one action in [-1, 1] and one target at most: tests by hand know what an action means there.
+SINGLE = [i for i, t in TASKS.items() if _plain(t())]
 RENDERS = find_spec("pygame") is not None and find_spec("lag_envs.envs.rendering") is not None
 
 
@@ -33,12 +42,29 @@ def make(env_id, **options):
 
 
 def actions(steps, *shape, seed=0):
-    """Return actions of three tempers: noise, stubborn full swings, and some beyond the limits."""
+    """Return actions of three tempers: noise, stubborn full swings, and some beyond the limits.
+
+    With a space in place of a shape they are as large as its own, or of its choices.
+    """
+    space = shape[0] if shape and isinstance(shape[0], gym.Space) else None
+    if space is not None:
+        shape = space.shape
     rng = np.random.default_rng(seed)
     noise = rng.uniform(-1.0, 1.0, (steps, *shape))
     swings = np.repeat(rng.choice([-1.0, 0.0, 1.0], (steps // 20 + 1, *shape)), 20, axis=0)[:steps]
     temper = np.repeat(rng.integers(3, size=(steps // 50 + 1, *shape)), 50, axis=0)[:steps]
-    return np.select([temper == 0, temper == 1], [noise, swings], 2.0 * noise).astype(np.float32)
+    found = np.select([temper == 0, temper == 1], [noise, swings], 2.0 * noise).astype(np.float32)
+    if space is None:
+        return found
+    if isinstance(space, gym.spaces.Box):
+        return found * space.high
+    choices = space.n if isinstance(space, gym.spaces.Discrete) else space.nvec
+    return np.minimum((0.5 * np.clip(found, -1.0, 1.0) + 0.5) * choices, choices - 1).astype(np.int64)
+
+
+def nothing(env):
+    """Return the action 0, of the type that an environment's space has."""
+    return np.zeros(env.action_space.shape, env.action_space.dtype)
 
 
 def one_by_one(env_id, agent, seeds, **options):

@@ -15,7 +15,7 @@ from covering import covering
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from rollouts import ANY_BAR, IDS, RENDERS, SINGLE, actions, make, trace
+from rollouts import ANY_BAR, IDS, RENDERS, SINGLE, actions, make, nothing, trace
 
 from lag_envs.envs import program
 from lag_envs.envs.model import Model
@@ -75,12 +75,20 @@ IMPOSSIBLE = {
 # --- checkers and registration ---
 
 
+#: What checkers dislike of spaces, even Gymnasium's own.
+unusual_spaces = pytest.mark.filterwarnings(
+    "ignore:.*(recommend (using|you to use) a symmetric|observation space (min|max)imum value is):UserWarning"
+)
+
+
 @each_id
+@unusual_spaces
 def test_gymnasium_checker(env_id):
     check_env(make(env_id), skip_render_check=not RENDERS)
 
 
 @each_id
+@unusual_spaces
 def test_stable_baselines_checker(env_id):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     checker.check_env(make(env_id), skip_render_check=not RENDERS)
@@ -90,7 +98,7 @@ def test_stable_baselines_checker(env_id):
 def test_made_with_all_wrappers(env_id):
     env = gym.make(env_id)  # PassiveEnvChecker warns of what it dislikes
     env.reset(seed=1)
-    trace(env, actions(300, *env.action_space.shape))
+    trace(env, actions(300, env.action_space))
     env.close()
 
 
@@ -104,7 +112,8 @@ def test_namespace_of_the_module():
 
 @each_id
 def test_spec_survives_json(env_id):
-    env = gym.make(env_id, dt=0.04, damping=0.1) if "Damping" not in env_id else gym.make(env_id, dt=0.04)
+    some = dict(list(make(env_id).task.examples.batch.items())[:1])
+    env = gym.make(env_id, dt=0.04, **{name: values[1] for name, values in some.items()})
     spec = EnvSpec.from_json(env.spec.to_json())
     assert spec == env.spec
     twin = gym.make(spec)
@@ -113,7 +122,7 @@ def test_spec_survives_json(env_id):
     assert twin.observation_space == env.observation_space
     for e in (env, twin):
         e.reset(seed=3)
-    given = actions(60, *env.action_space.shape)
+    given = actions(60, env.action_space)
     assert trace(env, given) == trace(twin, given)
 
 
@@ -171,10 +180,15 @@ def test_spec_of_an_endless_episode_survives_json():
 @each_id
 def test_spaces(env_id):
     env = make(env_id)
-    assert env.action_space == gym.spaces.Box(-1.0, 1.0, (len(env.task.action),), np.float32)
+    choices = [len(values) for values in env.task.action.values() if isinstance(values, list)]
+    top = env.task.largest_action
+    box = gym.spaces.Box(-top, top, (len(env.task.action),), np.float32)
+    assert env.action_space == (gym.spaces.Discrete(*choices) if choices else box)
     space = env.observation_space
     assert space.dtype == np.float32 and space.shape == (len(env.task.observation),)
-    assert (space.low == -space.high).all() and (env_id not in SINGLE or np.isfinite(space.high).all())
+    finite = env.task.unbounded < np.inf
+    assert np.isfinite(space.high).all() == finite
+    assert ((space.low == -space.high) | (env_id not in SINGLE)).all()
     assert type(env).metadata["render_modes"] == ["human", "rgb_array"]
     assert env.metadata["render_fps"] == round(1.0 / env.task.dt)
 
@@ -185,7 +199,7 @@ def test_spaces(env_id):
 @each_id
 def test_a_seed_gives_one_episode(env_id):
     first, second, other = make(env_id), make(env_id), make(env_id)
-    given = actions(700, *first.action_space.shape)
+    given = actions(700, first.action_space)
     starts = [env.reset(seed=seed)[0] for env, seed in ((first, 7), (second, 7), (other, 8))]
     assert starts[0].tobytes() == starts[1].tobytes()
     assert (starts[0] != starts[2]).any()
@@ -222,7 +236,7 @@ def test_bad_seed(seed):
     env, twin = running_twins("PivotedBar-v0")
     with pytest.raises((TypeError, ValueError), match=f"seed must be .*{seed}"):
         env.reset(seed=seed)
-    given = actions(30, *env.action_space.shape)
+    given = actions(30, env.action_space)
     assert trace(env, given) == trace(twin, given)
 
 
@@ -233,10 +247,10 @@ def test_bad_seed(seed):
 def test_copies_go_on_alike(env_id, clone):
     env = gym.make(env_id)
     env.reset(seed=2)
-    trace(env, actions(37, *env.action_space.shape))
+    trace(env, actions(37, env.action_space))
     twin = clone(env)
     assert (twin.unwrapped.state == env.unwrapped.state).all()
-    given = actions(300, *env.action_space.shape, seed=1)
+    given = actions(300, env.action_space, seed=1)
     assert trace(env, given) == trace(twin, given)
     assert twin.spec == env.spec
 
@@ -246,7 +260,7 @@ def test_copies_are_independent():
     env.reset(seed=2)
     before = env.state
     twin = copy.deepcopy(env)
-    trace(twin, actions(5, *env.action_space.shape))
+    trace(twin, actions(5, env.action_space))
     assert (env.state == before).all()
 
 
@@ -300,7 +314,7 @@ def test_parameters_reach_the_scene():
 def test_steps_are_those_of_simulate(env_id):
     env = make(env_id)
     env.reset(seed=1, options={"state": TASKS[env_id].examples.start["state"]})
-    for action in actions(40, *env.action_space.shape):
+    for action in actions(40, env.action_space):
         before = env.state
         _, _, terminated, truncated, _ = env.step(action)
         after = env.scene.simulate(before, [env.control], env.task.dt)[1]
@@ -309,7 +323,7 @@ def test_steps_are_those_of_simulate(env_id):
             moved[-1] -= round(moved[-1] / 1.5) * 1.5  # a kick
         elif env.task.draws:
             moved[-1] = 0.0
-        np.testing.assert_allclose(moved, 0.0, atol=2e-15)
+        np.testing.assert_allclose(moved, 0.0, atol=3e-15)
         if terminated or truncated:
             break
 
@@ -322,7 +336,7 @@ def test_types(env_id):
     env = make(env_id)
     observation, info = env.reset(seed=1)
     assert type(observation) is np.ndarray and observation.dtype == np.float32 and info == {}
-    for action in actions(5, *env.action_space.shape):
+    for action in actions(5, env.action_space):
         observation, reward, terminated, truncated, info = env.step(action)
         assert type(observation) is np.ndarray and observation.dtype == np.float32
         assert type(reward) is float and type(terminated) is bool and type(truncated) is bool and info == {}
@@ -334,12 +348,12 @@ def test_types(env_id):
 def test_nothing_is_shared(env_id):
     env = make(env_id, diagnostics=True)
     arrays, infos = [env.reset(seed=1)[0]], []
-    for action in actions(5, *env.action_space.shape):
+    for action in actions(5, env.action_space):
         observation, *_, info = env.step(action)
         arrays += [observation, env.state]
         infos.append(info)
     kept = [a.copy() for a in arrays]
-    env.step(actions(1, *env.action_space.shape)[0])
+    env.step(actions(1, env.action_space)[0])
     for i, a in enumerate(arrays):
         assert (a == kept[i]).all()
         assert not any(np.shares_memory(a, b) for b in arrays[:i])
@@ -447,7 +461,7 @@ def test_bad_actions_leave_the_environment_as_it_was(env_id):
     for action in BAD:
         with pytest.raises(ValueError, match=r"action|inhomogeneous"):
             env.step(action)
-    given = actions(50, *env.action_space.shape)
+    given = actions(50, env.action_space)
     assert trace(env, given) == trace(twin, given)
 
 
@@ -496,9 +510,9 @@ def test_the_action_is_not_changed(env_id):
 def test_step_before_reset(env_id):
     env = make(env_id)
     with pytest.raises(ResetNeeded, match="no episode has begun"):
-        env.step(np.zeros(env.action_space.shape))
+        env.step(nothing(env))
     env.reset(seed=1)
-    env.step(np.zeros(env.action_space.shape))
+    env.step(nothing(env))
 
 
 @pytest.mark.parametrize("env_id", covering(i for i, task in TASKS.items() if task.examples.ending))
@@ -507,23 +521,25 @@ def test_step_after_termination(env_id):
     env.reset(seed=1, options={"state": start})
     terminated = False
     for _ in range(20):
-        _, _, terminated, truncated, _ = env.step(np.full(env.action_space.shape, action))
+        _, _, terminated, truncated, _ = env.step(
+            np.full(env.action_space.shape, action, env.action_space.dtype)
+        )
         if terminated:
             break
     assert terminated and not truncated
     state = env.state
     with pytest.raises(ResetNeeded, match="terminated"):
-        env.step(np.zeros(env.action_space.shape))
+        env.step(nothing(env))
     assert (env.state == state).all()
     env.reset()
-    env.step(np.zeros(env.action_space.shape))
+    env.step(nothing(env))
 
 
 @pytest.mark.parametrize("env_id", ["PivotedBar-v0", pivoted_bar.SwingUpFree.id])
 def test_going_on_after_truncation_is_allowed(env_id):
     env = make(env_id, duration=0.1)
     env.reset(seed=1)
-    assert [env.step(np.zeros(env.action_space.shape))[3] for _ in range(7)] == [False] * 4 + [True] * 3
+    assert [env.step(nothing(env))[3] for _ in range(7)] == [False] * 4 + [True] * 3
 
 
 @each_id
@@ -533,7 +549,7 @@ def test_options_state(env_id):
     observation, _ = env.reset(seed=1, options={"state": start})
     assert env.state.tolist() == start
     assert not np.any(env.control)
-    env.step(np.ones(env.action_space.shape))
+    env.step(nothing(env) + 1)
     again, _ = env.reset(options={"state": np.array(start, dtype=np.float64)})
     n = len(observation) - env.task.formulas.targets
     assert again[:n].tobytes() == observation[:n].tobytes()
@@ -563,7 +579,7 @@ def test_unsafe_starts_are_refused(env_id):
         with pytest.raises(ValueError, match="unknown reset option"):
             env.reset(options=options)
     assert env.control == twin.control
-    given = actions(50, *env.action_space.shape)
+    given = actions(50, env.action_space)
     assert trace(env, given) == trace(twin, given)
 
 
@@ -575,7 +591,7 @@ def test_targets(env_id):
         assert env.target is None
         with pytest.raises(ValueError, match="no target"):
             env.reset(options={"target": 0.1})
-        given = actions(20, *env.action_space.shape)
+        given = actions(20, env.action_space)
         assert trace(env, given) == trace(twin, given)
         with pytest.raises(ValueError, match="no target"):
             make(env_id, target=0.1)
@@ -585,7 +601,7 @@ def test_targets(env_id):
     for target in (bad, math.nan, "high", [0.1]):
         with pytest.raises(ValueError, match="target"):
             env.reset(options={"target": target})
-    given = actions(20, *env.action_space.shape)
+    given = actions(20, env.action_space)
     assert trace(env, given) == trace(twin, given)
     observation, _ = env.reset(options={"target": good})
     assert env.target == good and observation[-1] == np.float32(good)
@@ -607,7 +623,9 @@ def test_targets(env_id):
 def steps_until_truncated(env, action=0.0):
     env.reset(seed=1)
     for n in range(1, 100_000):
-        *_, terminated, truncated, _ = env.step(np.full(env.action_space.shape, action))
+        *_, terminated, truncated, _ = env.step(
+            np.full(env.action_space.shape, action, env.action_space.dtype)
+        )
         if truncated:
             return n
         if terminated:
@@ -648,17 +666,18 @@ def test_an_endless_episode():
     env = gym.make(pivoted_bar.SwingUpFree.id, duration=math.inf)
     assert env.spec.max_episode_steps is None
     env.reset(seed=1)
-    assert not any(env.step(np.zeros(env.action_space.shape))[3] for _ in range(2000))
+    assert not any(env.step(nothing(env))[3] for _ in range(2000))
 
 
-@pytest.mark.parametrize("env_id", covering(i for i in IDS if i != incline.Brake.id))
+@pytest.mark.parametrize("env_id", covering(i for i, task in TASKS.items() if task.scaled))
 def test_running_rewards_scale_with_the_interval(env_id):
     start = TASKS[env_id].examples.start["state"]
     rates = []
     for dt in (1e-6, 2e-6):
         env = make(env_id, dt=dt, duration=1.0)
         env.reset(seed=1, options={"state": start})
-        rates.append(env.step(np.full(env.action_space.shape, 0.5))[1] / dt)
+        action = np.full(env.action_space.shape, 0.5).astype(env.action_space.dtype)
+        rates.append(env.step(action)[1] / dt)
     assert rates[0] == pytest.approx(rates[1], rel=1e-3)
 
 
@@ -671,7 +690,7 @@ def test_diagnostics(env_id):
     _, info = env.reset(seed=1)
     names = {"control", "energy", *env.scene.forces(env.state)}
     assert set(info) == names and info["control"] == 0.0
-    for action in actions(5, *env.action_space.shape):
+    for action in actions(5, env.action_space):
         *_, info = env.step(action)
         assert set(info) == names
         assert info["control"] == env.control
@@ -692,7 +711,7 @@ def test_a_refused_step_changes_nothing():
     state = env.state
     for _ in range(2):
         with pytest.raises(StepRefused, match="the step was refused: from \\(theta="):
-            env.step(np.ones(env.action_space.shape))
+            env.step(nothing(env) + 1)
         assert (env.state == state).all() and env.control == 0.0
     env.reset(seed=2)
 

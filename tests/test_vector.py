@@ -79,7 +79,7 @@ def assert_alike(native, sync, steps, seed=0):
     n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     stray = 0.5 / native.task.limit
     rng = np.random.default_rng(seed)
-    given = actions(steps, *native.action_space.shape, seed=seed)
+    given = actions(steps, native.action_space, seed=seed)
     ends = 0
     for action in given:
         mine, theirs = native.step(action), sync.step(action)
@@ -172,7 +172,7 @@ def test_a_sub_environment_is_the_single_one(env_id):
     native.reset(seed=40)
     env = make(env_id)
     env.reset(seed=43)
-    for action in actions(30, *native.action_space.shape):
+    for action in actions(30, native.action_space):
         mine = native.step(action)
         theirs = env.step(action[3])
         assert mine[0][3].tobytes() == theirs[0].tobytes() and mine[1][3] == theirs[1]
@@ -193,7 +193,7 @@ def test_states_and_targets_by_hand(env_id):
     native = gym.make_vec(env_id, num_envs=6)
     observations, _ = native.reset(seed=0, options=options)
     assert native.state.tobytes() == options["state"].tobytes()
-    given = actions(1, *native.action_space.shape)[0]
+    given = actions(1, native.action_space)[0]
     stepped = native.step(given)[0]
     for i in range(6):
         own = {name: values[i] for name, values in options.items()}
@@ -322,7 +322,7 @@ def test_nothing_is_shared(env_id, mode):
     kept = []
     for _ in range(2):
         arrays = [envs.reset(seed=1)[0]]
-        for action in actions(40, *envs.action_space.shape):
+        for action in actions(40, envs.action_space):
             *out, info = envs.step(action)
             over = out[2] | out[3]
             arrays += [
@@ -362,7 +362,7 @@ def test_spaces_and_types(env_id):
 def test_observations_stay_in_the_space(env_id):
     envs = gym.make_vec(env_id, num_envs=100, autoreset_mode="SameStep")
     observations, _ = envs.reset(seed=1)
-    for action in actions(400, *envs.action_space.shape, seed=5):
+    for action in actions(400, envs.action_space, seed=5):
         assert observations in envs.observation_space
         observations, *_, infos = envs.step(action)
         for last in infos.get("final_obs", ()):
@@ -379,11 +379,11 @@ def test_observations_stay_in_the_space(env_id):
 def test_copies_go_on_alike(env_id, clone):
     envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **TASKS[env_id].examples.batch)
     envs.reset(seed=2)
-    for action in actions(37, *envs.action_space.shape):
+    for action in actions(37, envs.action_space):
         envs.step(action)
     twin = clone(envs)
     before = twin.state
-    for action in actions(60, *envs.action_space.shape, seed=1):
+    for action in actions(60, envs.action_space, seed=1):
         mine = envs.step(action)
         assert (twin.state == before).all()  # nothing in common
         assert_same(mine, twin.step(action))
@@ -401,7 +401,7 @@ def test_spec_survives_json(env_id):
     twin = gym.make_vec(spec)
     assert twin.num_envs == 7 and twin.metadata == envs.metadata
     assert_same(envs.reset(seed=1), twin.reset(seed=1))
-    for action in actions(40, *envs.action_space.shape):
+    for action in actions(40, envs.action_space):
         assert_same(envs.step(action), twin.step(action))
 
 
@@ -534,7 +534,7 @@ def test_bad_options_reset_nothing(options, error, match):
     with pytest.raises(error, match=match):
         envs.reset(seed=5, options=options)
     assert (envs.state == twin.state).all()
-    for action in actions(20, *envs.action_space.shape):
+    for action in actions(20, envs.action_space):
         assert_same(envs.step(action), twin.step(action))
 
 

@@ -62,13 +62,16 @@ def _description(task: Task) -> str:
 def _controls(task: Task) -> list[tuple[str, ...]]:
     units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
     rows: list[tuple[str, ...]] = []
+    top = task.formulas.largest
     for acting in task.formulas.acting:
         unit = units.pop(acting.control)
         if acting.values:
             given = f"{', '.join(f'{v:g}' for v in acting.values)} {unit}"
             rows.append((acting.control, given, f"actions 0 to {len(acting.values) - 1}"))
         else:
-            rows.append((acting.control, f"{acting.low:g} to {acting.high:g} {unit}", "actions -1 to 1"))
+            rows.append(
+                (acting.control, f"{acting.low:g} to {acting.high:g} {unit}", f"actions {-top:g} to {top:g}")
+            )
     return rows + [(name, f"0 {unit}", "no action sets it") for name, unit in units.items()]
 
 

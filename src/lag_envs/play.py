@@ -40,18 +40,19 @@ def action_of(
     Parameters
     ----------
     space : gym.Space
-        The environment's actions: Box in [-1, 1], Discrete or MultiDiscrete.
+        The environment's actions: a Box, Discrete or MultiDiscrete.
     pressed : callable
         Tells whether the key of a name is pressed.
     rest : sequence of float
-        What each number of the action is without a key: in [-1, 1], or for a choice its index.
+        What each number of the action is without a key; for a choice its index.
     sticks : sequence of float, optional
         How far a gamepad's sticks are pushed, in [-1, 1], in the order of the pairs of keys.
     """
     numbers = list(rest)
     sizes = [int(space.n)] if isinstance(space, gym.spaces.Discrete) else getattr(space, "nvec", None)
     for i, (down, up) in enumerate(keys_of(space)):
-        low, high = (-1.0, 1.0) if sizes is None else (0.0, float(sizes[i]) - 1.0)
+        top = float(space.high[i]) if isinstance(space, gym.spaces.Box) else 0.0
+        low, high = (-top, top) if sizes is None else (0.0, float(sizes[i]) - 1.0)
         push = float(sticks[i]) if i < len(sticks) else 0.0
         if pressed(down) != pressed(up):
             push = -1.0 if pressed(down) else 1.0

@@ -188,7 +188,7 @@ def action_of(key: Sequence[int], task: Any) -> Any:
     """Return the action that a step's numbers mean."""
     if task.formulas.choices:
         return key[0] if len(task.formulas.choices) == 1 else list(key)
-    return [n / LEVELS for n in key]
+    return [task.formulas.largest * (n / LEVELS) for n in key]
 
 
 def keys_of(drive: Drive, task: Any) -> list[tuple[int, ...]]:

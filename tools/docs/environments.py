@@ -149,7 +149,7 @@ def _picture(env_id: str) -> str:
 
 
 def _summary(env_id: str, task: Task) -> str:
-    spaces = Actions(task.formulas.actions, task.formulas.choices).space, observation_space([task])
+    spaces = Actions(task.formulas).space, observation_space([task])
     shown = [str(space) if not hasattr(space, "low") else _box(space) for space in spaces]
     rows = [
         ["Make it", f'`gym.make("{env_id}")`, `gym.make_vec("{env_id}", num_envs=64)`'],
@@ -175,8 +175,14 @@ def _actions(task: Task) -> str:
         ends = acting.values or (acting.low, acting.high)
         values = [", ".join(map(number, ends)), ""] if acting.values else [*map(number, ends)]
         rows.append([str(i), f"`{acting.control}`", units[acting.control], *values])
+    top = task.formulas.largest
     listed = any(acting.values for acting in task.formulas.acting)
-    head = ["Num", "Control", "Unit", *(("Values, by action", "") if listed else ("At -1", "At 1"))]
+    head = [
+        "Num",
+        "Control",
+        "Unit",
+        *(("Values, by action", "") if listed else (f"At {number(-top)}", f"At {number(top)}")),
+    ]
     return table(head, rows)
 
 

@@ -53,7 +53,7 @@ class Feedback:
     """
 
     def __init__(self, task: Task, *, gain: ArrayLike) -> None:
-        self.gain = np.atleast_2d(np.asarray(gain, np.float64))
+        self.gain, self.largest = np.atleast_2d(np.asarray(gain, np.float64)), task.formulas.largest
         if self.gain.shape != (wanted := (task.formulas.actions, len(task.observation))):
             raise ValueError(f"gain must have shape {wanted}, got {self.gain.shape}")
 
@@ -61,7 +61,7 @@ class Feedback:
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action, for each observation."""
-        return np.clip(observation @ self.gain.T, -1.0, 1.0).astype(np.float32), state
+        return np.clip(observation @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
 
 
 def feedback(task: Task, **gains: float) -> Feedback:
@@ -91,7 +91,7 @@ class Choice:
 
     def __init__(self, task: Task, rng: np.random.Generator | None = None) -> None:
         self.task, self.rng = task, rng
-        self.shape = Actions(task.formulas.actions, task.formulas.choices).shape
+        self.shape = Actions(task.formulas).shape
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -113,24 +113,26 @@ class Random:
         Seed of the actions.
     count : int
         How many controls an action has.
+    largest : float
+        The largest action.
     """
 
-    def __init__(self, seed: int, count: int = 1) -> None:
-        self.rng, self.count = np.random.default_rng(seed), count
+    def __init__(self, seed: int, count: int = 1, largest: float = 1.0) -> None:
+        self.rng, self.count, self.largest = np.random.default_rng(seed), count, largest
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Any]:
         """Return an action for each observation."""
         shape = (*np.shape(observation)[:-1], self.count)
-        return self.rng.uniform(-1.0, 1.0, shape).astype(np.float32), state
+        return self.rng.uniform(-self.largest, self.largest, shape).astype(np.float32), state
 
 
 def at_random(task: Task, seed: int = 0) -> Random | Choice:
     """Return the agent of random actions."""
     if task.formulas.choices:
         return Choice(task, np.random.default_rng(seed))
-    return Random(seed, task.formulas.actions)
+    return Random(seed, task.formulas.actions, task.formulas.largest)
 
 
 class FeedbackController(ABC):
@@ -150,36 +152,55 @@ class FeedbackController(ABC):
 
     @abstractmethod
     def control(self, state: Array, target: Array) -> Array:
-        """Return the control [SI unit] for states (..., n_state) and targets (...)."""
+        """Return controls [SI units] for states (..., n_state) and targets (...): see `actions_for`."""
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[NDArray[np.float32], Any]:
+    ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
-        return as_actions(self.task.formulas.action(self.control(*self.read(observation)))), state
+        return actions_for(self.task, self.control(*self.read(observation))), state
 
 
-def as_actions(values: Array) -> NDArray[np.float32]:
-    """Return numbers (...) as actions (..., 1) in [-1, 1]."""
-    return np.clip(values, -1.0, 1.0)[..., None].astype(np.float32)
+def actions_for(task: Task, controls: Array) -> NDArray:
+    """Return the actions that ask for controls, or for the nearest to them that there are.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    controls : ndarray, shape (...) or (..., n_actions)
+        The controls that actions set [SI units]: without a last axis where there is one only.
+    """
+    formulas = task.formulas
+    if formulas.choices:
+        (acting,) = formulas.acting
+        return np.abs(controls[..., None] - np.array(acting.values)).argmin(axis=-1)
+    if formulas.actions == 1:
+        return as_actions(formulas.action(controls), formulas.largest)
+    low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
+    shares = 2.0 * (controls - low) / (high - low) - 1.0
+    return (formulas.largest * np.clip(shares, -1.0, 1.0)).astype(np.float32)
+
+
+def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:
+    """Return numbers (...) as actions (..., 1), none of them beyond the largest."""
+    return np.clip(values, -largest, largest)[..., None].astype(np.float32)
 
 
 class ObservationDecoder:
     """Reads states and targets from observations.
 
     What a task observes is linear in the state, in cosine and sine of its angles, and in the target; so it is
-    inverted from the values at zero and at the unit vectors.
+    inverted from the values at zero and at the unit vectors, or shorter ones where an entry is clipped.
 
     Parameters
     ----------
     task : Task
-        The task, with one target at most.
+        The task.
     """
 
     def __init__(self, task: Task) -> None:
         formulas, form = task.formulas, task.scene._form
-        if formulas.targets > 1:
-            raise ValueError(f"{type(task).__name__} has {formulas.targets} targets; one at most can be read")
         k = SimpleNamespace(**formulas.constants())
         self.task, self._n = task, len(task.scene.state_names)
         entries = enumerate(task.scene._layout.state)
@@ -193,11 +214,18 @@ class ObservationDecoder:
             known = [(state[i], *circle) for i, circle in zip(angles, circles, strict=True)]
             if form is not None and form.angle is not None:
                 state += circles[angles.index(form.angle)].tolist()
-            return formulas.observe(Lifted(np, known), state, [row[-1]] * formulas.targets, k)
+            return formulas.observe(Lifted(np, known), state, list(row[self._width :][: formulas.targets]), k)
 
-        rows = np.vstack([np.zeros(self._width + 1), np.eye(self._width + 1)])
-        values = np.array([seen(row) for row in rows])
-        self._zero, slopes = values[0], values[1:] - values[0]
+        width = self._width + max(formulas.targets, 1)
+        self._zero = np.array(seen(np.zeros(width)))
+
+        def risen(size: float) -> NDArray[np.float64]:
+            return np.array([seen(row) for row in size * np.eye(width)]) - self._zero
+
+        size = 1.0
+        while not np.allclose(risen(size), 2.0 * risen(0.5 * size)):
+            size *= 0.5
+        slopes = risen(size) / size
         self._inverse = np.linalg.pinv(slopes)
         #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
@@ -205,7 +233,10 @@ class ObservationDecoder:
         self.wrapped = [i for i, _ in self._pairs]
 
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
-        """Return states (..., n_state) and targets (...) for observations (..., n)."""
+        """Return states (..., n_state) and targets for observations (..., n).
+
+        Targets have the shape (...), being 0 where there are none, or (..., n_targets) where there are more.
+        """
         values = np.asarray(observation, np.float64)
         if values.shape[-1:] != self._zero.shape:
             raise ValueError(
@@ -216,7 +247,8 @@ class ObservationDecoder:
         state = lifted[..., : self._n].copy()
         for i, j in self._pairs:
             state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])
-        return state, lifted[..., self._width]
+        targets = lifted[..., self._width :]
+        return state, targets[..., 0] if targets.shape[-1] == 1 else targets
 
     def difference(self, states: Array, others: Array) -> Array:
         """Return states (..., n_state) minus others, the shorter way around where only that is seen."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.scenes.checks import is_masked, shown
+from lag_envs.tasks.base import TaskFormulas
 
 
 class Actions:
@@ -16,21 +17,26 @@ class Actions:
 
     Parameters
     ----------
+    formulas : TaskFormulas
+        Those of the task.
+
+    Attributes
+    ----------
     count : int
         How many numbers an action has.
     values : tuple of int
-        For actions that are chosen from lists the length of each list; empty where they lie in [-1, 1].
+        For actions that are chosen from lists the length of each list; empty where they lie in a box.
     """
 
-    def __init__(self, count: int, values: tuple[int, ...]) -> None:
-        self.count, self.values = count, values
+    def __init__(self, formulas: TaskFormulas) -> None:
+        self.count, self.values = count, values = formulas.actions, formulas.choices
         self.space: gym.Space[Any]
         if len(values) == 1:
             self.space = gym.spaces.Discrete(values[0])
         elif values:
             self.space = gym.spaces.MultiDiscrete(list(values))
         else:
-            self.space = gym.spaces.Box(-1.0, 1.0, (count,), np.float32)
+            self.space = gym.spaces.Box(-formulas.largest, formulas.largest, (count,), np.float32)
         #: Shape of one action.
         self.shape = () if len(values) == 1 else (count,)
 

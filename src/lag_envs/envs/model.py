@@ -79,7 +79,7 @@ class Model:
             States in the order of ``task.scene.state_names``; whether an episode would have ended there does
             not matter.
         actions : array_like, shape (n,), or (n, n_actions) where there are several
-            Actions; finite values outside [-1, 1] are clipped.
+            Actions; finite values outside their space are clipped.
         targets : array_like, shape (n,) or (), or (n, n_targets) or (n_targets,) where there are several
             Targets, for a task that has them and does not fix them.
 
@@ -127,7 +127,7 @@ class Model:
 
         The motion's derivatives are those of the scene's control step. Guard and reward have kinks, of which
         a planner should see as much as lies within reach: their formulas are expanded by central differences
-        of `REACH`, along the motion so linearised. That actions beyond [-1, 1] are clipped is left aside.
+        of `REACH`, along the motion so linearised. That actions beyond their space are clipped is left out.
 
         Parameters
         ----------

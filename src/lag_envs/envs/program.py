@@ -135,8 +135,11 @@ class Program:
         def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
             return _lines(formula, inputs, outputs, formulas.trace)
 
+        top = formulas.largest
         clip = [
-            f"{a} = select({a} < -1.0, -1.0, select({a} > 1.0, 1.0, {a}))" for a in self.a if formulas.clipped
+            f"{a} = select({a} < {-top}, {-top}, select({a} > {top}, {top}, {a}))"
+            for a in self.a
+            if formulas.clipped
         ]
         self.control = clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]

@@ -84,7 +84,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.render_mode = render_mode
         self.diagnostics = diagnostics
         self.metadata = {"render_modes": RENDER_MODES, "render_fps": max(1, round(1.0 / self.task.dt))}
-        self._actions = Actions(self.task.formulas.actions, self.task.formulas.choices)
+        self._actions = Actions(self.task.formulas)
         self.action_space = self._actions.space
         self._plain = not self._actions.values and self._actions.count == 1
         self.observation_space = observation_space([self.task])
@@ -163,7 +163,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters
         ----------
         action : array_like, shape (1,)
-            The action in [-1, 1]; a finite value outside is clipped.
+            The action; a finite value outside its space is clipped.
 
         Returns
         -------
@@ -222,7 +222,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def get_keys_to_action(self) -> dict[str, NDArray[np.float32]]:
         """Return the keys of `gymnasium.utils.play`: a and d for the ends of the control, else no control."""
         rest = self.task.rest_action
-        keys = {"": rest, "a": -1.0, "d": 1.0, "ad": rest}
+        top = self.task.formulas.largest
+        keys = {"": rest, "a": -top, "d": top, "ad": rest}
         return {pressed: np.array([action], FLOAT32) for pressed, action in keys.items()}
 
     def close(self) -> None:

@@ -244,7 +244,8 @@ class UnfusedProgram:
 
         def control(xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
             if formulas.clipped:
-                a = [xp.where(x < -1.0, -1.0, xp.where(x > 1.0, 1.0, x)) * k.strength for x in a]
+                top = formulas.largest
+                a = [xp.where(x < -top, -top, xp.where(x > top, top, x)) * k.strength for x in a]
             return formulas.control(xp, a, y, g, k)
 
         u = self._run(t, control, actions, y, g)
@@ -378,7 +379,7 @@ class Unfused:
         self._functions = program.functions
         self.numbers = [0.0] * program.size
         self.constants = program.constants
-        self._actions = Actions(task.formulas.actions, task.formulas.choices)
+        self._actions = Actions(task.formulas)
         self._key: Any = None
         self.steps = 0
 

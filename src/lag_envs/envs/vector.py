@@ -119,7 +119,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             "render_fps": max(1, round(1.0 / self.task.dt)),
             "autoreset_mode": self.autoreset_mode,
         }
-        self._actions = Actions(self.task.formulas.actions, self.task.formulas.choices)
+        self._actions = Actions(self.task.formulas)
         self.single_action_space = self._actions.space
         self.single_observation_space = observation_space(self._tasks)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -231,7 +231,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         Parameters
         ----------
         actions : array_like, shape (num_envs, 1)
-            Actions in [-1, 1]; finite values outside are clipped.
+            Actions; finite values outside their space are clipped.
 
         Returns
         -------

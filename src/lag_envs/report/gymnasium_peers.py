@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -16,31 +16,8 @@ from mpmath import mpf
 from lag_envs.report.episodes import DIGITS, Episode, compare, entries, moved, random_actions
 from lag_envs.report.oracle import oracle_of
 from lag_envs.report.runner import Row
-from lag_envs.scenes import Acrobot, CartPole
-from lag_envs.scenes.base import Scene, parameter
-
-
-class Rod(Scene):
-    """Pendulum-v1: a uniform rod on a hinge, theta = 0 upright, driven by a torque."""
-
-    mass: float = parameter(1.0, "kg", above=0.0)
-    length: float = parameter(1.0, "m", above=0.0)
-    gravity: float = parameter(10.0, "m/s²", least=0.0)
-
-    coordinates: ClassVar = {"theta": "rad"}
-    controls: ClassVar = {"torque": "N m"}
-
-    def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
-        """Return T."""
-        return self.mass * self.length**2 * v.theta**2 / 6
-
-    def potential(self, q: Any, xp: Any) -> Any:
-        """Return V."""
-        return self.mass * self.gravity * self.length * xp.cos(q.theta) / 2
-
-    def applied(self, q: Any, v: Any, u: Any, xp: Any) -> dict[str, Any]:
-        """Return the torque."""
-        return {"theta": u.torque}
+from lag_envs.scenes import Acrobot, CartPole, Pendulum
+from lag_envs.scenes.base import Scene
 
 
 class Peer(NamedTuple):
@@ -62,7 +39,7 @@ class Peer(NamedTuple):
 
 PEERS = {
     "Pendulum-v1": Peer(
-        lambda env: Rod(mass=env.m, length=env.l, gravity=env.g),
+        lambda env: Pendulum(mass=env.m, length=env.l, gravity=env.g),
         (0, 1),
         "semi-implicit Euler",
         lambda env: env.dt,

@@ -10,6 +10,7 @@ from lag_envs.scenes.chain import Chain
 from lag_envs.scenes.checks import StepRefused
 from lag_envs.scenes.cylinder_in_cylinder import CylinderInCylinder
 from lag_envs.scenes.incline import Incline
+from lag_envs.scenes.pendulum import Pendulum
 from lag_envs.scenes.pivoted_bar import PivotedBar
 from lag_envs.scenes.rotary_pendulum import RotaryPendulum
 from lag_envs.scenes.two_link_arm import TwoLinkArm
@@ -24,6 +25,7 @@ SCENES: tuple[type[Scene], ...] = (
     Chain,
     RotaryPendulum,
     TwoLinkArm,
+    Pendulum,
 )
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "Chain",
     "CylinderInCylinder",
     "Incline",
+    "Pendulum",
     "PivotedBar",
     "RotaryPendulum",
     "Scene",

@@ -14,6 +14,8 @@ With l₁ from shoulder to elbow, centres of mass at c₁ and c₂ along the lin
     V = -(m₁ c₁ + m₂ l₁) g cos(theta_1) - m₂ c₂ g cos(theta_1 + theta_2)
 
 Friction in each joint is b v + c atan(100 v): viscous, and a rounded step that stands for dry friction.
+Motors with rotors of inertia J behind gears of ratio n, the elbow's being carried by the first link, add
+J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2 to T.
 """
 
 from __future__ import annotations
@@ -40,9 +42,17 @@ class Acrobot(Scene):
     inertia_1, inertia_2 : float [kg m²], optional
         Moments of inertia I about the centres of mass; by default those of uniform bars, ml²/12.
     damping : float [N m s]
-        Coefficient b of the viscous friction in both joints.
+        Coefficient b of the viscous friction in the shoulder.
+    damping_2 : float [N m s], optional
+        That in the elbow; by default the same.
     dry_friction : float [N m]
-        Coefficient c of the friction c atan(100 v) in both joints; it reaches cπ/2.
+        Coefficient c of the friction c atan(100 v) in the shoulder; it reaches cπ/2.
+    dry_friction_2 : float [N m], optional
+        That in the elbow; by default the same.
+    rotor_inertia : float [kg m²]
+        Inertia J of each motor's rotor.
+    gear_ratio : float
+        Ratio n by which the rotors turn faster than the joints.
     gravity : float [m/s²]
         Field g, downward.
     control : {"elbow", "shoulder", "both"}
@@ -65,7 +75,11 @@ class Acrobot(Scene):
     inertia_1: float = parameter(lambda arm: arm.mass_1 * arm.length_1**2 / 12, "kg m²", least=0.0)
     inertia_2: float = parameter(lambda arm: arm.mass_2 * arm.length_2**2 / 12, "kg m²", least=0.0)
     damping: float = parameter(0.0, "N m s", least=0.0)
+    damping_2: float = parameter(lambda arm: arm.damping, "N m s", least=0.0)
     dry_friction: float = parameter(0.0, "N m", least=0.0)
+    dry_friction_2: float = parameter(lambda arm: arm.dry_friction, "N m", least=0.0)
+    rotor_inertia: float = parameter(0.0, "kg m²", least=0.0)
+    gear_ratio: float = parameter(6.0, "1", above=0.0)
     gravity: float = parameter(9.81, "m/s²", least=0.0)
     control: str = "elbow"
 
@@ -83,7 +97,9 @@ class Acrobot(Scene):
         about_shoulder = self.mass_1 * self.com_distance_1**2 + self.inertia_1
         about_elbow = self.mass_2 * self.com_distance_2**2 + self.inertia_2
         coupled = self.mass_2 * elbow * (0.5 * elbow + self.com_distance_2 * second * xp.cos(q.theta_2))
-        return 0.5 * about_shoulder * first**2 + 0.5 * about_elbow * second**2 + coupled
+        rotors = (self.gear_ratio * first) ** 2 + (self.gear_ratio * v.theta_2 - first) ** 2
+        links = 0.5 * about_shoulder * first**2 + 0.5 * about_elbow * second**2 + coupled
+        return links + 0.5 * self.rotor_inertia * rotors
 
     def potential(self, q: Any, xp: Any) -> Any:
         """Return V [J]."""
@@ -94,11 +110,12 @@ class Acrobot(Scene):
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
         """Return Rayleigh's function of the friction [W], whose derivative is b v + c atan(100 v)."""
 
-        def joint(w: Any) -> Any:
+        def joint(w: Any, damping: Any, dry_friction: Any) -> Any:
             rounded = w * xp.atan(100 * w) - xp.log(1 + (100 * w) ** 2) / 200
-            return 0.5 * self.damping * w**2 + self.dry_friction * rounded
+            return 0.5 * damping * w**2 + dry_friction * rounded
 
-        return joint(v.theta_1) + joint(v.theta_2)
+        shoulder = joint(v.theta_1, self.damping, self.dry_friction)
+        return shoulder + joint(v.theta_2, self.damping_2, self.dry_friction_2)
 
     def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
         """Return the torques [N m]."""

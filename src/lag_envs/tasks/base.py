@@ -74,6 +74,13 @@ class Task:
         Random numbers in [0, 1) that `kick` uses.
     scaled : bool
         Whether rewards are scaled by dt/interval for another `dt`.
+    largest_action : float
+        The action that asks for the largest control: the space is the box of ± as much. Only where others
+        have fixed it, it is not 1.
+    peer : str
+        The environment of Gymnasium that has the same spaces, rewards and endings.
+    unbounded : float
+        What the space has as bound of an observation that has none: the largest float32, or infinity.
     order : int, optional
         Order of the general series, 6 to 24; by default it follows from `dt`. Slow motions are stepped
         faster with a lower order, fast ones with a higher one. Steps are certified with any order.
@@ -128,6 +135,9 @@ class Task:
     target: Any = MappingProxyType({})
     draws: ClassVar[int] = 0
     scaled: ClassVar[bool] = True
+    largest_action: ClassVar[float] = 1.0
+    peer: ClassVar[str] = ""
+    unbounded: ClassVar[float] = _UNBOUNDED
     order: ClassVar[int | None] = None
     usable: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
     controllers: ClassVar[Mapping[str, Controller]] = MappingProxyType({})
@@ -434,6 +444,7 @@ class Task:
     def wanted(self, actions: ArrayLike) -> NDArray[np.float64]:
         """Return the controls that actions (n,) or (n, n_actions) ask for, shape (n, n_controls)."""
         columns = np.reshape(np.asarray(actions, np.float64), (-1, len(self.formulas.acting))).T
+        columns = np.asarray(self.formulas.shares([*columns]))
         names, found = self.scene.control_names, np.zeros((columns.shape[-1], len(self.scene.control_names)))
         for acting, numbers in zip(self.formulas.acting, columns, strict=True):
             found[:, names.index(acting.control)] = _control(acting, numbers, np)
@@ -558,6 +569,13 @@ class TaskFormulas:
                 "give each control one or each the other"
             )
         self.clipped = not self.choices
+        #: The action of the largest control.
+        self.largest = float(task.largest_action)
+        if not 0.0 < self.largest < math.inf:
+            raise FormulaError(
+                f"{type(task).__name__}.largest_action must be above 0 and finite, "
+                f"got {task.largest_action!r}"
+            )
         self.target_boxes = _target_boxes(task)
         self.targets = len(self.target_boxes)
         self.draws = task.draws
@@ -646,13 +664,19 @@ class TaskFormulas:
         """Return the action, unclipped, that asks for a control; for tasks with one."""
         (acting,) = self.acting
         if acting.low == -acting.high:
-            return control / acting.high
-        return 2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0
+            return self.largest * (control / acting.high)
+        return self.largest * (2.0 * ((control - acting.low) / (acting.high - acting.low)) - 1.0)
+
+    def shares(self, actions: Sequence) -> Sequence:
+        """Return actions as shares of the largest one; choices as they are."""
+        if self.choices or self.largest == 1.0:
+            return actions
+        return [a * (1.0 / self.largest) for a in actions]
 
     def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the controls that are applied."""
         wanted = dict.fromkeys(self._controls, 0.0)
-        for acting, number in zip(self.acting, a, strict=True):
+        for acting, number in zip(self.acting, self.shares(a), strict=True):
             wanted[acting.control] = _control(acting, number, xp)
         if type(self._task).guard is Task.guard:
             return list(wanted.values())
@@ -764,7 +788,9 @@ class TaskFormulas:
         if self.choices:
             found: Any = [int(np.argmin(np.abs(a.values))) for a in self.acting]
         else:
-            found = [min(1.0, max(-1.0, -(a.high + a.low) / (a.high - a.low))) for a in self.acting]
+            found = [
+                self.largest * min(1.0, max(-1.0, -(a.high + a.low) / (a.high - a.low))) for a in self.acting
+            ]
         return found[0] if len(found) == 1 else found
 
     def control_range(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -772,7 +798,9 @@ class TaskFormulas:
         k = SimpleNamespace(**self.constants())
         y: Any = self._task.centre if self._form is None else self._form.lift(self._task.centre)
         ends = ([0.0 for a in self.acting], [float(n - 1) for n in self.choices])
-        low, high = ends if self.choices else ([-1.0] * self.actions, [1.0] * self.actions)
+        if not self.choices:
+            ends = ([-self.largest] * self.actions, [self.largest] * self.actions)
+        low, high = ends
         found = (self.control(np, a, y, [0.0] * self.targets, k) for a in (low, high))
         first, last = (np.array([float(u) for u in controls]) for controls in found)
         return first, last
@@ -786,13 +814,13 @@ class TaskFormulas:
                     f"{type(self._task).__name__}.bounds: there is no observation {name!r}, "
                     f"only {', '.join(self.observation)}"
                 )
-        low, high = [], []
+        low, high, unbounded = [], [], self._task.unbounded
         for name in self.observation:
-            bound = given.get(name, _UNBOUNDED)
+            bound = given.get(name, unbounded)
             pair = tuple(bound) if isinstance(bound, Sequence) else (-bound, bound)
             # Where an episode has no end no bound exists, and no speed times no end is no number.
-            low.append(float(pair[0]) if pair[0] > -_UNBOUNDED else -_UNBOUNDED)
-            high.append(float(pair[1]) if pair[1] < _UNBOUNDED else _UNBOUNDED)
+            low.append(float(pair[0]) if pair[0] > -_UNBOUNDED else -unbounded)
+            high.append(float(pair[1]) if pair[1] < _UNBOUNDED else unbounded)
         return low, high
 
 

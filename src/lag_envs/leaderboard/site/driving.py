@@ -88,6 +88,7 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
             {"name": a.control, "unit": units[a.control], "low": a.low, "high": a.high, "values": a.values}
             for a in formulas.acting
         ],
+        "largest": formulas.largest,
         "rest": resting if isinstance(resting, list) else [resting] * formulas.actions,
         "frames": len(program.frames),
         "targets": [{"name": t.name, "unit": t.unit} for t in formulas.target_boxes],

@@ -95,7 +95,7 @@
   }
 
   /** The action that a step's numbers mean. */
-  const actionOf = (key, { controls, levels }) => key.map((n, i) => (controls[i].values.length ? n : n / levels));
+  const actionOf = (key, { controls, levels, largest }) => key.map((n, i) => (controls[i].values.length ? n : largest * (n / levels)));
 
   // --- links -----------------------------------------------------------------------------------------------
   // As lag_envs/replay.py has them.
@@ -363,7 +363,7 @@
     /** A number for each control. Keys count before the pointer, the pointer before the gamepad. */
     numbers() {
       const pad = this.readPad();
-      const { controls, levels, rest } = this.about;
+      const { controls, levels, largest, rest } = this.about;
       return controls.map(({ values }, i) => {
         const many = values.length;
         const [down, up] = (PAIRS[i] ?? []).map((key) => this.pressed.has(key));
@@ -373,7 +373,7 @@
         if (down || up) share = up - down;
         else if (this.pointer && i < 2) share = this.pointer[i];
         else if (pad) share = pad[i] ?? null;
-        if (share === null || (share === 0 && many)) return many ? rest[i] : Math.round(rest[i] * levels);
+        if (share === null || (share === 0 && many)) return many ? rest[i] : Math.round((rest[i] / largest) * levels);
         return many ? Math.round((0.5 + 0.5 * share) * (many - 1)) : Math.round(share * levels);
       });
     }

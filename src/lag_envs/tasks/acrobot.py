@@ -1,0 +1,335 @@
+"""Tasks with two links on a pivot: Gymnasium's, stepped exactly, and those of a real machine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import Acrobot
+from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Controller, Examples, Goal
+
+_USABLE = {
+    "mass_1": (1e-2, 1e2),
+    "mass_2": (1e-2, 1e2),
+    "length_1": (0.05, 1e1),
+    "length_2": (0.05, 1e1),
+    "damping": (0.0, 1e1),
+    "dry_friction": (0.0, 1.0),
+    "gravity": (0.0, 1e2),
+}
+
+
+def _angles(after: Any, xp: Any) -> dict[str, Any]:
+    """Return cosine and sine of both angles."""
+    return {
+        "cos(theta_1)": xp.cos(after.theta_1),
+        "sin(theta_1)": xp.sin(after.theta_1),
+        "cos(theta_2)": xp.cos(after.theta_2),
+        "sin(theta_2)": xp.sin(after.theta_2),
+    }
+
+
+_ANGLES = {
+    "cos(theta_1)": ("1", "cosine of the first link's angle, 1 hanging"),
+    "sin(theta_1)": ("1", "its sine"),
+    "cos(theta_2)": ("1", "cosine of the second link's angle against the first, 1 straight"),
+    "sin(theta_2)": ("1", "its sine"),
+}
+
+
+class AcrobotExact(Task):
+    """Lift the tip of two links above a line by the elbow's motor: Gymnasium's Acrobot-v1, stepped exactly.
+
+    ## Description
+
+    Two links hang from a pivot, with a motor at the elbow only. Swing them so that the tip gets one link's
+    length above the pivot, as soon as possible. Spaces, rewards, starts and endings are those of Gymnasium's
+    `Acrobot-v1`, so a policy that was trained there runs here as it is, and the other way round.
+
+    Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, by which the energy of the
+    undriven links drifts by several joules. Here the motion under the held torque is exact. And Gymnasium
+    clips the speeds at 4π and 9π rad/s, which takes energy away without a cause. Here they are free, and only
+    what is *observed* of them is clipped.
+
+    What is kept, though no links of 1 kg and 1 m can have it, is the inertia of 1 kg m² about each centre of
+    mass: no mass distribution within a link gives more than a quarter of that.
+
+    ## Action Space
+
+    `Discrete(3)`. The torque is held for one step.
+
+    ## Observation Space
+
+    Cosine and sine of both angles, and the speeds, clipped at 4π and 9π rad/s.
+
+    ## Rewards
+
+    Each step pays -1, the one that reaches the goal 0. With another `dt` rewards are scaled by dt/0.2.
+
+    ## Starting State
+
+    The links hang, nearly at rest.
+
+    ## Episode End
+
+    Termination: -cosθ₁ - cos(θ₁ + θ₂) > 1 at a step's end.
+
+    ## Arguments
+
+    Gymnasium's parameters, which its class has as constants, are keywords here. By default `damping_2` and
+    `dry_friction_2` follow the shoulder's.
+
+    ## Equations
+
+    These are those of Sutton and Barto's book, Gymnasium's choice (`book_or_nips = "book"`).
+
+    ## Signs and Units
+
+    SI units. θ₁ = 0 hangs, θ₂ = 0 is straight; both grow counter-clockwise and are not wrapped.
+
+    ## Numerical Accuracy
+
+    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
+    step: the returns of a policy are.
+
+    ## Known Returns
+
+    The optimum is not known.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "AcrobotExact-v0"
+    peer = "Acrobot-v1"
+    quantities = {
+        **_ANGLES,
+        "theta_1_dot": ("rad/s", "angular velocity of the first link, clipped at 4π"),
+        "theta_2_dot": ("rad/s", "that of the second against the first, clipped at 9π"),
+    }
+    scene: Any = Acrobot
+    defaults = {"inertia_1": 1.0, "inertia_2": 1.0, "gravity": 9.8}
+    usable = _USABLE
+    interval, steps = 0.2, 500
+    action = {"elbow_torque": [-1.0, 0.0, 1.0]}
+    start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.1)
+    fastest_seen = {"theta_1_dot": 4.0 * math.pi, "theta_2_dot": 9.0 * math.pi}  # [rad/s]
+
+    controllers = {"pump": Controller("lag_envs.controllers.energy:Pump", {"rate": "theta_2_dot"})}
+    reference = "pump"
+    hyperparameters = {"ppo": {"gamma": 0.99}}
+    examples = Examples(
+        start={"state": [0.5, -1.0, 0.8, 1.0]},
+        moving=[1.0, 3.0, -1.0, 5.0],
+        ending=([2.6, 1.0, 0.0, 0.0], 1),
+        batch={"mass_2": [1.0, 0.2, 3.0, 1.0, 0.2, 1.0, 3.0], "damping": [0.0, 0.1, 1.0, 0.0, 0.1, 0.0, 1.0]},
+    )
+    difficulty = "The elbow's torque is far too weak to lift the links, so they have to be swung."
+    note = "The pump pushes the elbow the way it turns, which always adds energy; it never plans ahead."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosines, sines and clipped speeds."""
+        return _angles(after, xp) | {
+            name: clip(after[name], -top, top, xp) for name, top in self.fastest_seen.items()
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of Gymnasium's space."""
+        return dict.fromkeys(_ANGLES, 1.0) | self.fastest_seen
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return -1."""
+        return -1.0
+
+    def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 0."""
+        return 0.0
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the tip is a link's length above the pivot."""
+        return -xp.cos(after.theta_1) - xp.cos(after.theta_1 + after.theta_2) > 1.0
+
+
+class AcrobotReal(Task):
+    """Swing two links of a real machine up by a motor at the elbow, and hold them upright.
+
+    ## Description
+
+    The double pendulum of the RealAIGym project, as identified: two links with quasi-direct-drive motors,
+    friction in both joints, and here only the elbow driven. Swing both links up and keep them upright.
+
+    Parameters, torque limit, control interval, length of an episode and criterion of success are those of the
+    project's published leaderboards [1]_: `design_C.1`, `model_1.0`, 6 N m, 0.002 s and 10 s. Its simulations
+    leave friction and rotors out, its machine has them; so has this one. The driven joint's friction is that
+    which was identified. The idle joint's is 0, for on the machine the idle motor compensates it: it may give
+    0.5 N m for that, and friction takes half as much at most.
+
+    .. [1] F. Wiebe et al., "Open Source Dual-Purpose Acrobot and Pendubot Platform", IEEE Robotics &
+       Automation Magazine 31 (2024); github.com/dfki-ric-underactuated-lab/double_pendulum, folders
+       `data/system_identification/identified_parameters` and `leaderboard`.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The torque is held for one step.
+
+    ## Observation Space
+
+    Cosine and sine of both angles; the speeds, divided by 10 and 20, have no bound.
+
+    ## Rewards
+
+    Each step pays 0.02 h⁴ (1 - 0.1 a²), so that a second pays 10 at most. The tip's height h is 0 hanging and
+    1 upright, taken at the step's end; a is the action. The project's own score, which weighs several norms
+    of a whole trajectory, is no sum over steps. With another `dt` rewards are scaled by dt/0.002.
+
+    ## Starting State
+
+    The links hang, nearly at rest; the project's begin at rest.
+
+    ## Episode End
+
+    Termination: never.
+
+    ## Arguments
+
+    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+    Inertias are about the centres of mass, those of the project's files about the joints. The shoulder's
+    identified friction is `damping=0.001` and `dry_friction=0.16`, the elbow's `damping_2=0.001` and
+    `dry_friction_2=0.12`; with `rotor_inertia=0` and without any friction it is the project's simulation.
+
+    ## Equations
+
+    Dry friction c atan(100 v) is the project's too.
+
+    ## Signs and Units
+
+    SI units. θ₁ = 0 hangs, θ₂ = 0 is straight; both grow counter-clockwise and are not wrapped.
+
+    ## Numerical Accuracy
+
+    The friction's step is narrow: where a joint's speed passes 0, steps are divided.
+
+    ## Known Returns
+
+    The optimum is not known; no return exceeds 100.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "AcrobotReal-v0"
+    quantities = {
+        **_ANGLES,
+        "theta_1_dot/10": ("rad/s", "angular velocity of the first link, divided by 10"),
+        "theta_2_dot/20": ("rad/s", "that of the second against the first, divided by 20"),
+    }
+    scene: Any = Acrobot
+    #: Inertias about the centres of mass; the source has 0.031887199591513114 and 0.05086984812807257 kg m²
+    #: about the joints.
+    defaults = {
+        "mass_1": 0.5234602302310271,
+        "mass_2": 0.6255677234174437,
+        "length_1": 0.2,
+        "length_2": 0.3,
+        "com_distance_1": 0.2,
+        "com_distance_2": 0.25569305436052964,
+        "inertia_1": 0.031887199591513114 - 0.5234602302310271 * 0.2**2,
+        "inertia_2": 0.05086984812807257 - 0.6255677234174437 * 0.25569305436052964**2,
+        "damping": 0.0,
+        "damping_2": 0.001,
+        "dry_friction": 0.0,
+        "dry_friction_2": 0.12,
+        "rotor_inertia": 6.287203962819607e-05,
+        "gear_ratio": 6.0,
+        "gravity": 9.81,
+    }
+    usable = _USABLE
+    interval, steps = 0.002, 5000
+    action = {"elbow_torque": 6.0}
+    start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.05)
+    high = 0.9  # share of both lengths above which the tip is up, as in the project
+
+    goal = Goal(
+        "success: the tip above nine tenths of both links' lengths throughout the last second, and time: "
+        "until it is so for good, the project's swing-up time",
+        arrival="up",
+    )
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.energy:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
+        ),
+    }
+    hyperparameters = {"ppo": {"gamma": 0.999}}
+    examples = Examples(
+        start={"state": [2.8, -1.0, 0.3, 1.0]},
+        moving=[1.0, 8.0, -1.0, -9.0],
+        rest=[math.pi, 0.0, 0.0, 0.0],
+        batch={
+            "mass_2": [0.6, 0.3, 1.2, 0.6, 0.3, 0.6, 1.2],
+            "gravity": [9.81, 3.7, 0.0, 9.81, 3.7, 9.81, 0.0],
+        },
+    )
+    difficulty = (
+        "One motor for two joints, and friction that eats what is pumped in; the upright rest is unstable, "
+        "and 500 decisions a second leave little time for each."
+    )
+    note = (
+        "The LQR is that of the project's leaderboard. It holds the links where it finds them upright; "
+        "hanging links it leaves alone."
+    )
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosines, sines and scaled speeds."""
+        return _angles(after, xp) | {
+            "theta_1_dot/10": 0.1 * after.theta_1_dot,
+            "theta_2_dot/20": 0.05 * after.theta_2_dot,
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of cosines and sines."""
+        return dict.fromkeys(_ANGLES, 1.0)
+
+    def tip(self, after: Any, xp: Any) -> Any:
+        """Return the tip's height above the shoulder, as a share of both links' lengths."""
+        upper, lower = self.scene.length_1, self.scene.length_2
+        height = -upper * xp.cos(after.theta_1) - lower * xp.cos(after.theta_1 + after.theta_2)
+        return height / (upper + lower)
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 0.02 h⁴ (1 - 0.1 a²)."""
+        height = 0.5 + 0.5 * self.tip(after, xp)
+        effort = sum((control[name] * (1.0 / most)) ** 2 for name, most in self.action.items())
+        return 0.02 * height**4 * (1.0 - 0.1 * effort)
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the tip is up."""
+        return self.tip(after, xp) > self.high
+
+
+class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of both)
+    __doc__ = (
+        (AcrobotReal.__doc__ or "")
+        .replace("by a motor at the elbow", "by a motor at the shoulder")
+        .replace("only the elbow driven", "only the shoulder driven")
+    )
+    id = "PendubotReal-v0"
+    defaults = {
+        **AcrobotReal.defaults,
+        "control": "shoulder",
+        "damping": 0.001,
+        "damping_2": 0.0,
+        "dry_friction": 0.16,
+        "dry_friction_2": 0.0,
+    }
+    action = {"shoulder_torque": 6.0}
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.energy:PublishedLQR",
+            {"weights": (0.00125, 0.65, 0.000688, 0.000936), "effort": 25.0},
+        ),
+    }

@@ -1,0 +1,172 @@
+"""Reach for a point with an arm of two links, and stay there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import TwoLinkArm
+from lag_envs.scenes.shapes import Bodies, Circle
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Controller, Examples, Goal
+
+
+class Reach(Task):
+    """Bring an arm's hand to a point by torques in shoulder and elbow, and keep it there.
+
+    ## Description
+
+    An arm of two links hangs in a vertical plane. A point in front of it is drawn for each episode. Bring the
+    hand there, soon, and hold it still against gravity. The motors are weak: the shoulder's cannot hold the
+    arm stretched out level, so of the two postures that reach a point often only one can be kept.
+
+    ## Action Space
+
+    `Box(-1, 1, (2,), float32)`. Values outside are clipped. The torques are held for one step.
+
+    ## Observation Space
+
+    Cosine and sine of both angles, the rates, which have no bound, and the point to reach.
+
+    ## Rewards
+
+    Each step pays exp(-d/0.1)(1 - 0.05 (a₁² + a₂²)), with the hand's distance d from the point in metres at
+    the step's end and the actions a. To pass through the point pays next to nothing: what pays is to be
+    there. With another `dt` rewards are scaled by dt/0.02.
+
+    ## Starting State
+
+    The arm hangs, nearly at rest.
+
+    ## Episode End
+
+    Termination: never.
+
+    ## Arguments
+
+    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+
+    ## Equations
+
+    Both links are uniform.
+
+    ## Signs and Units
+
+    SI units. θ₁ is measured from the level, counter-clockwise, so -π/2 hangs; θ₂ = 0 is stretched. Neither is
+    wrapped. The shoulder is the origin, x to the right and y upward.
+
+    ## Numerical Accuracy
+
+    The steps are certified, as those of every environment.
+
+    ## Known Returns
+
+    The optimum is not known; no return exceeds 200.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "TwoLinkArm-v0"
+    quantities = {
+        "cos(theta_1)": ("1", "cosine of the upper arm's angle, 1 level to the right"),
+        "sin(theta_1)": ("1", "its sine, -1 hanging"),
+        "cos(theta_2)": ("1", "cosine of the forearm's angle against the upper arm, 1 stretched"),
+        "sin(theta_2)": ("1", "its sine"),
+        "theta_1_dot/5": ("rad/s", "angular velocity of the upper arm, divided by 5"),
+        "theta_2_dot/10": ("rad/s", "that of the forearm against it, divided by 10"),
+        "goal_x": ("m", "place of the point to reach, to the right of the shoulder"),
+        "goal_y": ("m", "its height above the shoulder"),
+    }
+    scene: Any = TwoLinkArm
+    defaults = {"damping": 0.05}
+    usable = {
+        "mass_1": (0.1, 1e1),
+        "mass_2": (0.1, 1e1),
+        "length_1": (0.1, 2.0),
+        "length_2": (0.1, 2.0),
+        "load": (0.0, 1e1),
+        "damping": (0.0, 1e1),
+        "gravity": (0.0, 1e2),
+    }
+    interval, steps = 0.02, 200
+    action = {"shoulder": 8.0, "elbow": 3.0}
+    start = {"theta_1": (-0.5 * math.pi, 0.3), "theta_1_dot": 0.1, "theta_2": 0.3, "theta_2_dot": 0.1}
+    target = {"goal_x": ("m", 0.35, 0.15), "goal_y": ("m", 0.45)}
+
+    goal = Goal(
+        "success: the hand within 2 cm of the point throughout the last second; time: until it is so for "
+        "good",
+        arrival="there",
+    )
+    controllers = {
+        "springs": Controller("lag_envs.controllers.arm:Springs"),
+        "computed torque": Controller(
+            "lag_envs.controllers.arm:ComputedTorque",
+            tune={"frequency": (2.0, 40.0), "damping": (0.3, 2.0)},
+        ),
+    }
+    reference = "computed torque"
+    hyperparameters = {"ppo": {"gamma": 0.98}}
+    examples = Examples(
+        start={"state": [-1.0, 1.0, 0.5, -1.0], "target": [0.4, 0.1]},
+        moving=[-1.0, 6.0, 0.5, -9.0],
+        rest=[-0.5 * math.pi, 0.0, 0.0, 0.0],
+        batch={
+            "load": [0.0, 0.2, 1.0, 0.0, 0.2, 0.0, 1.0],
+            "gravity": [9.81, 1.6, 0.0, 9.81, 1.6, 9.81, 0.0],
+        },
+    )
+    difficulty = (
+        "Torques are scarce, the links act on each other, and a posture that cannot be held must be left "
+        "alone."
+    )
+    note = (
+        "Springs that pull towards the joint angles of the posture hang short of them, for gravity pulls "
+        "too. The computed torque takes gravity and links' coupling out, and picks the posture that costs "
+        "less to hold."
+    )
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosines, sines, scaled rates and the point."""
+        return {
+            "cos(theta_1)": xp.cos(after.theta_1),
+            "sin(theta_1)": xp.sin(after.theta_1),
+            "cos(theta_2)": xp.cos(after.theta_2),
+            "sin(theta_2)": xp.sin(after.theta_2),
+            "theta_1_dot/5": 0.2 * after.theta_1_dot,
+            "theta_2_dot/10": 0.1 * after.theta_2_dot,
+            "goal_x": target.goal_x,
+            "goal_y": target.goal_y,
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of cosines and sines."""
+        return dict.fromkeys(list(self.quantities)[:4], 1.0)
+
+    def off(self, after: Any, target: Any, xp: Any) -> Any:
+        """Return the square of the hand's distance from the point [m²]."""
+        upper, fore, both = self.scene.length_1, self.scene.length_2, after.theta_1 + after.theta_2
+        x = upper * xp.cos(after.theta_1) + fore * xp.cos(both) - target.goal_x
+        y = upper * xp.sin(after.theta_1) + fore * xp.sin(both) - target.goal_y
+        return x * x + y * y
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return exp(-d/0.1)(1 - 0.05 (a₁² + a₂²))."""
+        effort = sum((control[name] * (1.0 / most)) ** 2 for name, most in self.action.items())
+        return xp.exp(-10.0 * xp.sqrt(self.off(after, target, xp))) * (1.0 - 0.05 * effort)
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the hand is within 2 cm of the point."""
+        return self.off(after, target, xp) <= 0.02**2
+
+    def bodies(self) -> Bodies:
+        """Add the point."""
+        size = 0.05 * (self.scene.length_1 + self.scene.length_2)
+        return {"point": [Circle((0.0, 0.0), size, "target")], **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the point is."""
+        return {**super().indicators(now, xp), "point": (now.target[0], now.target[1], 0.0)}

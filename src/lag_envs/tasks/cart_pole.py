@@ -1,0 +1,420 @@
+"""Tasks with a pole on a cart: Gymnasium's, stepped exactly, with a continuous force, and from below."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import CartPole
+from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Controller, Examples, Goal
+
+_STATE = {
+    "x": ("m", "place of the cart"),
+    "x_dot": ("m/s", "its speed"),
+    "theta": ("rad", "angle of the pole, 0 upright"),
+    "theta_dot": ("rad/s", "its angular velocity"),
+}
+_ORDINARY = {
+    "cart_mass": (0.1, 1e2),
+    "pole_mass": (1e-2, 1e1),
+    "half_length": (0.05, 1e1),
+    "gravity": (0.0, 1e2),
+    "friction": (0.0, 1e1),
+}
+
+
+class _OnTrack(Task):
+    """What the tasks have in common: a cart on a track that ends 2.4 m from its middle."""
+
+    scene: Any = CartPole
+    usable = _ORDINARY
+    interval, steps = 0.02, 500
+    track = 2.4  # half length [m]
+    highest = math.radians(12.0)  # [rad]
+
+    def off_track(self, after: Any, xp: Any) -> Any:
+        """Tell whether the cart has left its track."""
+        return xp.abs(after.x) > self.track
+
+    def check_start(self, state: Any) -> None:
+        """Refuse a start from which the episode would be over."""
+        if self.terminated(state, None, _Numbers):
+            raise ValueError(
+                f"the start must lie inside the limits at which an episode ends, got x={state.x:g} m, "
+                f"theta={state.theta:g} rad"
+            )
+
+
+class _Numbers:
+    """What `terminated` needs of a namespace, for numbers."""
+
+    abs = staticmethod(abs)
+
+
+class CartPoleExact(_OnTrack):
+    """Balance a pole on a cart by pushes to the left or right: Gymnasium's CartPole-v1, stepped exactly.
+
+    ## Description
+
+    A pole stands on a cart. Push the cart to either side so that the pole stays up. Spaces, rewards, starts
+    and endings are those of Gymnasium's `CartPole-v1`, so a policy that was trained there runs here as it is,
+    and the other way round.
+
+    One thing differs. Gymnasium steps by explicit Euler, so that a place does not depend on the push of its
+    own step, and energy grows out of nothing: within ten seconds to several times of what it was. Here the
+    motion under the held force is exact. Where the episode ends, what the space cannot hold is clipped in the
+    observation, not in the state.
+
+    ## Action Space
+
+    `Discrete(2)`. The force is held for one step.
+
+    ## Observation Space
+
+    Place and angle are bounded by twice the limits at which an episode ends. The speeds have no bound:
+    infinity, as in Gymnasium.
+
+    ## Rewards
+
+    Each step pays 1, the last one too. With another `dt` rewards are scaled by dt/0.02.
+
+    ## Starting State
+
+    The pole stands, nearly at rest. Starts outside the limits below are refused.
+
+    ## Episode End
+
+    Termination: |x| > 2.4 m or |θ| > 12 degrees at a step's end.
+
+    ## Arguments
+
+    The force of a push is fixed. Gymnasium's `length` is `half_length` here.
+
+    ## Equations
+
+    Gymnasium's are the same, solved for the accelerations.
+
+    ## Signs and Units
+
+    SI units. θ = 0 is upright and positive to the right, x positive to the right.
+
+    ## Numerical Accuracy
+
+    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
+    step: the returns of a policy are.
+
+    ## Known Returns
+
+    No return exceeds 500, and the best policies get that.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "CartPoleExact-v0"
+    peer = "CartPole-v1"
+    quantities = _STATE
+    action = {"force": [-10.0, 10.0]}
+    start = dict.fromkeys(_STATE, 0.05)
+    unbounded = math.inf
+    order = 10  # a pole that hardly leans: 16 takes half as long again, 8 twice as long
+
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.energy:Regulator",
+            {"weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1}, "effort": 0.01},
+        )
+    }
+    reference = "LQR"
+    hyperparameters = {"ppo": {"gamma": 0.99}}
+    examples = Examples(
+        start={"state": [0.1, -0.2, 0.05, 0.1]},
+        moving=[0.5, 2.0, 0.1, -3.0],
+        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
+        ending=([2.39, 2.0, 0.0, 0.0], 1),
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
+    )
+    difficulty = "The pole falls within a second unless it is caught, and there is no push of strength zero."
+    note = "An LQR whose sign is the push is as good as can be."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return the state; place and angle clipped to the space."""
+        ends = self.bounds()
+        return {
+            name: clip(after[name], -ends[name], ends[name], xp) if name in ends else after[name]
+            for name in self.scene.state_names
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of Gymnasium's space."""
+        return {"x": 2.0 * self.track, "theta": 2.0 * self.highest}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return 1."""
+        return 1.0
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
+
+
+class CartPoleContinuous(_OnTrack):
+    """Balance a pole on a cart by a force of any strength, against kicks, near the middle of the track.
+
+    ## Description
+
+    A pole stands on a cart. Push the cart so that the pole stays up, while random kicks knock it off balance.
+    The model is that of Gymnasium's `CartPole-v1`, the force continuous.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The force is held for one step.
+
+    ## Observation Space
+
+    The state, each entry divided by what it reaches in a good episode. The bounds of place and angle are
+    proved for every start that is accepted; speeds have none.
+
+    ## Rewards
+
+    Each step pays (1 - (θ/0.21)²/2 - (x/2.4)²/2)(1 - 0.1 a²), taken at its end and before a kick, with the
+    action a; 0.21 rad are the 12 degrees below. Inside the limits that lies between 0 and 1, and the effort
+    is a factor, so that ending an episode never pays. With another `dt` rewards are scaled by dt/0.02.
+
+    ## Starting State
+
+    The pole is nearly upright. Given starts must lie inside the limits below.
+
+    After each step, with probability 0.02 (1 - 0.98^(dt/0.02) for another `dt`), a kick changes θ' by a
+    uniform amount within ±1 rad/s.
+
+    ## Episode End
+
+    Termination: |x| > 2.4 m or |θ| > 12 degrees at a step's end. That step pays nothing.
+
+    ## Arguments
+
+    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+
+    ## Equations
+
+    Upright and without a force, the pole of the default parameters falls e-fold in 0.25 s.
+
+    ## Signs and Units
+
+    SI units. θ = 0 is upright and positive to the right, x positive to the right.
+
+    ## Numerical Accuracy
+
+    The steps are certified, as those of every environment.
+
+    ## Known Returns
+
+    No return exceeds 500.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "CartPoleContinuous-v0"
+    quantities = {
+        "x/2.4": ("m", "place of the cart, divided by 2.4"),
+        "x_dot/2": ("m/s", "its speed, halved"),
+        "theta/0.21": ("rad", "angle of the pole, divided by 12 degrees"),
+        "theta_dot/2": ("rad/s", "its angular velocity, halved"),
+    }
+    action = {"force": 10.0}
+    start = {"x": 1.0, "x_dot": 0.1, "theta": 0.1, "theta_dot": 0.2}
+    draws = 2
+
+    goal = Goal("success: not fallen, and on the track", hold=None, arrival="")
+    controllers = {
+        "LQR": Controller(
+            "lag_envs.controllers.energy:Regulator",
+            {"weights": {"x": 0.03, "x_dot": 0.03, "theta": 10.0, "theta_dot": 0.21}, "effort": 5e-4},
+            tune={"effort": (1e-4, 1.0)},
+        )
+    }
+    reference = "LQR"
+    hyperparameters = {"ppo": {"gamma": 0.98}}
+    examples = Examples(
+        start={"state": [0.1, -0.2, 0.05, 0.1]},
+        moving=[0.5, 2.0, 0.1, -3.0],
+        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}, {"state": [0.0, 0.0, -0.3, 0.0]}],
+        ending=([2.39, 2.0, 0.0, 0.0], 1.0),
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
+    )
+    difficulty = (
+        "To bring the cart to the middle it must first be pushed away from it, and each kick has to be met "
+        "with a pole that is never upright by itself."
+    )
+    note = "The LQR's weights are of the size of the reward's; nobody tuned them further."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return the scaled state."""
+        return {
+            "x/2.4": after.x * (1.0 / self.track),
+            "x_dot/2": 0.5 * after.x_dot,
+            "theta/0.21": after.theta * (1.0 / self.highest),
+            "theta_dot/2": 0.5 * after.theta_dot,
+        }
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return (1 - (θ/0.21)²/2 - (x/2.4)²/2)(1 - 0.1 a²)."""
+        lean, place = after.theta * (1.0 / self.highest), after.x * (1.0 / self.track)
+        effort = control.force * 0.1
+        return (1.0 - 0.5 * lean * lean - 0.5 * place * place) * (1.0 - 0.1 * effort * effort)
+
+    def last_reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return nothing: outside the limits the formula would fall below 0."""
+        return 0.0
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
+        return self.off_track(after, xp) | (xp.abs(after.theta) > self.highest)
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Return a change of the pole's rate within ±1 rad/s."""
+        return {"theta_dot": xp.where(draws[0] < self.chance(0.02), 2.0 * draws[1] - 1.0, 0.0)}
+
+
+class CartPoleSwingUp(_OnTrack):
+    """Swing a pole up by pushing its cart, and hold it upright without leaving the track.
+
+    ## Description
+
+    A pole hangs from a cart. Push the cart to and fro to swing the pole up, then keep it upright. The model
+    is that of Gymnasium's `CartPole-v1`.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The force is held for one step.
+
+    ## Observation Space
+
+    Place and angle by cosine and sine are bounded; the speeds have no bound.
+
+    ## Rewards
+
+    Each step pays h² (1 - 0.1 a²). The height h = (1 + cosθ)/2 is 0 hanging and 1 upright, taken at the
+    step's end; a is the action. Because of the square, a pole that only spins earns little. The effort is a
+    factor, so no step pays less than 0 and leaving the track never pays. With another `dt` rewards are scaled
+    by dt/0.02.
+
+    ## Starting State
+
+    The pole hangs, nearly at rest.
+
+    ## Episode End
+
+    Termination: |x| > 2.4 m at a step's end. That step still pays.
+
+    ## Arguments
+
+    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+
+    ## Equations
+
+    Force and motion are coupled: the swinging pole acts back on the cart.
+
+    ## Signs and Units
+
+    SI units. θ = 0 is upright and θ = π hangs; θ is positive to the right and not wrapped. x is positive to
+    the right.
+
+    ## Numerical Accuracy
+
+    The steps are certified, as those of every environment.
+
+    ## Known Returns
+
+    The optimum is not known.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "CartPoleSwingUp-v0"
+    quantities = {
+        "x/2.4": ("m", "place of the cart, divided by 2.4"),
+        "x_dot/4": ("m/s", "its speed, divided by 4"),
+        "cos(theta)": ("1", "cosine of the pole's angle, 1 upright"),
+        "sin(theta)": ("1", "its sine"),
+        "theta_dot/8": ("rad/s", "its angular velocity, divided by 8"),
+    }
+    action = {"force": 10.0}
+    start = {"x": 0.2, "x_dot": 0.1, "theta": (math.pi, 0.05), "theta_dot": 0.1}
+
+    goal = Goal(
+        "success: within 0.2 rad of upright throughout the last second; time: until it is so for good",
+        arrival="upright",
+    )
+    controllers = {
+        "energy shaping + LQR": Controller(
+            "lag_envs.controllers.energy:PivotEnergyLQR",
+            {
+                "pivot": "x",
+                "angle": "theta",
+                "pump": 28.0,
+                "centring": 10.0,
+                "catch": 31.0,
+                "lose": 36.0,
+                "weights": {"x": 0.06, "x_dot": 0.046, "theta": 1.0, "theta_dot": 0.0165},
+                "effort": 0.013,
+            },
+            tune={"pump": (1.0, 60.0), "centring": (0.2, 20.0), "catch": (1.0, 60.0), "lose": (10.0, 300.0)},
+        )
+    }
+    hyperparameters = {"ppo": {"gamma": 0.99}}
+    examples = Examples(
+        start={"state": [0.1, -0.2, 2.0, 3.0]},
+        refused=[{"state": [2.5, 0.0, 0.0, 0.0]}],
+        ending=([2.39, 2.0, 3.0, 0.0], 1.0),
+        reach=12.0,
+        rest=[0.0, 0.0, 0.0, 0.0],
+        batch={
+            "half_length": [0.5, 0.1, 2.0, 0.5, 0.1, 0.5, 2.0],
+            "friction": [0.0, 0.1, 5.0, 0.0, 0.1, 0.0, 5.0],
+        },
+    )
+    difficulty = "The pole must be pumped, caught, and the cart kept on its track meanwhile."
+    note = "Energy shaping pumps with the cart's acceleration, then hands over to an LQR."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return x/2.4, x'/4, cosθ, sinθ, θ'/8."""
+        return {
+            "x/2.4": after.x * (1.0 / self.track),
+            "x_dot/4": 0.25 * after.x_dot,
+            "cos(theta)": xp.cos(after.theta),
+            "sin(theta)": xp.sin(after.theta),
+            "theta_dot/8": 0.125 * after.theta_dot,
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return bounds of cosine and sine."""
+        return {"cos(theta)": 1.0, "sin(theta)": 1.0}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return h² (1 - 0.1 a²) with the height h = (1 + cosθ)/2."""
+        height, effort = 0.5 + 0.5 * xp.cos(after.theta), control.force * 0.1
+        return height * height * (1.0 - 0.1 * effort * effort)
+
+    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the cart has left its track."""
+        return self.off_track(after, xp)
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the pole is within 0.2 rad of upright."""
+        return xp.cos(after.theta) >= math.cos(0.2)

@@ -1,0 +1,304 @@
+"""Tasks with a rod on a hinge: Gymnasium's, stepped exactly, and one whose optimum is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import Pendulum
+from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Controller, Examples, Goal, Optimum
+
+
+def wrapped(cosine: Any, sine: Any, xp: Any) -> Any:
+    """Return the angle in [-π, π] with this cosine and sine."""
+    steep = xp.abs(sine) > xp.abs(cosine)
+    slope = xp.atan(xp.where(steep, cosine, sine) / xp.where(steep, sine, cosine))
+    quarter = xp.where(sine < 0.0, -0.5 * math.pi, 0.5 * math.pi)
+    return xp.where(steep, quarter - slope, slope + xp.where(cosine < 0.0, 2.0 * quarter, 0.0))
+
+
+class PendulumExact(Task):
+    """Swing a rod up by a weak torque and hold it: Gymnasium's Pendulum-v1, stepped exactly.
+
+    ## Description
+
+    A uniform rod hangs from a motor that is too weak to lift it in one go. Spaces, rewards, starts and the
+    length of an episode are those of Gymnasium's `Pendulum-v1`, so a policy that was trained there runs here
+    as it is, and the other way round.
+
+    Two things differ. Gymnasium steps by semi-implicit Euler: within a swing the energy of the undriven rod
+    is off by several per cent. Here the motion under the held torque is exact. And Gymnasium clips the rod's
+    speed at 8 rad/s, which takes energy away without a cause. Here the speed is free, and only what is
+    *observed* of it is clipped, to the same 8 rad/s that the space allows. Random play passes that speed
+    often. The reward uses the true one.
+
+    ## Action Space
+
+    The torque in N m, `Box(-2, 2, (1,), float32)`, as in Gymnasium and unlike the package's own environments,
+    whose actions lie in [-1, 1]. Values outside are clipped. The torque is held for one step.
+
+    ## Observation Space
+
+    The angle's cosine and sine, and the speed, clipped at 8 rad/s.
+
+    ## Rewards
+
+    Each step pays -(θ² + 0.1 θ'² + 0.001 u²), with θ in [-π, π] and the speed as they were *before* the step,
+    as in Gymnasium. With another `dt` rewards are scaled by dt/0.05.
+
+    ## Starting State
+
+    Any angle, and a small speed.
+
+    ## Episode End
+
+    Termination: never.
+
+    ## Arguments
+
+    Gymnasium's `g` is `gravity` here.
+
+    ## Equations
+
+    Gymnasium has the same equation, θ'' = 3g/(2l) sinθ + 3/(m l²) u.
+
+    ## Signs and Units
+
+    SI units. θ = 0 is upright; θ grows counter-clockwise and is not wrapped in the state.
+
+    ## Numerical Accuracy
+
+    Two ways of stepping one equation part company after a while, so the episodes are not the same step by
+    step: the returns of a policy are.
+
+    ## Known Returns
+
+    The optimum is not known.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "PendulumExact-v0"
+    peer = "Pendulum-v1"
+    quantities = {
+        "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
+        "sin(theta)": ("1", "its sine"),
+        "theta_dot": ("rad/s", "angular velocity, clipped at 8"),
+    }
+    scene: Any = Pendulum
+    defaults = {"gravity": 10.0}
+    usable = {"mass": (1e-2, 1e2), "length": (1e-1, 1e1), "damping": (0.0, 1e2), "gravity": (0.0, 1e2)}
+    interval, steps = 0.05, 200
+    action = {"torque": 2.0}
+    largest_action = 2.0
+    start = {"theta": math.pi, "theta_dot": 1.0}
+    fastest_seen = 8.0  # [rad/s]
+
+    controllers = {
+        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+    }
+    reference = "energy shaping + LQR"
+    hyperparameters = {"ppo": {"gamma": 0.95}}
+    examples = Examples(
+        start={"state": [2.0, 3.0]},
+        moving=[2.0, 12.0],
+        reach=12.0,
+        rest=[0.0, 0.0],
+        batch={
+            "length": [1.0, 0.1, 5.0, 1.0, 0.1, 1.0, 5.0],
+            "damping": [0.0, 0.1, 10.0, 0.0, 0.1, 0.0, 10.0],
+        },
+    )
+    difficulty = (
+        "The motor holds the rod only within some 24 degrees of upright, so energy has to be pumped in first."
+    )
+    note = "Best is energy shaping, which hands over to an LQR near upright. Nothing else was tried."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosθ, sinθ and the clipped θ'."""
+        top = self.fastest_seen
+        return {
+            "cos(theta)": xp.cos(after.theta),
+            "sin(theta)": xp.sin(after.theta),
+            "theta_dot": clip(after.theta_dot, -top, top, xp),
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of Gymnasium's space."""
+        return {"cos(theta)": 1.0, "sin(theta)": 1.0, "theta_dot": self.fastest_seen}
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return -(θ² + 0.1 θ'² + 0.001 u²) with the state before the step."""
+        angle = wrapped(xp.cos(before.theta), xp.sin(before.theta), xp)
+        return -(angle * angle + 0.1 * before.theta_dot**2 + 0.001 * control.torque**2)
+
+    @property
+    def fastest(self) -> float:
+        """Speed that field and torque can add in a second [rad/s]; a bound on what a step may turn."""
+        rod = self.scene
+        pull = (0.5 * rod.mass * rod.gravity * rod.length + 2.0) / (rod.mass * rod.length**2 / 3.0)
+        return 2.0 * math.sqrt(pull)
+
+
+class PendulumRegret(Task):
+    """Swing a rod up by a weak torque in a task whose optimal policy and value are known exactly.
+
+    ## Description
+
+    A uniform rod hangs from a motor that is too weak to lift it in one go. Swing it up and hold it. What is
+    special is the reward: it is built backwards, from a value function and a policy that were chosen first
+    (converse optimality [1]_), on the exact motion of the step. So the regret of any policy is an absolute
+    number, to rounding: there is no "best known" that could be beaten.
+
+    .. [1] J. C. Doyle, J. A. Primbs, B. Shapiro and V. Nevistić, "Nonlinear games: examples and
+       counterexamples", IEEE Conference on Decision and Control (1996), 3915-3920.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The torque is held for one step.
+
+    ## Observation Space
+
+    The angle's cosine and sine; the speed, divided by 8, has no bound.
+
+    ## Rewards
+
+    Let V be the energy that is missing, plus that which is too much: what the rod's height lacks of upright,
+    and its kinetic energy, together as a share of what lies between hanging and upright, times 100. And let
+    π be a law of the state: far from upright a torque that pumps the energy to that of the upright rest,
+    near it a damped spring. Each step pays
+
+    V(before) - V(after) - 0.2 ((u - π(before))/U)².
+
+    The sum over an episode is V(start) - V(end) - 0.2 Σ((u - π)/U)². As V is nowhere below 0, no policy gets
+    more than V(start); π gets V(start) - V(end), and brings V to nothing.
+
+    It is no recipe, though. The law is not observed. Pumping raises V at first, so whoever takes what the
+    next step pays most brakes the rod and keeps it hanging: the penalty weighs little against that. With
+    another `dt` V's share of the reward is not scaled, so the bound stays.
+
+    ## Starting State
+
+    The rod hangs, nearly at rest.
+
+    ## Episode End
+
+    Termination: never.
+
+    ## Arguments
+
+    The law is made of the parameters. Where they leave the motor too weak for it, V(start) stays a bound.
+
+    ## Equations
+
+    J θ'' = w sinθ + u, with J = m l²/3 and w = m g l/2.
+
+    ## Signs and Units
+
+    SI units. θ = 0 is upright; θ grows counter-clockwise and is not wrapped.
+
+    ## Numerical Accuracy
+
+    The sum telescopes on the states that the steps return, so the identity holds to rounding.
+
+    ## Known Returns
+
+    The optimum lies between V(start) - V(end) of π and V(start).
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "PendulumRegret-v0"
+    quantities = {
+        "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
+        "sin(theta)": ("1", "its sine"),
+        "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
+    }
+    scene: Any = Pendulum
+    usable = {"mass": (1e-2, 1e2), "length": (1e-1, 1e1), "damping": (0.0, 1e2), "gravity": (1e-1, 1e2)}
+    interval, steps = 0.05, 200
+    scaled = False
+    action = {"torque": 2.0}
+    start = {"theta": (math.pi, 0.2), "theta_dot": 0.2}
+    penalty = 0.2
+
+    goal = Goal(
+        "success: within 0.1 rad of upright throughout the last second; time: until it is so for good",
+        arrival="upright",
+    )
+    optimum = Optimum(
+        "lag_envs.controllers.energy:value_at_start",
+        "pump the energy up, then act as a damped spring; V(start), which nobody exceeds",
+    )
+    controllers = {
+        "optimal law": Controller("lag_envs.controllers.energy:OwnLaw"),
+        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+    }
+    reference = "energy shaping + LQR"
+    hyperparameters = {"ppo": {"gamma": 0.999}}
+    examples = Examples(
+        start={"state": [2.0, 3.0]},
+        moving=[2.0, 12.0],
+        reach=12.0,
+        rest=[0.0, 0.0],
+        batch={
+            "length": [1.0, 0.5, 2.0, 1.0, 0.5, 1.0, 2.0],
+            "damping": [0.0, 0.01, 0.1, 0.0, 0.01, 0.0, 0.1],
+        },
+    )
+    difficulty = (
+        "The reward of a step misleads: it pays for a height that is lost again, and pumping first costs."
+    )
+    note = (
+        "The optimal law loses nothing but what the rod lacks of upright at the end. A good swing-up of "
+        "another kind pays for each torque that differs."
+    )
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosθ, sinθ, θ'/8."""
+        return {
+            "cos(theta)": xp.cos(after.theta),
+            "sin(theta)": xp.sin(after.theta),
+            "theta_dot/8": 0.125 * after.theta_dot,
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of cosine and sine."""
+        return {"cos(theta)": 1.0, "sin(theta)": 1.0}
+
+    def value(self, state: Any, xp: Any) -> Any:
+        """Return V: 100 (w (1 - cosθ) + J θ'²/2)/(2w)."""
+        inertia, weight = self._numbers()
+        lacking = weight * (1.0 - xp.cos(state.theta)) + 0.5 * inertia * state.theta_dot**2
+        return 50.0 * lacking / weight
+
+    def law(self, state: Any, xp: Any) -> Any:
+        """Return the optimal torque π [N m]."""
+        inertia, weight = self._numbers()
+        top = self.action["torque"]
+        spring = -3.0 * weight * xp.sin(state.theta) - 3.0 * xp.sqrt(weight * inertia) * state.theta_dot
+        missing = weight * (1.0 - xp.cos(state.theta)) - 0.5 * inertia * state.theta_dot**2
+        pump = xp.where(state.theta_dot < 0.0, -1.0, 1.0) * (5.0 * top) * (missing / weight)
+        near = (xp.cos(state.theta) > 0.9) & (xp.abs(spring) < top)
+        return xp.where(near, spring, clip(pump, -top, top, xp))
+
+    def _numbers(self) -> tuple[Any, Any]:
+        """Return the rod's inertia J and the torque w of its weight."""
+        rod = self.scene
+        return rod.mass * rod.length**2 / 3.0, 0.5 * rod.mass * rod.gravity * rod.length
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return V(before) - V(after) - 0.2 ((u - π(before))/U)²."""
+        off = (control.torque - self.law(before, xp)) * (1.0 / self.action["torque"])
+        return self.value(before, xp) - self.value(after, xp) - self.penalty * off * off
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the rod is within 0.1 rad of upright."""
+        return xp.cos(after.theta) >= math.cos(0.1)

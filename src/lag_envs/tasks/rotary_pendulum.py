@@ -1,0 +1,148 @@
+"""Swing Furuta's pendulum up by a torque on its arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.scenes import RotaryPendulum
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.record import Controller, Examples, Goal
+
+
+class RotarySwingUp(Task):
+    """Swing a pendulum up by turning the arm that carries it, and hold it upright with the arm in front.
+
+    ## Description
+
+    A pendulum hangs from the end of an arm that a motor turns about the vertical: Furuta's apparatus. Turn
+    the arm to and fro to swing the pendulum up, then keep it upright and the arm where it began.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The torque is held for one step.
+
+    ## Observation Space
+
+    Cosine and sine of both angles; the rates, divided by 10 and 20, have no bound.
+
+    ## Rewards
+
+    Each step pays h² (0.8 + 0.2 cosφ)(1 - 0.1 a²). The height h = (1 - cosθ)/2 is 0 hanging and 1 upright,
+    taken at the step's end like φ; a is the action. Because of the square, a pendulum that only spins earns
+    little. With another `dt` rewards are scaled by dt/0.02.
+
+    ## Starting State
+
+    The pendulum hangs, nearly at rest.
+
+    ## Episode End
+
+    Termination: never.
+
+    ## Arguments
+
+    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+
+    ## Equations
+
+    A fast arm throws the pendulum outwards: the term with φ'² sin(2θ).
+
+    ## Signs and Units
+
+    SI units. θ = 0 hangs straight down and θ = π stands; neither angle is wrapped.
+
+    ## Numerical Accuracy
+
+    The steps are certified, as those of every environment.
+
+    ## Known Returns
+
+    The optimum is not known; no return exceeds 500.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    id = "RotaryPendulum-v0"
+    quantities = {
+        "cos(phi)": ("1", "cosine of the arm's angle"),
+        "sin(phi)": ("1", "its sine"),
+        "phi_dot/10": ("rad/s", "the arm's angular velocity, divided by 10"),
+        "cos(theta)": ("1", "cosine of the pendulum's angle, 1 hanging"),
+        "sin(theta)": ("1", "its sine"),
+        "theta_dot/20": ("rad/s", "its angular velocity, divided by 20"),
+    }
+    scene: Any = RotaryPendulum
+    defaults = {"arm_inertia": 2e-3, "inertia": 7.5e-4, "arm_damping": 5e-4, "damping": 1e-4}
+    usable = {
+        "arm_length": (0.02, 2.0),
+        "arm_inertia": (1e-4, 1.0),
+        "mass": (1e-2, 1.0),
+        "com_distance": (0.02, 1.0),
+        "inertia": (1e-6, 1.0),
+        "arm_damping": (0.0, 1.0),
+        "damping": (0.0, 1.0),
+        "gravity": (0.0, 1e2),
+    }
+    interval, steps = 0.02, 500
+    action = {"torque": 0.15}
+    start = dict.fromkeys(("phi", "phi_dot", "theta", "theta_dot"), 0.1)
+
+    goal = Goal(
+        "success: within 0.2 rad of upright throughout the last second; time: until it is so for good",
+        arrival="upright",
+    )
+    controllers = {
+        "energy shaping + LQR": Controller(
+            "lag_envs.controllers.energy:PivotEnergyLQR",
+            {
+                "pivot": "phi", "angle": "theta", "at": {"theta": math.pi},
+                "pump": 162.0, "centring": 5.5, "catch": 18.0, "lose": 600.0,
+                "weights": {"phi": 0.0235, "phi_dot": 7e-4, "theta": 1.0, "theta_dot": 6e-4}, "effort": 0.08,
+            },
+            tune={"pump": (10.0, 1e3), "centring": (0.5, 50.0), "catch": (1.0, 60.0), "lose": (10.0, 1e3)},
+        )
+    }  # fmt: skip
+    hyperparameters = {"ppo": {"gamma": 0.99}}
+    examples = Examples(
+        start={"state": [0.3, -2.0, 2.0, 3.0]},
+        moving=[0.3, -8.0, 2.0, 12.0],
+        reach=20.0,
+        rest=[0.0, 0.0, math.pi, 0.0],
+        batch={
+            "mass": [0.1, 0.05, 0.3, 0.1, 0.05, 0.1, 0.3],
+            "damping": [0.0, 1e-4, 1e-2, 0.0, 1e-4, 0.0, 1e-2],
+        },
+    )
+    difficulty = (
+        "The motor is too weak to lift the pendulum in one go, and arm and pendulum push each other, the "
+        "faster the harder."
+    )
+    note = "Energy shaping pumps with the arm's acceleration, then hands over to an LQR."
+
+    def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
+        """Return cosφ, sinφ, φ'/10, cosθ, sinθ, θ'/20."""
+        return {
+            "cos(phi)": xp.cos(after.phi),
+            "sin(phi)": xp.sin(after.phi),
+            "phi_dot/10": 0.1 * after.phi_dot,
+            "cos(theta)": xp.cos(after.theta),
+            "sin(theta)": xp.sin(after.theta),
+            "theta_dot/20": 0.05 * after.theta_dot,
+        }
+
+    def bounds(self) -> Mapping[str, float]:
+        """Return the bounds of cosines and sines."""
+        return dict.fromkeys(("cos(phi)", "sin(phi)", "cos(theta)", "sin(theta)"), 1.0)
+
+    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+        """Return h² (0.8 + 0.2 cosφ)(1 - 0.1 a²)."""
+        height, effort = 0.5 - 0.5 * xp.cos(after.theta), control.torque * (1.0 / self.action["torque"])
+        return height * height * (0.8 + 0.2 * xp.cos(after.phi)) * (1.0 - 0.1 * effort * effort)
+
+    def reached(self, after: Any, target: Any, xp: Any) -> Any:
+        """Tell whether the pendulum is within 0.2 rad of upright."""
+        return xp.cos(after.theta) <= -math.cos(0.2)
