@@ -12,7 +12,6 @@ follows from the episode's.
 from __future__ import annotations
 
 import math
-
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import cached_property
@@ -26,18 +25,17 @@ from lag_envs.envs.program import (
     _indent,
     _lines,
     _next_episode,
-    _observations,
     constants_of,
     program_for,
 )
-from lag_envs.mechanics.algebra import FormulaError, evaluate
+from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.recording import formula as naming
 from lag_envs.mechanics.recording import parameter, twin
 from lag_envs.stepping.compiling import BLOCK, compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
 from lag_envs.stepping.tracing import Number
-from lag_envs.stepping.twofold import Twofold, two_product, two_sum
+from lag_envs.stepping.twofold import two_product, two_sum
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import seen_box
 
@@ -72,7 +70,9 @@ def numbers_of(task: Task) -> dict[str, float]:
 def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
     """Return the program of an environment, or of a batch of tasks that have these constants."""
     absent = frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
-    varying = frozenset(name for name in constants[0] if any(c[name] != constants[0][name] for c in constants))
+    varying = frozenset(
+        name for name in constants[0] if any(c[name] != constants[0][name] for c in constants)
+    )
     if task.imperfections is None:
         return program_for(task, absent, varying)
     key = (type(task), type(task.scene), task.formulas.key, task.imperfections.structure, absent, varying)
@@ -125,7 +125,7 @@ class ImperfectProgram(Program):
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         super()._record(formulas, constants)
         found = self.options
-        actions, width, targets = len(self.a), len(self.y), len(self.g)
+        actions, width = len(self.a), len(self.y)
         given = constants | {"dt": "h"}  # within a piece of a step, its length
         self._numbers = constants
 
@@ -181,7 +181,7 @@ class ImperfectProgram(Program):
     def _noisy(
         self, values: Sequence[str], purpose: str, sigma: Sequence[float], name: str, formulas: Any
     ) -> list[str]:
-        """Return the lines that add normal draws to values: numbers 2i and 2i + 1 share a pair of uniforms."""
+        """Return the lines that add normal draws to values; each two share a pair of uniform ones."""
         if not sigma:
             return []
 
@@ -227,7 +227,7 @@ class ImperfectProgram(Program):
     def _key(purpose: str) -> str:
         return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
 
-    # --- one environment, alone or in a batch: row r lies at f[base + r * stride] ------------------------------
+    # --- one environment, alone or in a batch: row r lies at f[base + r * stride] --------------------------
 
     def _at(self, row: str, slot: str = "") -> str:
         """Return where a row lies; with `slot` that of the slot of a ring with this number."""
@@ -505,7 +505,7 @@ class ImperfectProgram(Program):
         return _compiled("start_all", arguments, body, self.launch)
 
 
-# --- parameters that are drawn -------------------------------------------------------------------------------
+# --- parameters that are drawn ------------------------------------------------------------------------------
 
 
 class _Constants:

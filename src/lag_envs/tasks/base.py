@@ -171,7 +171,13 @@ class Task:
         asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
         known = list(inspect.signature(kind).parameters)
         for name in sorted(set(parameters) - set(known)):
-            options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else []), *KEYWORDS]
+            options = [
+                *sorted(known),
+                "dt",
+                "duration",
+                *(["target"] if type(self).target else []),
+                *KEYWORDS,
+            ]
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; this environment takes {', '.join(options)}"

@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -40,7 +40,7 @@ LATEST = 1000
 MOST_DRAWN = 8
 #: A delay this near to a whole number of control steps [steps] is one.
 _WHOLE = 1e-9
-#: By this share a bound is wider than what the tried parameters need. What lies beyond is shown as the bound.
+#: By this share a bound is wider where it is not proved; what lies beyond it is shown as the bound.
 MARGIN = 0.1
 _UNBOUNDED = float(np.finfo(np.float32).max)
 
@@ -136,7 +136,7 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
                 f"{type(task).__name__}.imperfections: unknown {name!r}; known are {', '.join(KEYWORDS)}"
             )
     asked = {name: value for name, value in (dict(own) | dict(given)).items() if value is not None}
-    found = {}
+    found: dict[str, Any] = {}
     for name, value in asked.items():
         found |= _READERS[name](task, value)
     return Imperfections(**found) if Imperfections(**found) != Imperfections() else None
@@ -147,6 +147,8 @@ def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | No
 
 def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing: float) -> tuple[float, ...]:
     """Return a number for each name: from one for all, from a mapping, or from as many in a row."""
+    if not names:
+        raise ValueError(f"{keyword}: there is no {what} here, got {shown(value)}; leave it out")
     if isinstance(value, Mapping):
         for name in value:
             if name not in names:
@@ -235,7 +237,7 @@ def _action_delay(task: Task, value: Any) -> dict[str, Any]:
     else:
         low = high = _seconds("action_delay", value, task.dt)
     if high and not task.formulas.acting:
-        raise ValueError(f"action_delay: {type(task).__name__} has no actions")
+        raise ValueError(f"action_delay: there is no action here, got {shown(value)}; leave it out")
     return {"action_delay": (low, high)}
 
 
@@ -262,7 +264,7 @@ def _push(task: Task, value: Any) -> dict[str, Any]:
     if rate < 0.0:
         raise ValueError(f"push: its rate must be at least 0, got {rate:g}; 0 is off")
     sizes = dict(zip(moving, _sizes("push: its size", value[1], moving, "free velocity"), strict=False))
-    if not moving or rate == 0.0 or not sizes:
+    if rate == 0.0 or not sizes:
         return {}
     return {"push": tuple(sizes.get(e.name, 0.0) for e in layout.state), "push_rate": rate}
 
@@ -282,9 +284,7 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
     where, scene = f"randomize[{name!r}]", task.scene
     if name not in (numbers := scene._numbers()):
         known = [*inspect.signature(type(scene)).parameters, "dt", "duration", "target"]
-        why = (
-            "it decides how the environment is built" if name in known else "there is no such parameter"
-        )
+        why = "it decides how the environment is built" if name in known else "there is no such parameter"
         raise ValueError(f"{where}: it cannot be drawn, {why}; what can be is {', '.join(numbers)}")
     if not isinstance(given, Sequence) or isinstance(given, str) or len(given) < 2:
         raise ValueError(
@@ -352,13 +352,13 @@ class Drawn:
         self.task = task
         assert task.imperfections is not None
         self.draws = task.imperfections.drawn
-        #: One with values inside of all ranges.
-        self.inner = self.at(_middle(d, 0.37 + 0.03 * i) for i, d in enumerate(self.draws))
         self._corners = [self.at(ends) for ends in itertools.product(*((d.low, d.high) for d in self.draws))]
+        #: One with values inside of all ranges.
+        self.inner = self.at([_middle(d, 0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
         for corner in self._corners:
             self._compare(corner)
 
-    def at(self, values: Iterator[float] | Sequence[float]) -> Task:
+    def at(self, values: Sequence[float]) -> Task:
         """Return the task, without imperfections, that has these values of the drawn parameters."""
         given = dict(zip((d.name for d in self.draws), values, strict=True))
         try:
@@ -418,19 +418,22 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
     """Return the lowest and highest values that an environment of this task shows.
 
     Its bounds are those of the task, for all parameters that may be drawn, and wider by the largest noise.
+    Tasks prove their bounds for parameters that are given and for the ends of control steps; what is seen
+    within one, and what parameters between those that were tried would need, has a margin.
     """
     found = task.imperfections
     if found is None:
         return task.formulas.box()
     boxes = [t.formulas.box() for t in (task.drawn.tried if task.drawn else [task])]
-    low, high = [], []
+    low: list[float] = []
+    high: list[float] = []
     noise = found.observation_noise or (0.0,) * len(task.observation)
     for i, sigma in enumerate(noise):
         ends = [box[0][i] for box in boxes], [box[1][i] for box in boxes]
         for values, end, side, out in ((ends[0], min, -1.0, low), (ends[1], max, 1.0, high)):
             bound = end(values)
             if abs(bound) < _UNBOUNDED:
-                if min(values) != max(values):
+                if found.within or min(values) != max(values):
                     bound += side * MARGIN * abs(bound)
                 bound += side * sigma * LARGEST_NORMAL
             out.append(min(max(bound, -_UNBOUNDED), _UNBOUNDED))
