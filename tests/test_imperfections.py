@@ -14,7 +14,9 @@ import pytest
 import lag_envs
 from lag_envs.envs.imperfect import PURPOSES, numbers_of, program_of
 from lag_envs.envs.program import Program, constants_of
+from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.stepping.primitives import episode_key, uniform
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.imperfections import KEYWORDS, LARGEST_NORMAL, MARGIN
@@ -447,3 +449,8 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
 
     with pytest.raises(ValueError, match="an attribute that it computes from parameters"):
         LagrangianVectorEnv(Stale, 1, randomize={"mass": (0.5, 2.0)})
+
+
+def test_scripts_refuse_them():
+    with pytest.raises(FormulaError, match=r"SwingUp has hidden parameters, or imperfect .*None"):
+        Unfused(make_task(ID, **ALL))

@@ -14,6 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.imperfect import numbers_of, program_of
 from lag_envs.envs.program import SLOW, constants_of
@@ -233,6 +234,47 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._viewer is not None:
             self._viewer.close()
             self._viewer = None
+
+    def get_state(self) -> snapshots.Snapshot:
+        """Return all that decides how this episode and those after it go on, for `set_state`.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("call reset() before get_state(): no episode has begun")
+        rows = {name: self._rows[[self._row[name]]] for name in self._program.kept}
+        total = np.array([self._total])
+        return snapshots.Snapshot(
+            self._about, rows, self._ids.reshape(3, 1).copy(), np.zeros(1, np.int64), total, self._ready
+        )
+
+    def set_state(self, snapshot: snapshots.Snapshot) -> None:
+        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            Of this environment, or of one that was made alike, perhaps in another process.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For what is no snapshot, or one of another environment; nothing is changed then.
+        """
+        snapshots.check(snapshot, self._about, self._program.kept)
+        for name, values in snapshot.rows.items():
+            self._rows[self._row[name]] = values[0]
+        self._ids[:] = snapshot.ids[:, 0]
+        self._ready, self._total = snapshot.ready, float(snapshot.totals[0])
+        self._started = True
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What a snapshot must agree in."""
+        return snapshots.about([self.task], num_envs=None)
 
     # --- what can be looked at -----------------------------------------------------------------------------
 

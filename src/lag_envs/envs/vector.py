@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.imperfect import numbers_of, program_of
 from lag_envs.envs.program import BLOCK
@@ -316,6 +317,57 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             viewer.close()
         self._viewers = ()
 
+    def get_state(self) -> snapshots.Snapshot:
+        """Return all that decides how these episodes and those after them go on, for `set_state`.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("call reset() before get_state(): no episode has begun")
+        rows = {name: self._read(name) for name in self._program.kept}
+        ids = self._ids.reshape(3, self.num_envs).copy()
+        return snapshots.Snapshot(self._about, rows, ids, self._steps.copy(), self._totals.copy())
+
+    def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
+        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            Of this batch, or of one that was made alike, perhaps in another process.
+        mask : ndarray of bool, shape (num_envs,), optional
+            The environments to set; by default all. The others stay as they are.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For what is no snapshot, or one of another batch, and for a mask that is none; nothing is changed
+            then.
+        ResetNeeded
+            Before the first reset, where the mask leaves some out.
+        """
+        snapshots.check(snapshot, self._about, self._program.kept)
+        mask = self._check_mask(mask, "mask")
+        if not self._started and not mask.all():
+            raise ResetNeeded("call reset() before set_state() with a mask that leaves some out")
+        lanes = self._lanes[mask]
+        for name, values in snapshot.rows.items():
+            self._write(name, lanes, values[lanes])
+        self._ids.reshape(3, self.num_envs)[:, lanes] = snapshot.ids[:, lanes]
+        self._steps[lanes], self._totals[lanes] = snapshot.steps[lanes], snapshot.totals[lanes]
+        self._started = True
+        self._over = int(np.count_nonzero(self._read("n") < 0.0))
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What a snapshot must agree in."""
+        options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
+        limit = self._constants[0]["limit"]
+        return snapshots.about(self._tasks, **options, max_episode_steps=limit, order=self.order)
+
     # --- what can be looked at -----------------------------------------------------------------------------
 
     @property
@@ -463,18 +515,17 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         error.results = results
         return error
 
-    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
+    def _check_mask(self, mask: Any, name: str = "options['reset_mask']") -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or is_masked(mask):
-            raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {shown(mask)}")
+            raise TypeError(f"{name} must be a NumPy array of bool, got {shown(mask)}")
         if mask.shape != (self.num_envs,):
             raise ValueError(
-                f"options['reset_mask'] must have shape ({self.num_envs},), "
-                f"got shape {mask.shape}: {shown(mask)}"
+                f"{name} must have shape ({self.num_envs},), got shape {mask.shape}: {shown(mask)}"
             )
         if not mask.any():
-            raise ValueError(f"options['reset_mask'] must select at least one environment, got {shown(mask)}")
+            raise ValueError(f"{name} must select at least one environment, got {shown(mask)}")
         return mask
 
     def _check_seeds(self, seed: Any) -> list[tuple[int, int]]:
