@@ -452,5 +452,5 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
 
 
 def test_scripts_refuse_them():
-    with pytest.raises(FormulaError, match=r"SwingUp has hidden parameters, or imperfect .*None"):
+    with pytest.raises(FormulaError, match=r"SwingUp has hidden parameters or imperfect .*None"):
         Unfused(make_task(ID, **ALL))

@@ -94,8 +94,8 @@ class UnfusedProgram:
     def __init__(self, task: Task) -> None:
         if task.imperfections:
             raise FormulaError(
-                f"{type(task).__name__} has hidden parameters, or imperfect sensors or actuators, which scripts "
-                "do not have; switch them off with None, as in observation_noise=None"
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which no "
+                "script has; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
         self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
