@@ -196,7 +196,10 @@ def test_equations(env_id, page):
     free = scene._layout.free
     assert head.startswith(r"\mathcal{L} = ") and all(one.endswith("= 0") for one in latex[: len(free)])
     state = [0.3 + 0.1 * i for i in range(len(scene.state_names))]
-    found = {name: float(value) for name, value in scene.acceleration(state, [0.7] * len(scene.control_names)).items()}
+    found = {
+        name: float(value)
+        for name, value in scene.acceleration(state, [0.7] * len(scene.control_names)).items()
+    }
     values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
     if "w" in values:  # the momentum's speed stands for the place's rate
         values["x_dot"] = values["w"] - scene.radius * values["phi_dot"]

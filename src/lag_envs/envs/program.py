@@ -58,11 +58,22 @@ class Program:
         Constants that are zero in every environment that the program is for: they leave no code behind.
     varying : frozenset of str
         Constants that differ within a batch; they become rows.
+    names : sequence of str, optional
+        All constants; by default those of the task.
     """
 
-    def __init__(self, task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> None:
+    #: Rows that are kept besides.
+    own: Sequence[str] = ()
+
+    def __init__(
+        self,
+        task: Any,
+        absent: frozenset[str],
+        varying: frozenset[str] = frozenset(),
+        names: Sequence[str] | None = None,
+    ) -> None:
         formulas = task.formulas
-        names = formulas.constants()
+        names = names or list(formulas.constants())
         self._stepper = formulas.stepper(absent)
         #: Whether steps are taken by the general series, block by block, and not lane by lane.
         self.general = not hasattr(self._stepper, "fast")
@@ -74,23 +85,15 @@ class Program:
         self.u = [f"u{i}" for i in range(formulas.controls)]
         self.g = [f"g{i}" for i in range(formulas.targets)]
         self._record(formulas, {name: 0.0 if name in absent else f"k_{name}" for name in names})
-        lines = [
-            *self.control,
-            *self.fast,
-            *self.outcome,
-            *self.last,
-            *self.kick,
-            *self.observe,
-            *self.sample,
-        ]
-        used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", " ".join(lines))}
+        lines = " ".join(self._printed)
+        used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", lines)}
         #: Names of the constants that are carried: those that are not zero, and that something uses.
         self.constants = [name for name in names if f"k_{name}" in used]
         self.uniform = [name for name in self.constants if name not in varying]
         self.varying = [name for name in self.constants if name in varying]
         #: Names of the rows that are kept from step to step, and of those that are needed within one. Those
         #: of the series come first, one behind the other.
-        self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying)]
+        self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying), *self.own]
         self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
         self.scratch = [*self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held]
@@ -136,12 +139,12 @@ class Program:
             return _lines(formula, inputs, outputs, formulas.trace)
 
         top = formulas.largest
-        clip = [
+        self.clip = [
             f"{a} = select({a} < {-top}, {-top}, select({a} > {top}, {top}, {a}))"
             for a in self.a
             if formulas.clipped
         ]
-        self.control = clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
+        self.control = self.clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]
         self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._stepper.fast)]
         #: What closed forms do without.
@@ -160,6 +163,12 @@ class Program:
         draws, names = ([f"{name}{i}" for i in range(states + targets)] for name in ("draw", "s"))
         self.sample = _draw(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
         self.lift = formulas.lift("y")
+
+    @property
+    def _printed(self) -> list[str]:
+        """The lines in which constants are used."""
+        parts = (self.control, self.fast, self.outcome, self.last, self.kick, self.observe, self.sample)
+        return [line for part in parts for line in part]
 
     # --- one environment: rows, then constants, in one array -----------------------------------------------
 
@@ -260,6 +269,11 @@ class Program:
     def room(self) -> int:
         """Numbers that `step_one` needs behind the constants."""
         return self._stepper.scratch if self.general else 0
+
+    @property
+    def room_of_all(self) -> int:
+        """Numbers that `step_all` needs behind the constants."""
+        return len(self.scratch) * BLOCK
 
     def _at_one(self, row: str) -> str:
         return f"f[{(self.kept + self.scratch).index(row)}]"

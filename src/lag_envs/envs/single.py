@@ -14,11 +14,14 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.program import SLOW, constants_of, program_for
+from lag_envs.envs.imperfect import numbers_of, program_of
+from lag_envs.envs.program import SLOW, constants_of
 from lag_envs.scenes.checks import check_number, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import seen_box
 
 RENDER_MODES = ["human", "rgb_array"]
 FLOAT32 = np.dtype(np.float32)
@@ -89,8 +92,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._plain = not self._actions.values and self._actions.count == 1
         self.observation_space = observation_space([self.task])
 
-        constants = constants_of(self.task)
-        self._program = program = program_for(self.task, absent([constants]))
+        constants = numbers_of(self.task)
+        self._program = program = program_of(self.task, [constants])
         rows = program.kept + program.scratch
         numbers = [constants[name] for name in program.uniform]
         self._rows = np.array([0.0] * len(rows) + numbers + [0.0] * program.room)
@@ -99,6 +102,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._row = {name: j for j, name in enumerate(rows)}
         self._size = len(program.o)
         self._ready = self._started = False
+        self._known: tuple[dict[str, float], Task] = {}, self.task
         self._bind()
 
     def _bind(self) -> None:
@@ -232,6 +236,47 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._viewer.close()
             self._viewer = None
 
+    def get_state(self) -> snapshots.Snapshot:
+        """Return all that decides how this episode and those after it go on, for `set_state`.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("call reset() before get_state(): no episode has begun")
+        rows = {name: self._rows[[self._row[name]]] for name in self._program.kept}
+        total = np.array([self._total])
+        return snapshots.Snapshot(
+            self._about, rows, self._ids.reshape(3, 1).copy(), np.zeros(1, np.int64), total, self._ready
+        )
+
+    def set_state(self, snapshot: snapshots.Snapshot) -> None:
+        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            Of this environment, or of one that was made alike, perhaps in another process.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For what is no snapshot, or one of another environment; nothing is changed then.
+        """
+        snapshots.check(snapshot, self._about, self._program.kept)
+        for name, values in snapshot.rows.items():
+            self._rows[self._row[name]] = values[0]
+        self._ids[:] = snapshot.ids[:, 0]
+        self._ready, self._total = snapshot.ready, float(snapshot.totals[0])
+        self._started = True
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What a snapshot must agree in."""
+        return snapshots.about([self.task], num_envs=None)
+
     # --- what can be looked at -----------------------------------------------------------------------------
 
     @property
@@ -248,6 +293,23 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def control(self) -> Any:
         """The control applied last, in SI units; an array where there are several; 0 after a reset."""
         return single_number(self._read(self._program.u))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The parameters that were drawn for this episode, by name; empty where none are."""
+        found = self.task.imperfections
+        drawn = [d.name for d in found.drawn] if found and self._started else []
+        return dict(zip(drawn, self._read([f"p_{name}" for name in drawn]).tolist(), strict=True))
+
+    @property
+    def drawn_task(self) -> Task:
+        """The task as it is in this episode: with the parameters that were drawn, perfect otherwise."""
+        parameters = self.parameters
+        if not parameters:
+            return self.task
+        if self._known[0] != parameters:
+            self._known = parameters, self.task.varied(**parameters)
+        return self._known[1]
 
     def _read(self, names: list[str]) -> NDArray[np.float64]:
         return self._rows[[self._row[name] for name in names]]
@@ -279,8 +341,10 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
-        constants = constants_of(self.task)
         held = self._read(program.held)
+        if self.task.imperfections:
+            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+        constants = constants_of(self.task)
         start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
         *end, status = program.advance(
             *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
@@ -294,7 +358,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return program.finish_one(rows, observation, self._ids)
 
     def _info(self) -> dict[str, Any]:
-        return diagnostics(self.scene, self.state, np.float64(self.control)) if self.diagnostics else {}
+        if not self.diagnostics:
+            return {}
+        return diagnostics(self.drawn_task.scene, self.state, np.float64(self.control))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and windows."""
@@ -303,7 +369,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
         self.__dict__.update(state)
-        self._program = program_for(self.task, absent([constants_of(self.task)]))
+        self._program = program_of(self.task, [numbers_of(self.task)])
         self._bind()
 
 
@@ -342,7 +408,7 @@ def absent(constants: list[dict[str, float]]) -> frozenset[str]:
 
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
     """Return a space that holds the observations of all the tasks."""
-    boxes = [task.formulas.box() for task in {id(task): task for task in tasks}.values()]
+    boxes = [seen_box(task) for task in {id(task): task for task in tasks}.values()]
     low = np.min([low for low, _ in boxes], axis=0).astype(np.float32)
     high = np.max([high for _, high in boxes], axis=0).astype(np.float32)
     return gym.spaces.Box(low, high, dtype=np.float32)

@@ -76,7 +76,7 @@ class UnfusedProgram:
     Parameters
     ----------
     task : Task
-        The task.
+        The task; not with imperfections, which scripts do not have.
 
     Attributes
     ----------
@@ -92,6 +92,11 @@ class UnfusedProgram:
     """
 
     def __init__(self, task: Task) -> None:
+        if task.imperfections:
+            raise FormulaError(
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which no "
+                "script has; switch them off with None, as in observation_noise=None"
+            )
         self.task, formulas, scene = task, task.formulas, task.scene
         self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
         own = formulas.constants()

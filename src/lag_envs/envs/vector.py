@@ -13,11 +13,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.program import BLOCK, constants_of, program_for
+from lag_envs.envs.imperfect import numbers_of, program_of
+from lag_envs.envs.program import BLOCK
 from lag_envs.envs.single import (
     FLOAT32,
-    absent,
     check_flag,
     check_look,
     check_render_mode,
@@ -33,6 +34,7 @@ from lag_envs.scenes.checks import is_masked, real_array, shown
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import KEYWORDS
 
 BOOL = np.dtype(np.bool_)
 
@@ -125,7 +127,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
-        self._constants = [constants_of(task) for task in self._tasks]
+        numbers = {id(task): numbers_of(task) for task in {id(t): t for t in self._tasks}.values()}
+        self._constants = [dict(numbers[id(task)]) for task in self._tasks]
         endless = type(max_episode_steps) is int and max_episode_steps == -1  # Gymnasium's word for it
         if max_episode_steps is not None and not endless:
             steps = float(check_count("max_episode_steps", max_episode_steps))
@@ -135,13 +138,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
         #: The constants, then room for what a step needs.
-        self._par = np.array(uniform + [0.0] * len(program.scratch) * BLOCK)
+        self._par = np.array(uniform + [0.0] * program.room_of_all)
         blocks = -(-self.num_envs // BLOCK)
         self._memory = np.zeros(blocks * len(program.kept) * BLOCK)
         #: Keys of the seeds, numbers of the episodes, keys of the episodes.
         self._ids = np.zeros(3 * self.num_envs, dtype=np.uint64)
         self._lanes = np.arange(self.num_envs)
-        for name in program.varying:
+        for name in program.varying:  # those that are drawn are written when an episode begins
             values = [constants[name] for constants in self._constants]
             self._write(f"k_{name}", self._lanes, np.array(values))
         self._started = False
@@ -151,9 +154,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._seen = render_mode is not None and bool(show_readout or show_trail)
 
     def _compile(self) -> None:
-        first = self._constants[0]
-        varying = frozenset(name for name in first if any(c[name] != first[name] for c in self._constants))
-        self._program = program_for(self.task, absent(self._constants), varying)
+        self._program = program_of(self.task, self._constants)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
 
@@ -316,6 +317,57 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             viewer.close()
         self._viewers = ()
 
+    def get_state(self) -> snapshots.Snapshot:
+        """Return all that decides how these episodes and those after them go on, for `set_state`.
+
+        Raises
+        ------
+        ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("call reset() before get_state(): no episode has begun")
+        rows = {name: self._read(name) for name in self._program.kept}
+        ids = self._ids.reshape(3, self.num_envs).copy()
+        return snapshots.Snapshot(self._about, rows, ids, self._steps.copy(), self._totals.copy())
+
+    def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
+        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+
+        Parameters
+        ----------
+        snapshot : Snapshot
+            Of this batch, or of one that was made alike, perhaps in another process.
+        mask : ndarray of bool, shape (num_envs,), optional
+            The environments to set; by default all. The others stay as they are.
+
+        Raises
+        ------
+        TypeError, ValueError
+            For what is no snapshot, or one of another batch, and for a mask that is none; nothing is changed
+            then.
+        ResetNeeded
+            Before the first reset, where the mask leaves some out.
+        """
+        snapshots.check(snapshot, self._about, self._program.kept)
+        mask = self._check_mask(mask, "mask")
+        if not self._started and not mask.all():
+            raise ResetNeeded("call reset() before set_state() with a mask that leaves some out")
+        lanes = self._lanes[mask]
+        for name, values in snapshot.rows.items():
+            self._write(name, lanes, values[lanes])
+        self._ids.reshape(3, self.num_envs)[:, lanes] = snapshot.ids[:, lanes]
+        self._steps[lanes], self._totals[lanes] = snapshot.steps[lanes], snapshot.totals[lanes]
+        self._started = True
+        self._over = int(np.count_nonzero(self._read("n") < 0.0))
+
+    @property
+    def _about(self) -> dict[str, Any]:
+        """What a snapshot must agree in."""
+        options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
+        limit = self._constants[0]["limit"]
+        return snapshots.about(self._tasks, **options, max_episode_steps=limit, order=self.order)
+
     # --- what can be looked at -----------------------------------------------------------------------------
 
     @property
@@ -338,6 +390,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return single_number(
             np.array([self._read(name) for name in self._program.u]).reshape(-1, self.num_envs).T
         )
+
+    @property
+    def parameters(self) -> dict[str, NDArray[np.float64]]:
+        """The parameters that were drawn for these episodes, shape (num_envs,) each; empty where none are."""
+        found = self.task.imperfections
+        drawn = [d.name for d in found.drawn] if found and self._started else []
+        return {name: self._read(f"p_{name}") for name in drawn}
 
     @property
     def order(self) -> int | None:
@@ -441,8 +500,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         mask = np.ones(self.num_envs, dtype=np.bool_) if mask is None else mask
         infos: dict[str, Any] = {}
         states, controls = self.state, self.control
+        drawn = self.parameters
         for i in self._lanes[mask]:
-            infos = self._add_info(infos, diagnostics(self._tasks[i].scene, states[i], controls[i]), int(i))
+            task = self._tasks[i]
+            if drawn:
+                task = task.varied(**{name: float(values[i]) for name, values in drawn.items()})
+            infos = self._add_info(infos, diagnostics(task.scene, states[i], controls[i]), int(i))
         return infos
 
     def _refusal(self, i: int, results: tuple) -> StepRefused:
@@ -452,18 +515,17 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         error.results = results
         return error
 
-    def _check_mask(self, mask: Any) -> NDArray[np.bool_]:
+    def _check_mask(self, mask: Any, name: str = "options['reset_mask']") -> NDArray[np.bool_]:
         if mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
         if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or is_masked(mask):
-            raise TypeError(f"options['reset_mask'] must be a NumPy array of bool, got {shown(mask)}")
+            raise TypeError(f"{name} must be a NumPy array of bool, got {shown(mask)}")
         if mask.shape != (self.num_envs,):
             raise ValueError(
-                f"options['reset_mask'] must have shape ({self.num_envs},), "
-                f"got shape {mask.shape}: {shown(mask)}"
+                f"{name} must have shape ({self.num_envs},), got shape {mask.shape}: {shown(mask)}"
             )
         if not mask.any():
-            raise ValueError(f"options['reset_mask'] must select at least one environment, got {shown(mask)}")
+            raise ValueError(f"{name} must select at least one environment, got {shown(mask)}")
         return mask
 
     def _check_seeds(self, seed: Any) -> list[tuple[int, int]]:
@@ -530,7 +592,8 @@ def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
     many = {
         name: values
         for name, values in options.items()
-        if isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim > 0)
+        if (isinstance(values, list | tuple) or (isinstance(values, np.ndarray) and values.ndim > 0))
+        and name not in KEYWORDS
     }
     for name, values in many.items():
         if is_masked(values):

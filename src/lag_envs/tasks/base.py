@@ -27,6 +27,7 @@ from lag_envs.scenes.steps import refusal
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.stepping.series import check_order
+from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
 from lag_envs.tasks.record import Controller, Examples, Goal, Optimum, ValueIteration
 
 if TYPE_CHECKING:
@@ -93,6 +94,10 @@ class Task:
         A `record.Controller` for each of its controllers, by name. Every task also has "zero" and "random".
     reference : str
         A quick controller among them, used as a control variate where episodes differ much.
+    imperfections : mapping
+        Keywords of imperfect sensors and actuators and of hidden parameters (`lag_envs.tasks.imperfections`)
+        that this task's environments have on. An instance has them checked here, or None. Formulas, and so
+        `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
         For a learner ("fast_ppo", "ppo", "sac", "td3", "tqc", "dqn"): what differs from
         `lag_envs.hyperparams.DEFAULTS`.
@@ -142,6 +147,7 @@ class Task:
     usable: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
     controllers: ClassVar[Mapping[str, Controller]] = MappingProxyType({})
     reference: ClassVar[str] = ""
+    imperfections: Any = MappingProxyType({})
     hyperparameters: ClassVar[Mapping[str, Mapping[str, Any]]] = MappingProxyType({})
     goal: ClassVar[Goal | None] = None
     value_iteration: ClassVar[ValueIteration | None] = None
@@ -154,7 +160,7 @@ class Task:
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        for name in ("defaults", "action", "start", "target", "usable"):
+        for name in ("defaults", "action", "start", "target", "usable", "imperfections"):
             if isinstance(vars(cls).get(name), Mapping):
                 setattr(cls, name, MappingProxyType(dict(vars(cls)[name])))
 
@@ -173,14 +179,23 @@ class Task:
             raise FormulaError(
                 f"{type(self).__name__}.scene must be a class derived from Scene, got {kind!r:.60}"
             )
+        asked = {name: parameters.pop(name) for name in KEYWORDS if name in parameters}
         known = list(inspect.signature(kind).parameters)
         for name in sorted(set(parameters) - set(known)):
-            options = [*sorted(known), "dt", "duration", *(["target"] if type(self).target else [])]
+            options = [
+                *sorted(known),
+                "dt",
+                "duration",
+                *(["target"] if type(self).target else []),
+                *KEYWORDS,
+            ]
             # In Python's own words, by which libraries notice that an environment takes no `frameskip`.
             raise TypeError(
                 f"got an unexpected keyword argument {name!r}; this environment takes {', '.join(options)}"
             )
-        self.scene = kind(**(dict(self.defaults) | parameters))
+        #: Parameters of the scene that were given, here or by the class.
+        self.given = dict(self.defaults) | parameters
+        self.scene = kind(**self.given)
         if self.order is not None:
             vars(self.scene)[ORDER] = check_order(f"{type(self).__name__}.order", self.order)
         self.dt = self.interval if dt is None else check_number("dt", dt, "s")
@@ -196,6 +211,7 @@ class Task:
         _ = self.formulas
         if target is not None:
             self.fixed_target = np.atleast_1d(self.check_target(target))
+        self.imperfections = imperfections_of(self, asked)
 
     # --- what a task defines -------------------------------------------------------------------------------
 
@@ -356,6 +372,20 @@ class Task:
         """What compiled functions are made of."""
         return TaskFormulas(self)
 
+    @cached_property
+    def drawn(self) -> Drawn | None:
+        """The tasks among which each episode's is drawn; None where no parameter is."""
+        return Drawn(self) if self.imperfections and self.imperfections.drawn else None
+
+    def varied(self, **parameters: float) -> Task:
+        """Return the same task, without imperfections, with other parameters of the scene."""
+        target: Any = self.fixed_target
+        if target is not None:
+            target = float(target[0]) if len(target) == 1 else target
+        off = dict.fromkeys(KEYWORDS)
+        given = self.given | parameters
+        return type(self)(dt=self.dt, duration=self.duration, target=target, **given, **off)
+
     @property
     def observation(self) -> tuple[str, ...]:
         """Names of the observation's entries."""
@@ -421,7 +451,7 @@ class Task:
         return np.broadcast_to(np.asarray(holds, np.bool_), len(array))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "formulas"}
+        return {name: value for name, value in vars(self).items() if name not in ("formulas", "drawn")}
 
     # --- the picture ---------------------------------------------------------------------------------------
 
@@ -539,7 +569,7 @@ class Lifted:
 _checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
 
 #: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas"}
+_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn"}
 
 
 class TaskFormulas:
@@ -628,7 +658,8 @@ class TaskFormulas:
     def _self(self, k: Any) -> Task:
         """Return a task whose numbers are those that are recorded."""
         task = copy.copy(self._task)
-        vars(task).pop("formulas", None)
+        for name in ("formulas", "drawn"):
+            vars(task).pop(name, None)
         names = self._task.scene._numbers()
         task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
         task.dt = k.dt
@@ -675,9 +706,17 @@ class TaskFormulas:
 
     def control(self, xp: Any, a: Sequence, y: Sequence, g: Sequence, k: Any) -> list:
         """Return the controls that are applied."""
+        return self.guarded(xp, self.wanted(xp, a), y, k)
+
+    def wanted(self, xp: Any, a: Sequence) -> list:
+        """Return the controls that actions ask for, one for each that actions set."""
+        shares = zip(self.acting, self.shares(a), strict=True)
+        return [_control(acting, share, xp) for acting, share in shares]
+
+    def guarded(self, xp: Any, asked: Sequence, y: Sequence, k: Any) -> list:
+        """Return the controls that are applied where these are asked for."""
         wanted = dict.fromkeys(self._controls, 0.0)
-        for acting, number in zip(self.acting, self.shares(a), strict=True):
-            wanted[acting.control] = _control(acting, number, xp)
+        wanted |= {acting.control: u for acting, u in zip(self.acting, asked, strict=True)}
         if type(self._task).guard is Task.guard:
             return list(wanted.values())
         given = Values("control", wanted)

@@ -1,0 +1,679 @@
+"""Programs of environments with hidden parameters, imperfect sensors or actuators.
+
+What the keywords mean is told in docs/usage.md; `lag_envs.tasks.imperfections` checks them. A control step is
+taken by one function on the rows of one environment. The single environment calls it on its own rows, a batch
+on those of each environment in turn, so both have the same bits. Within the step the command in force may
+change, and what a late sensor shows may lie in its midst: it is divided there, and nowhere else.
+
+Draws come from the same generator as starts and kicks, with a key of their own for each purpose, which
+follows from the episode's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any
+
+from lag_envs.envs.program import (
+    DRAWS,
+    SLOW,
+    Program,
+    _indent,
+    _lines,
+    _next_episode,
+    constants_of,
+    program_for,
+)
+from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.recording import formula as naming
+from lag_envs.mechanics.recording import parameter, twin
+from lag_envs.stepping.compiling import BLOCK, compile_function, record_block
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.flows import split
+from lag_envs.stepping.tracing import Number
+from lag_envs.stepping.twofold import two_product, two_sum
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import seen_box
+
+#: What has draws of its own, by the number that its key is made with.
+PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
+
+
+def numbers_of(task: Task) -> dict[str, float]:
+    """Return every number that an environment's compiled functions take, by name."""
+    found = task.imperfections
+    if found is None:
+        return constants_of(task)
+    numbers = dict(constants_of(task.drawn.inner if task.drawn else task))
+    for name, values in (
+        ("sigma", found.observation_noise),
+        ("shake", found.action_noise),
+        ("slew", found.slew),
+        ("push", found.push),
+        ("draw_low", [d.low for d in found.drawn]),
+        ("draw_high", [d.high for d in found.drawn]),
+        ("rest", _listed(task.formulas.rest_action) if task.formulas.acting else []),
+        *zip(("seen_low", "seen_high"), seen_box(task), strict=True),
+    ):
+        numbers |= {f"{name}{i}": float(value) for i, value in enumerate(values)}
+    # Pushes that come at a rate: the chance that there is one in a step.
+    numbers["push_chance"] = -math.expm1(-found.push_rate * task.dt)
+    numbers["late_low"], numbers["late_high"] = found.action_delay
+    numbers["shown_at"] = (1.0 - found.observation_delay % 1.0) * task.dt
+    return numbers | {"every": float(found.observation_every)}
+
+
+def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
+    """Return the program of an environment, or of a batch of tasks that have these constants."""
+    absent = frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
+    varying = frozenset(
+        name for name in constants[0] if any(c[name] != constants[0][name] for c in constants)
+    )
+    if task.imperfections is None:
+        return program_for(task, absent, varying)
+    key = (type(task), type(task.scene), task.formulas.key, task.imperfections.structure, absent, varying)
+    if task.drawn:
+        key = (*key, task.drawn.inner.formulas.key, *task.drawn.made)
+    if key not in _programs:
+        _programs[key] = ImperfectProgram(task, absent, varying)
+    return _programs[key]
+
+
+_programs: dict[tuple, ImperfectProgram] = {}
+
+
+class ImperfectProgram(Program):
+    """The compiled functions of a task with imperfections; parameters as those of `Program`.
+
+    Rows that are kept besides: drawn parameters ``p_``, the commands that the actuator's slew has reached
+    ``c``, those under way ``sent`` with the time ``at`` which each takes, observations that are still to be
+    seen ``seen``, and what was shown last ``h``.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
+        assert task.imperfections is not None
+        self.options = found = task.imperfections
+        self._absent, self._drawn = absent, task.drawn
+        source = task.drawn.inner if task.drawn else task
+        self._made = _Constants(task, absent) if task.drawn else None
+        drawn = frozenset(self._made.changed) if self._made else frozenset()
+        formulas = source.formulas
+        self.a = [f"a{i}" for i in range(formulas.actions)]
+        seen = range(len(formulas.observation))
+        self.c = [f"c{i}" for i in range(formulas.actions)] if any(found.slew) else []
+        self.p = [f"p_{d.name}" for d in found.drawn]
+        ring = range(found.commands if found.commands > 1 else 0)
+        self.own = [
+            *self.p, *self.c, *(f"h{i}" for i in seen),
+            *(f"{row}_{slot}" for slot in ring for row in [*(f"sent{i}" for i in range(len(self.a))), "at"]),
+            *(f"seen{i}_{slot}" for slot in range(found.readings) for i in seen),
+        ]  # fmt: skip
+        super().__init__(source, absent, varying | drawn, list(numbers_of(task)))
+        self.scratch = [*self.a, *self.o, *self.held]
+
+    # --- lines ----------------------------------------------------------------------------------------------
+
+    @property
+    def _printed(self) -> list[str]:
+        more = (self.perturb, self.sense, self.push, self.at_rest, self.begin, self.command, self.respond)
+        return [*super()._printed, *(line for part in more for line in part)]
+
+    def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
+        super()._record(formulas, constants)
+        found = self.options
+        actions, width = len(self.a), len(self.y)
+        given = constants | {"dt": "h"}  # within a piece of a step, its length
+        self._numbers = constants
+
+        def asked(xp: Any, *values: Any) -> Sequence:
+            return formulas.wanted(xp, list(values))
+
+        def limited(xp: Any, *values: Any) -> list:
+            a, c, (h,), rest = split(values, actions, actions, 1)
+            at = dict(zip(constants, rest, strict=True))
+            reached = []
+            for i, (u, old) in enumerate(zip(formulas.wanted(xp, a), c, strict=True)):
+                if found.slew[i] < math.inf:
+                    most = h * at[f"slew{i}"]
+                    u = xp.minimum(xp.maximum(u, old - most), old + most)
+                reached.append(u)
+            return reached
+
+        def guarded(xp: Any, *values: Any) -> Sequence:
+            w, y, rest = split(values, actions, width)
+            k = SimpleNamespace(**dict(zip(constants, rest, strict=True)))
+            return formulas.guarded(xp, w, y, k)
+
+        def record(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
+            return _lines(formula, inputs, outputs, formulas.trace)
+
+        wanted = [f"w{i}" for i in range(actions)]
+        #: From the command in force to the control: ``a``, ``c``, ``y``, ``h`` to ``u``.
+        if self.c:
+            self.command = record(limited, [*self.a, *self.c, "h", *constants.values()], wanted)
+            self.command += [f"{c} = {w}" for c, w in zip(self.c, wanted, strict=True)]
+        else:
+            self.command = record(asked, self.a, wanted)
+        # Here an actuator that follows its command with a lag would find it, in w.
+        self.command += record(guarded, [*wanted, *self.y, *given.values()], self.u)
+        #: The command before the first.
+        self.at_rest = [f"{a} = {self._constant(f'rest{i}')}" for i, a in enumerate(self.a)]
+        if self.c:
+            self.at_rest += record(asked, self.a, self.c)
+        self.perturb = self._perturb(formulas)
+        self.sense = self._noisy(self.o, "observation", found.observation_noise, "sigma", formulas)
+        self.sense += [self._between(f"o{i}", f"seen_low{i}", f"seen_high{i}") for i in range(len(self.o))]
+        self.push = self._pushes()
+        self.begin = self._made.lines(constants) if self._made else []
+        self.respond = [f"k_{name}" for name in ("late_low", "late_high", "shown_at", "every", "push_chance")]
+
+    def _constant(self, name: str) -> str:
+        return str(self._numbers[name])
+
+    def _between(self, value: str, low: str, high: str) -> str:
+        low, high = self._constant(low), self._constant(high)
+        return f"{value} = select({value} < {low}, {low}, select({value} > {high}, {high}, {value}))"
+
+    def _noisy(
+        self, values: Sequence[str], purpose: str, sigma: Sequence[float], name: str, formulas: Any
+    ) -> list[str]:
+        """Return the lines that add normal draws to values; each two share a pair of uniform ones."""
+        if not sigma:
+            return []
+
+        def normals(xp: Any, first: Any, second: Any) -> list:
+            radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
+            return [radius * xp.cos(angle), radius * xp.sin(angle)]
+
+        lines = [f"key_{purpose} = {self._key(purpose)}"]
+        per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step has that many times `DRAWS`
+        for i in range(0, len(values), 2):
+            pair = [j for j in (i, i + 1) if j < len(values) and sigma[j] > 0.0]
+            if pair:
+                lines += [
+                    f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
+                    for x, j in zip(("first", "second"), (i, i + 1), strict=True)
+                ]
+                lines += _lines(normals, ["first", "second"], ["normal0", "normal1"], formulas.trace)
+                lines += [f"{values[j]} += {self._constant(f'{name}{j}')} * normal{j - i}" for j in pair]
+        return lines
+
+    def _perturb(self, formulas: Any) -> list[str]:
+        """Return the lines that make the command of an action."""
+        noise = self._noisy(self.a, "action", self.options.action_noise, "shake", formulas)
+        return [*self.clip, *noise, *(self.clip if noise else [])]
+
+    def _pushes(self) -> list[str]:
+        """Return the lines that push free velocities, now and then, after a step."""
+        found = [i for i, size in enumerate(self.options.push) if size > 0.0]
+        if not found:
+            return []
+        draws = (f"uniform(key_push, np.uint64(n), np.uint64({1 + j}))" for j in range(len(found)))
+        return [
+            f"key_push = {self._key('push')}",
+            f"if uniform(key_push, np.uint64(n), np.uint64(0)) < {self._constant('push_chance')}:",
+            *(
+                f"    y{i} = y{i} + {self._constant(f'push{i}')} * (2.0 * {draw} - 1.0)"
+                for i, draw in zip(found, draws, strict=True)
+            ),
+        ]
+
+    @staticmethod
+    def _key(purpose: str) -> str:
+        return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
+
+    # --- one environment, alone or in a batch: row r lies at f[base + r * stride] --------------------------
+
+    def _at(self, row: str, slot: str = "") -> str:
+        """Return where a row lies; with `slot` that of the slot of a ring with this number."""
+        if not slot:
+            return f"f[base + {self.kept.index(row)} * stride]"
+        first = self.kept.index(f"{row}_0")
+        width = len(self.o) if row.startswith("seen") else len(self.a) + 1
+        return f"f[base + ({first} + {slot} * {width}) * stride]"
+
+    def _load_row(self, rows: Sequence[str]) -> list[str]:
+        return [f"{row} = {self._at(row)}" for row in rows]
+
+    def _store_row(self, rows: Sequence[str]) -> list[str]:
+        return [f"{self._at(row)} = {row}" for row in rows]
+
+    @property
+    def _parameters(self) -> list[str]:
+        return [f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)]
+
+    @property
+    def _rows_of_constants(self) -> list[str]:
+        return [f"k_{name}" for name in self.varying]
+
+    @cached_property
+    def take(self) -> Callable:
+        """``take(f, base, stride, par, work, room, key)`` to (reward, over): a step of one environment.
+
+        `work` has the action; it gets what is shown, or the controls of a step that is refused.
+        """
+        found, n_act, n_seen = self.options, len(self.a), len(self.o)
+        ring, within = found.commands, found.within
+        divided = ring > 1 or within
+        send, choose = [], []
+        if ring > 1:
+            jitter = found.action_delay[0] < found.action_delay[1]
+            late, high = self._constant("late_low"), self._constant("late_high")
+            drawn = f" + ({high} - {late}) * uniform({self._key('delay')}, np.uint64(n), np.uint64(0))"
+            send = [
+                "now = np.int64(n)", f"slot = now % {ring}",
+                *(f"{self._at(f'sent{i}', 'slot')} = {a}" for i, a in enumerate(self.a)),
+                f"{self._at('at', 'slot')} = {late}{drawn if jitter else ''}",
+            ]  # fmt: skip
+            # The command in force is the last sent of those that have come; the others' times end this piece.
+            choose = [
+                f"for back in range({ring}):",
+                f"    slot = (now + {ring} - back) % {ring}",
+                f"    comes = ({self._at('at', 'slot')} - back) * k_dt",
+                "    if comes <= t:", "        break",
+                "    if comes < switch:", "        switch = comes",
+                *(f"{a} = {self._at(f'sent{i}', 'slot')}" for i, a in enumerate(self.a)),
+            ]  # fmt: skip
+        arguments = [*self.y, *self.u, "h", "dt_limit", *self._stepper.constants]
+        if self.general:
+            arguments = ["room", *arguments]
+        limit = str(self._x) if self.general or self._x == 0.0 else f"{self._x} * (h / k_dt)"
+        move = [
+            "h = end - t", f"dt_limit = {limit}",
+            f"{', '.join(self.z)}, status = advance({', '.join(arguments)})",
+            "if status < 0:",
+            *(f"    work[{n_act + n_seen + j}] = {u}" for j, u in enumerate(self.u)),
+            f"    return 0.0, {SLOW}",
+            *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
+            "t = end",
+        ]  # fmt: skip
+        watch = ["if t == k_shown_at:", *_indent([*self.observe, *(f"m{i} = o{i}" for i in range(n_seen))])]
+        pieces = [
+            *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
+            "t, switch = 0.0, 0.0",
+            "while t < k_dt:",
+            *_indent([
+                "if t == switch:",
+                *_indent([
+                    "switch = k_dt", *choose, "h = switch - t", *self.command,
+                    *(f"mean_{u} += (h / k_dt) * {u}" for u in self.u),
+                ]),
+                "end = switch",
+                *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
+                *move,
+                *(watch if within else []),
+            ]),
+            *(f"{y} = b_{y}" for y in self.y),
+            *(f"last_{u}, {u} = {u}, mean_{u}" for u in self.u),
+        ]  # fmt: skip
+        whole = [
+            "h, t, end = k_dt, 0.0, k_dt", *self.command, *(f"last_{u} = {u}" for u in self.u),
+            *(f"b_{y} = {y}" for y in self.y), *move, *(f"{y} = b_{y}" for y in self.y),
+        ]  # fmt: skip
+        body = [
+            *self._parameters,
+            *self._load_row([*self._rows_of_constants, *self.y, *self.g, *self.c, "n"]),
+            *(f"a{i} = work[{i}]" for i in range(n_act)),
+            *self.perturb, *send, *(pieces if divided else whole),
+            *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            "n = n + 1.0", *self.kick, *self.move, *self.push,
+            "if n >= k_limit:", "    over = over + 2.0",
+            *self.observe, *self._read(),
+            *(f"work[{n_act + i}] = {self._at(f'h{i}')}" for i in range(n_seen)),
+            *self._store_row([*self.y, *self.c, "n"]),
+            *(f"{self._at(u)} = last_{u}" for u in self.u),
+            "return r, np.int64(over)",
+        ]  # fmt: skip
+        return _compiled("take", "f, base, stride, par, work, room, key", body, self.advance)
+
+    def _read(self) -> list[str]:
+        """Return the lines that show what is observed: late, with noise, and not after every step."""
+        found, n = self.options, len(self.o)
+        lines = []
+        if found.readings:
+            values = [f"{'m' if found.within else 'o'}{i}" for i in range(n)]
+            lines += [
+                f"slot = np.int64(n) % {found.readings}",
+                *(f"{self._at(f'seen{i}', 'slot')} = {x}" for i, x in enumerate(values)),
+                f"slot = (slot + 1) % {found.readings}",
+                *(f"o{i} = {self._at(f'seen{i}', 'slot')}" for i in range(n)),
+            ]
+        show = [*self.sense, *(f"{self._at(f'h{i}')} = o{i}" for i in range(n))]
+        if found.observation_every > 1:
+            return [*lines, f"if np.int64(n) % np.int64({self._constant('every')}) == 0:", *_indent(show)]
+        return [*lines, *show]
+
+    @cached_property
+    def launch(self) -> Callable:
+        """``launch(f, base, stride, par, key, state_given, target_given)``: begin an episode."""
+        found, n = self.options, len(self.o)
+        body = [
+            *self._parameters,
+            *self._load_row([*self._undrawn, *self.y[: self.n_state], *self.g]),
+            *self._draw_parameters,
+            *self._start, *self.at_rest,
+            *(
+                f"f[base + {self.kept.index(f'sent{i}_{slot}')} * stride] = {a}"
+                for slot in range(found.commands if found.commands > 1 else 0)
+                for i, a in enumerate(self.a)
+            ),
+            *(
+                f"f[base + {self.kept.index(f'at_{slot}')} * stride] = 0.0"
+                for slot in range(found.commands if found.commands > 1 else 0)
+            ),
+            *self.observe,
+            *(
+                f"f[base + {self.kept.index(f'seen{i}_{slot}')} * stride] = o{i}"
+                for slot in range(found.readings)
+                for i in range(n)
+            ),
+            *self.sense,
+            *(f"{self._at(f'h{i}')} = o{i}" for i in range(n)),
+            *self._store_row([*self.y, *self.g, *self.u, *self.c, "n", *self.p, *self._drawn_rows]),
+        ]  # fmt: skip
+        return _compiled("launch", "f, base, stride, par, key, state_given, target_given", body)
+
+    @property
+    def _drawn_rows(self) -> list[str]:
+        return [f"k_{name}" for name in self.varying if self._made and name in self._made.changed]
+
+    @property
+    def _undrawn(self) -> list[str]:
+        return [row for row in self._rows_of_constants if row not in self._drawn_rows]
+
+    @property
+    def _draw_parameters(self) -> list[str]:
+        if not self._made:
+            return []
+        keys = f"key_parameters = {self._key('parameters')}"
+        draws = [
+            f"share{j} = uniform(key_parameters, np.uint64(0), np.uint64({j}))" for j in range(len(self.p))
+        ]
+        return [keys, *draws, *self.begin]
+
+    # --- the functions of `Program` ------------------------------------------------------------------------
+
+    def _slices(self, at: int, work: int) -> list[str]:
+        """Return the lines that cut constants, the room of a step, and that of the series out of an array."""
+        return [
+            f"par = memory[{at}:]",
+            f"work = memory[{work}:]",
+            f"room = memory[{max(at + len(self.uniform), work + len(self.scratch))}:]",
+        ]
+
+    @cached_property
+    def step_one(self) -> Callable:
+        """See `Program.step_one`."""
+        first, n = len(self.kept), len(self.a)
+        body = [
+            "memory = f", *self._slices(first + len(self.scratch), first),
+            *(f"work[{i}] = {'a' if n == 1 else f'a[{i}]'}" for i in range(n)),
+            "r, over = take(f, np.int64(0), np.int64(1), par, work, room, ids[2])",
+            *(f"obs[{j}] = work[{n + j}]" for j in range(len(self.o))),
+            "return r, over",
+        ]  # fmt: skip
+        return _compiled("step_one", "f, obs, a, ids", body, self.take)
+
+    @cached_property
+    def start_one(self) -> Callable:
+        """See `Program.start_one`."""
+        first = len(self.kept)
+        body = [
+            "memory = f", *self._slices(first + len(self.scratch), first), *_next_episode("0", "1", "2"),
+            "launch(f, np.int64(0), np.int64(1), par, key, state_given, target_given)",
+            *(f"obs[{j}] = f[{self.kept.index(f'h{j}')}]" for j in range(len(self.o))),
+        ]  # fmt: skip
+        return _compiled("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
+
+    @property
+    def _each(self) -> list[str]:
+        return [
+            "for lane in range(count):",
+            f"    base = (lane // {BLOCK}) * {BLOCK * len(self.kept)} + lane % {BLOCK}",
+        ]
+
+    @property
+    def _show(self) -> list[str]:
+        at = (f"f[base + {self.kept.index(f'h{j}') * BLOCK}]" for j in range(len(self.o)))
+        return [f"obs[{j}, lane] = {h}" for j, h in enumerate(at)]
+
+    @property
+    def room_of_all(self) -> int:
+        """Numbers that `step_all` needs behind the constants."""
+        return len(self.scratch) + self.room
+
+    @cached_property
+    def step_all(self) -> Callable:
+        """See `Program.step_all`."""
+        n, stride = len(self.a), f"np.int64({BLOCK})"
+        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
+        held = n + len(self.o)
+        step = [
+            *(f"work[{j}] = action[lane * {n} + {j}]" for j in range(n)),
+            f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
+            f"if over == {SLOW}:",
+            "    refused, over = lane + 1, 0",
+            *(f"    {self._at_lane(u)} = work[{held + j}]" for j, u in enumerate(self.u)),
+            "if over > 0:",
+            f"    {self._at_lane('n')} = -np.float64(over)",
+            "    overs += 1",
+        ]
+        restart = [
+            *_next_episode("lane", "count + lane", "2 * count + lane"),
+            f"launch(f, base, {stride}, par, key, False, False)",
+            "r, over = 0.0, 0",
+        ]
+        body = [
+            "memory = par", *self._slices(0, len(self.uniform)), "second = np.uint64(count)",
+            *(self._check_finite(f"f[{place}] >= 0.0") if self.a else []),
+            "overs, refused = 0, 0",
+            *self._each,
+            *_indent([
+                f"if {self._at_lane('n')} < 0.0:", *_indent(restart), "else:", *_indent(step),
+                "reward[lane] = r",
+                "terminated[lane] = (over == 1) | (over == 3)", "truncated[lane] = over >= 2",
+                *self._show,
+            ]),
+            "return refused, overs",
+        ]  # fmt: skip
+        arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
+        return _compiled("step_all", arguments, body, self.take, self.launch)
+
+    def _at_lane(self, row: str) -> str:
+        return f"f[base + {self.kept.index(row) * BLOCK}]"
+
+    @cached_property
+    def start_all(self) -> Callable:
+        """See `Program.start_all`."""
+        begin = [
+            *_next_episode("lane", "count + lane", "2 * count + lane"),
+            f"launch(f, base, np.int64({BLOCK}), par, key, state_given, target_given)",
+        ]
+        body = [
+            *self._each,
+            *_indent([
+                "if mask[lane]:", *_indent(begin),
+                "if mask[lane] or whole:", *_indent(self._show),
+            ]),
+        ]  # fmt: skip
+        arguments = "f, ids, par, obs, mask, whole, state_given, target_given, count"
+        return _compiled("start_all", arguments, body, self.launch)
+
+
+# --- parameters that are drawn ------------------------------------------------------------------------------
+
+
+class _Constants:
+    """Which constants follow from the drawn parameters, and the lines that compute them.
+
+    They are computed with twice the digits, from the drawn values and the others, and rounded once: an
+    environment has the bits of one that is made with the values.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str]) -> None:
+        drawn = task.drawn
+        assert drawn is not None
+        self._task, self._draws, self._made = drawn.inner, drawn.draws, drawn.made
+        self._absent = absent
+        self._scene = self._task.scene
+        inner = {name: getattr(self._scene, name) for name in self._scene._numbers()}
+        trace = ElementaryTrace()
+        for d in self._draws:
+            inner[d.name] = trace.inputs(d.name)[0]
+        self._follow(inner)
+        parameters = {n for n, x in inner.items() if isinstance(x, Number)}
+        found = self._starts(trace, inner) | {f"self_{n}": x for n, x in inner.items()}
+        found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
+        #: Constants that differ from episode to episode.
+        self.changed = [name for name, x in found.items() if isinstance(x, Number)]
+        self._parameters = parameters
+
+    def _follow(self, numbers: dict[str, Any]) -> None:
+        """Replace the parameters that follow from others."""
+        for name, made in self._made.items():
+            with naming(self._scene, name):
+                numbers[name] = made(twin(self._scene, numbers))
+
+    def _starts(self, trace: Any, numbers: dict[str, Any]) -> dict[str, Any]:
+        """Return centres and half widths of the start."""
+        k = SimpleNamespace(**self._task.formulas.constants())
+        vars(k).update({f"self_{name}": x for name, x in numbers.items()})
+        found = {}
+        with naming(self._task, "start"):
+            given = dict(self._task.formulas._self(k).start)
+        for i, name in enumerate(self._scene.state_names):
+            if name in given:
+                pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
+                found[f"centre{i}"], found[f"half{i}"] = pair
+        return found
+
+    def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
+        """Return the constants of the motion that depend on parameters that change."""
+        form = self._scene._form
+        expressions = form.expressions if form else self._scene._stepper.expressions()
+        below = {s.name for s in form.inertia.symbols()} if form else set()
+        wanted = {n: e for n, e in expressions.items() if changed & ({s.name for s in e.symbols()} | below)}
+        values = {
+            parameter(name): _Twice(x) if isinstance(x, Number) else Fraction(x)
+            for name, x in numbers.items()
+            if isinstance(x, Number) or math.isfinite(x)
+        }
+        functions = _Functions(trace)
+        found = evaluate(list(wanted.values()), values, functions)
+        if form:
+            (inertia,) = evaluate([form.inertia], values, functions)
+            found = [x / inertia for x in found]
+        return {name: _rounded(x) for name, x in zip(wanted, found, strict=True)}
+
+    def lines(self, constants: dict[str, Any]) -> list[str]:
+        """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""
+        trace = ElementaryTrace()
+        outputs: dict[str, Any] = {}
+        for j, d in enumerate(self._draws):
+            low, high, share = trace.inputs(f"k_draw_low{j}", f"k_draw_high{j}", f"share{j}")
+            if d.log:  # a negative range is that of the sizes, turned round
+                size = trace.exp(trace.log(abs(low)) + share * (trace.log(abs(high)) - trace.log(abs(low))))
+                value = trace.copysign(size, low)
+            else:
+                value = low + share * (high - low)
+            outputs[f"p_{d.name}"] = trace.minimum(trace.maximum(value, low), high)
+        code, values = record_block(trace, outputs, fused=False)
+        # Those that follow are made as Python makes them: one rounding for each operation.
+        trace = ElementaryTrace()
+        numbers = self._given(trace, constants)
+        self._follow(numbers)
+        follow = {f"p_{n}": numbers[n] for n in self._made if n in self._parameters}
+        if follow:
+            more, _ = record_block(trace, follow, fused=False)
+            code += more
+        trace = ElementaryTrace()
+        numbers = self._given(trace, constants) | {n: trace.inputs(f"p_{n}")[0] for n in self._parameters}
+        found = self._starts(trace, numbers) | {f"self_{n}": x for n, x in numbers.items()}
+        found |= self._motion(trace, numbers, self._parameters)
+        results = {f"k_{name}": found[name] for name in self.changed}
+        last, values = record_block(trace, results)
+        rename = [f"{n} = {v}" for n, v in zip(results, values, strict=True) if n != v]
+        return [*code, *last, *rename]
+
+    def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
+        """Return all parameters as inputs; what is zero as zero."""
+        numbers: dict[str, Any] = {}
+        for name in self._scene._numbers():
+            at = constants[f"self_{name}"]
+            numbers[name] = trace.inputs(at)[0] if isinstance(at, str) else 0.0
+        for d in self._draws:
+            numbers[d.name] = trace.inputs(f"p_{d.name}")[0]
+        return numbers
+
+
+class _Twice:
+    """A number with twice the digits, for what `evaluate` does with parameters."""
+
+    __slots__ = ("high", "low")
+
+    def __init__(self, high: Any, low: Any = 0.0) -> None:
+        self.high, self.low = high, low
+
+    def __add__(self, other: Any) -> _Twice:
+        other = _twice(other)
+        high, rest = two_sum(self.high, other.high)
+        return _Twice(*two_sum(high, rest + (self.low + other.low)))
+
+    def __mul__(self, other: Any) -> _Twice:
+        other = _twice(other)
+        high, rest = two_product(self.high, other.high)
+        return _Twice(*two_sum(high, rest + (self.high * other.low + self.low * other.high)))
+
+    def __neg__(self) -> _Twice:
+        return _Twice(-self.high, -self.low)
+
+    def __sub__(self, other: Any) -> _Twice:
+        return self + -_twice(other)
+
+    def __truediv__(self, other: Any) -> _Twice:
+        other = _twice(other)
+        first = self.high / other.high
+        rest = self - other * _Twice(first)
+        return _Twice(*two_sum(first, (rest.high + rest.low) / other.high))
+
+    def __rtruediv__(self, other: Any) -> _Twice:
+        return _twice(other) / self
+
+    __radd__, __rmul__ = __add__, __mul__
+
+
+def _twice(value: Any) -> _Twice:
+    if isinstance(value, _Twice):
+        return value
+    if isinstance(value, Number):
+        return _Twice(value)
+    exact = Fraction(value)
+    return _Twice(float(exact), float(exact - Fraction(float(exact))))
+
+
+def _rounded(value: Any) -> Any:
+    return value.high + value.low if isinstance(value, _Twice) else float(value)
+
+
+class _Functions:
+    """Functions of numbers with twice the digits: of their nearest floats."""
+
+    Rational, mpf, pi = Fraction, None, Fraction(math.pi)
+
+    def __init__(self, trace: Any) -> None:
+        self._trace = trace
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda x: _Twice(getattr(self._trace, name)(_rounded(x)))
+
+
+def _listed(values: Any) -> list[Any]:
+    return list(values) if isinstance(values, list | tuple) else [values]
+
+
+def _compiled(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
+    return compile_function(name, "\n".join([f"def {name}({arguments}):", *_indent(body), ""]), *helpers)

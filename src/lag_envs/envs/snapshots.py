@@ -1,0 +1,79 @@
+"""Snapshots of environments: all that decides how an episode, and those after it, go on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.scenes.checks import shown
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import Imperfections
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The state of an environment or of a batch, as plain data that can be pickled.
+
+    Made by `get_state` of an environment, for its `set_state` or that of one made alike, in this process or
+    another: it then continues with the same bits.
+
+    Attributes
+    ----------
+    about : mapping
+        What it is a snapshot of: task, parameters, options.
+    rows : mapping of str to ndarray, shape (num_envs,)
+        The numbers that a step starts from: state, target, controls, clock, commands and observations under
+        way, drawn parameters.
+    ids : ndarray of uint64, shape (3, num_envs)
+        Keys of the seeds, numbers of the episodes, keys of the episodes.
+    steps, totals : ndarray, shape (num_envs,)
+        Steps and sums of rewards, where the environment counts them for pictures.
+    ready : bool
+        Whether a single environment may be stepped: not after a termination.
+    """
+
+    about: Mapping[str, Any]
+    rows: Mapping[str, NDArray[np.float64]]
+    ids: NDArray[np.uint64]
+    steps: NDArray[np.int64]
+    totals: NDArray[np.float64]
+    ready: bool = True
+
+
+def about(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
+    """Return what a snapshot must agree in, by name, in the order in which differences are told."""
+    first, kind = tasks[0], type(tasks[0])
+    found: dict[str, Any] = {"task": f"{kind.__module__}:{kind.__qualname__}", **options}
+    fields = [f.name for f in dataclasses.fields(first.scene)]
+    for name in fields:
+        found[name] = _common([getattr(task.scene, name) for task in tasks])
+    targets = [None if t.fixed_target is None else tuple(t.fixed_target.tolist()) for t in tasks]
+    found |= {"dt": first.dt, "duration": first.duration, "target": _common(targets)}
+    asked = dataclasses.asdict(first.imperfections or Imperfections())
+    del asked["drawn"]
+    drawn = [tuple(map(tuple, (task.imperfections or Imperfections()).drawn)) for task in tasks]
+    return found | asked | {"randomize": _common(drawn)}
+
+
+def check(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) -> None:
+    """Raise an error for a snapshot that is none, or one of another environment."""
+    if not isinstance(snapshot, Snapshot):
+        raise TypeError(f"set_state takes what get_state returned, got {shown(snapshot)}")
+    for name in dict.fromkeys([*here, *snapshot.about]):
+        there = snapshot.about.get(name), name in snapshot.about
+        if there != (here.get(name), name in here):
+            raise ValueError(
+                f"this is a snapshot of another environment: {name} is {shown(there[0])} there, and "
+                f"{shown(here.get(name))} here"
+            )
+    if set(rows) != set(snapshot.rows):
+        raise ValueError("this snapshot was made by another version of lag_envs: its numbers differ in kind")
+
+
+def _common(values: list[Any]) -> Any:
+    """Return the value that all share, or else all of them."""
+    return values[0] if all(value == values[0] for value in values) else tuple(values)

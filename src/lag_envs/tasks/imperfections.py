@@ -1,0 +1,440 @@
+"""Hidden parameters, imperfect sensors and actuators: the keywords that every environment takes.
+
+What is asked for is checked here and kept as numbers; `lag_envs.envs.imperfect` prints what they do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from lag_envs.scenes.checks import check_number, shown
+from lag_envs.scenes.declaring import complete
+
+if TYPE_CHECKING:
+    from lag_envs.tasks.base import Task
+
+#: The keywords.
+KEYWORDS = (
+    "randomize",
+    "observation_noise",
+    "observation_delay",
+    "observation_every",
+    "action_noise",
+    "action_delay",
+    "slew",
+    "push",
+)
+#: No normal draw is larger: √(2 · 53 log 2), since the uniform number that it is made of is at least 2^-53.
+LARGEST_NORMAL = math.sqrt(106.0 * math.log(2.0)) * (1.0 + 1e-9)
+#: Control steps by which actions and observations may be late.
+LATEST = 1000
+#: Parameters that may be drawn: all corners of their ranges are tried.
+MOST_DRAWN = 8
+#: A delay this near to a whole number of control steps [steps] is one.
+_WHOLE = 1e-9
+#: By this share a bound is wider where it is not proved; what lies beyond it is shown as the bound.
+MARGIN = 0.1
+_UNBOUNDED = float(np.finfo(np.float32).max)
+
+
+class Draw(NamedTuple):
+    """The range of a parameter that is drawn anew for each episode, in its unit."""
+
+    name: str
+    low: float
+    high: float
+    log: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Imperfections:
+    """What differs from perfect sensors, perfect actuators and known parameters; all numbers are checked.
+
+    Attributes
+    ----------
+    drawn : tuple of Draw
+        Parameters that each episode has its own values of.
+    observation_noise : tuple of float
+        Standard deviation for each entry of the observation, in its unit.
+    observation_delay : float
+        How old what is seen is [control steps].
+    observation_every : int
+        Control steps from one reading to the next.
+    action_noise : tuple of float
+        Standard deviation for each action, actions being in [-1, 1].
+    action_delay : (float, float)
+        Shortest and longest time from an action to its effect [control steps].
+    slew : tuple of float
+        For each control that actions set its largest change [SI unit per second]; infinity for any.
+    push : tuple of float
+        For each entry of the state the largest size of a random impulse.
+    push_rate : float
+        Pushes per second.
+    """
+
+    drawn: tuple[Draw, ...] = ()
+    observation_noise: tuple[float, ...] = ()
+    observation_delay: float = 0.0
+    observation_every: int = 1
+    action_noise: tuple[float, ...] = ()
+    action_delay: tuple[float, float] = (0.0, 0.0)
+    slew: tuple[float, ...] = ()
+    push: tuple[float, ...] = ()
+    push_rate: float = 0.0
+
+    @property
+    def commands(self) -> int:
+        """How many actions are kept: those that may still come into force, and the one in force."""
+        return 1 + math.ceil(self.action_delay[1])
+
+    @property
+    def readings(self) -> int:
+        """How many observations are kept: those that are still to be seen."""
+        return 1 + math.floor(self.observation_delay) if self.observation_delay else 0
+
+    @property
+    def within(self) -> bool:
+        """Whether what is seen lies within a control step."""
+        return self.observation_delay % 1.0 > 0.0
+
+    @property
+    def structure(self) -> tuple:
+        """What decides the code; all else are numbers that it takes."""
+        return (
+            tuple((d.name, d.log) for d in self.drawn),
+            tuple(x > 0.0 for x in self.observation_noise),
+            (self.readings, self.within),
+            self.observation_every > 1,
+            tuple(x > 0.0 for x in self.action_noise),
+            self.commands,
+            self.action_delay[0] < self.action_delay[1],
+            tuple(map(math.isfinite, self.slew)),
+            tuple(x > 0.0 for x in self.push),
+        )
+
+
+def imperfections_of(task: Task, given: Mapping[str, Any]) -> Imperfections | None:
+    """Return what keywords, and the task's own where they say nothing, ask for; None for nothing.
+
+    Raises
+    ------
+    ValueError
+        Naming keyword, value and remedy.
+    """
+    own = type(task).imperfections
+    for name in own:
+        if name not in KEYWORDS:
+            raise ValueError(
+                f"{type(task).__name__}.imperfections: unknown {name!r}; known are {', '.join(KEYWORDS)}"
+            )
+    asked = {name: value for name, value in (dict(own) | dict(given)).items() if value is not None}
+    found: dict[str, Any] = {}
+    for name, value in asked.items():
+        found |= _READERS[name](task, value)
+    return Imperfections(**found) if Imperfections(**found) != Imperfections() else None
+
+
+# --- one keyword each ---------------------------------------------------------------------------------------
+
+
+def _numbers(keyword: str, value: Any, names: Sequence[str], what: str, missing: float) -> tuple[float, ...]:
+    """Return a number for each name: from one for all, from a mapping, or from as many in a row."""
+    if not names:
+        raise ValueError(f"{keyword}: there is no {what} here, got {shown(value)}; leave it out")
+    if isinstance(value, Mapping):
+        for name in value:
+            if name not in names:
+                raise ValueError(f"{keyword}: there is no {what} {name!r}, only {', '.join(names)}")
+        given = [value.get(name, missing) for name in names]
+    elif isinstance(value, Sequence | np.ndarray) and not isinstance(value, str) and np.ndim(value) == 1:
+        if len(value) != len(names):
+            raise ValueError(
+                f"{keyword} must be one number, one by name, or {len(names)}, for {', '.join(names)}; "
+                f"got {shown(value)}"
+            )
+        given = list(value)
+    else:
+        given = [value] * len(names)
+    return tuple(
+        check_number(keyword, x) if x is value else check_number(f"{keyword} of {name}", x, endless=True)
+        for name, x in zip(names, given, strict=True)
+    )
+
+
+def _sizes(keyword: str, value: Any, names: Sequence[str], what: str) -> tuple[float, ...]:
+    """Return numbers of at least 0; nothing at all where all are 0."""
+    found = _numbers(keyword, value, names, what, 0.0)
+    for name, x in zip(names, found, strict=True):
+        if not 0.0 <= x < math.inf:
+            raise ValueError(f"{keyword} must be finite and at least 0, got {x:g} for {name}; 0 is off")
+    return found if any(found) else ()
+
+
+def _seconds(keyword: str, value: Any, dt: float) -> float:
+    """Return a delay in control steps."""
+    delay = check_number(keyword, value, "s")
+    if not 0.0 <= delay:
+        raise ValueError(
+            f"{keyword} must be at least 0 s, got {delay:g} s: nothing is known before it happens"
+        )
+    steps = delay / dt
+    if abs(steps - round(steps)) <= _WHOLE:
+        steps = float(round(steps))
+    if steps > LATEST:
+        raise ValueError(
+            f"{keyword} must be at most {LATEST} control steps, {LATEST * dt:g} s, got {delay:g} s"
+        )
+    return steps
+
+
+def _observation_noise(task: Task, value: Any) -> dict[str, Any]:
+    return {
+        "observation_noise": _sizes("observation_noise", value, task.observation, "entry of the observation")
+    }
+
+
+def _observation_delay(task: Task, value: Any) -> dict[str, Any]:
+    return {"observation_delay": _seconds("observation_delay", value, task.dt)}
+
+
+def _observation_every(task: Task, value: Any) -> dict[str, Any]:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
+    if not whole or not 1 <= value < 2**31:
+        raise ValueError(
+            f"observation_every must be a whole number of control steps, at least 1, got {shown(value)}"
+        )
+    return {"observation_every": int(value)}
+
+
+def _action_noise(task: Task, value: Any) -> dict[str, Any]:
+    names = [a.control for a in task.formulas.acting]
+    sizes = _sizes("action_noise", value, names, "control that actions set")
+    if sizes and task.formulas.choices:
+        raise ValueError(
+            f"action_noise is for actions in [-1, 1]; those of {type(task).__name__} are choices from a "
+            f"list, got {shown(value)}"
+        )
+    return {"action_noise": sizes}
+
+
+def _action_delay(task: Task, value: Any) -> dict[str, Any]:
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        if len(value) != 2:
+            raise ValueError(
+                f"action_delay must be seconds, or the shortest and the longest, got {shown(value)}"
+            )
+        low, high = (_seconds("action_delay", x, task.dt) for x in value)
+        if low > high:
+            raise ValueError(f"action_delay must be (shortest, longest), got {shown(value)}")
+    else:
+        low = high = _seconds("action_delay", value, task.dt)
+    if high and not task.formulas.acting:
+        raise ValueError(f"action_delay: there is no action here, got {shown(value)}; leave it out")
+    return {"action_delay": (low, high)}
+
+
+def _slew(task: Task, value: Any) -> dict[str, Any]:
+    names = [a.control for a in task.formulas.acting]
+    if value == math.inf:
+        return {}
+    rates = _numbers("slew", value, names, "control that actions set", math.inf)
+    for name, rate in zip(names, rates, strict=True):
+        if not rate > 0.0:
+            raise ValueError(
+                f"slew must be above 0, in the control's unit per second, got {rate:g} for {name}; "
+                "None is off"
+            )
+    return {"slew": rates if any(map(math.isfinite, rates)) else ()}
+
+
+def _push(task: Task, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+        raise ValueError(f"push must be (pushes per second, largest size), got {shown(value)}")
+    layout = task.scene._layout
+    moving = [e.name for e in layout.state if e.coordinate in layout.free and e.kind != "place"]
+    rate = check_number("push: its rate", value[0], "1/s")
+    if rate < 0.0:
+        raise ValueError(f"push: its rate must be at least 0, got {rate:g}; 0 is off")
+    sizes = dict(zip(moving, _sizes("push: its size", value[1], moving, "free velocity"), strict=False))
+    if rate == 0.0 or not sizes:
+        return {}
+    return {"push": tuple(sizes.get(e.name, 0.0) for e in layout.state), "push_rate": rate}
+
+
+def _randomize(task: Task, value: Any) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(
+            f'randomize must map parameters to ranges, as in {{"damping": (0.1, 10, "log")}}, got '
+            f"{shown(value)}"
+        )
+    if len(value) > MOST_DRAWN:
+        raise ValueError(f"randomize takes {MOST_DRAWN} parameters at most, got {len(value)}")
+    return {"drawn": tuple(_draw(task, name, given) for name, given in value.items())}
+
+
+def _draw(task: Task, name: str, given: Any) -> Draw:
+    where, scene = f"randomize[{name!r}]", task.scene
+    if name not in (numbers := scene._numbers()):
+        known = [*inspect.signature(type(scene)).parameters, "dt", "duration", "target"]
+        why = "it decides how the environment is built" if name in known else "there is no such parameter"
+        raise ValueError(f"{where}: it cannot be drawn, {why}; what can be is {', '.join(numbers)}")
+    if not isinstance(given, Sequence) or isinstance(given, str) or len(given) < 2:
+        raise ValueError(
+            f'{where} must be (low, high), with "log" and "absolute" behind where they are meant, got '
+            f"{shown(given)}"
+        )
+    words = list(given[2:])
+    for word in words:
+        if word not in ("log", "uniform", "absolute", "relative") or words.count(word) > 1:
+            raise ValueError(
+                f'{where}: behind low and high may stand "log" or "uniform" and "absolute" or "relative", '
+                f"got {shown(word)}"
+            )
+    if {"log", "uniform"} <= set(words) or {"absolute", "relative"} <= set(words):
+        raise ValueError(f"{where}: one excludes the other, got {shown(given)}")
+    low, high = (check_number(where, x) for x in given[:2])
+    if not low < high:
+        raise ValueError(f"{where}: low must be below high, got {shown(given)}")
+    log, value = "log" in words, getattr(scene, name)
+    if "absolute" not in words:
+        if not 0.0 <= low:
+            raise ValueError(f"{where}: factors must be at least 0, got {low:g}")
+        if not 0.0 < abs(value) < math.inf:
+            raise ValueError(
+                f"{where}: {name} is {value:g}, which has no range of factors; give its range in its unit, "
+                '(low, high, "absolute")'
+            )
+        low, high = sorted((low * value, high * value))
+    if log and not low * high > 0.0:
+        raise ValueError(f'{where}: a "log" range cannot contain 0, got {low:g} to {high:g}')
+    return Draw(name, low, high, log)
+
+
+_READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
+    "randomize": _randomize,
+    "observation_noise": _observation_noise,
+    "observation_delay": _observation_delay,
+    "observation_every": _observation_every,
+    "action_noise": _action_noise,
+    "action_delay": _action_delay,
+    "slew": _slew,
+    "push": _push,
+}
+assert tuple(_READERS) == KEYWORDS
+
+
+# --- drawn parameters ---------------------------------------------------------------------------------------
+
+
+class Drawn:
+    """The tasks among which an episode's is drawn.
+
+    Parameters
+    ----------
+    task : Task
+        A task with drawn parameters.
+
+    Raises
+    ------
+    ValueError
+        Where a corner of the ranges is no possible task, or would need other code than the others.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        assert task.imperfections is not None
+        self.draws = task.imperfections.drawn
+        self._corners = [self.at(ends) for ends in itertools.product(*((d.low, d.high) for d in self.draws))]
+        #: One with values inside of all ranges.
+        self.inner = self.at([_middle(d, 0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
+        for corner in self._corners:
+            self._compare(corner)
+
+    def at(self, values: Sequence[float]) -> Task:
+        """Return the task, without imperfections, that has these values of the drawn parameters."""
+        given = dict(zip((d.name for d in self.draws), values, strict=True))
+        try:
+            return self.task.varied(**given)
+        except ValueError as error:
+            raise ValueError(f"randomize allows {_listed(given)}, which is impossible: {error}") from error
+
+    def _compare(self, corner: Task) -> None:
+        if corner.formulas.key == self.inner.formulas.key:
+            return
+        values = {d.name: getattr(corner.scene, d.name) for d in self.draws}
+        raise ValueError(
+            f"randomize allows {_listed(values)}, where the formulas of {type(corner).__name__} differ from "
+            "those inside the ranges: an attribute that it computes from parameters, or a zero that a "
+            "formula divides by, would not follow; narrow the ranges, or draw other parameters"
+        )
+
+    @cached_property
+    def tried(self) -> list[Task]:
+        """Tasks at the corners, and along lines through the middle of the ranges."""
+        middle = [_middle(d, 0.5) for d in self.draws]
+        lines = [
+            [_middle(d, share) if d is other else m for other, m in zip(self.draws, middle, strict=True)]
+            for d in self.draws
+            for share in (0.0, 0.25, 0.5, 0.75, 1.0)
+        ]
+        return [*self._corners, *map(self.at, lines)]
+
+    @cached_property
+    def made(self) -> dict[str, Callable[[Any], Any]]:
+        """Parameters that follow from others, and how."""
+        scene = self.inner.scene
+        complete(type(scene))
+        fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
+        given = {d.name for d in self.draws} | {
+            name for name, value in self.task.given.items() if value is not None
+        }
+        return {name: fields[name] for name in scene._numbers() if fields[name] and name not in given}
+
+
+def _middle(draw: Draw, share: float) -> float:
+    if draw.log:
+        value = draw.low * (draw.high / draw.low) ** share
+    else:
+        value = draw.low + share * (draw.high - draw.low)
+    return min(max(value, draw.low), draw.high)
+
+
+def _listed(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in values.items())
+
+
+# --- what can be seen ---------------------------------------------------------------------------------------
+
+
+def seen_box(task: Task) -> tuple[list[float], list[float]]:
+    """Return the lowest and highest values that an environment of this task shows.
+
+    Its bounds are those of the task, for all parameters that may be drawn, and wider by the largest noise.
+    Tasks prove their bounds for parameters that are given and for the ends of control steps; what is seen
+    within one, and what parameters between those that were tried would need, has a margin.
+    """
+    found = task.imperfections
+    if found is None:
+        return task.formulas.box()
+    boxes = [t.formulas.box() for t in (task.drawn.tried if task.drawn else [task])]
+    low: list[float] = []
+    high: list[float] = []
+    noise = found.observation_noise or (0.0,) * len(task.observation)
+    for i, sigma in enumerate(noise):
+        ends = [box[0][i] for box in boxes], [box[1][i] for box in boxes]
+        for values, end, side, out in ((ends[0], min, -1.0, low), (ends[1], max, 1.0, high)):
+            bound = end(values)
+            if abs(bound) < _UNBOUNDED:
+                if found.within or min(values) != max(values):
+                    bound += side * MARGIN * abs(bound)
+                bound += side * sigma * LARGEST_NORMAL
+            out.append(min(max(bound, -_UNBOUNDED), _UNBOUNDED))
+    return low, high

@@ -1,0 +1,183 @@
+"""Snapshots: environments that go back, or over to another process, and on with the same bits."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from covering import covering
+from gymnasium.error import ResetNeeded
+from test_imperfections import ALL, ID
+
+from lag_envs.envs import snapshots
+from lag_envs.scenes import StepRefused
+
+#: The cases share a program with the tests of imperfections.
+CASES = [
+    pytest.param(ID, {"duration": 0.5}, id="perfect"),
+    pytest.param(ID, {"duration": 0.5, **ALL}, id="all"),
+]
+
+
+def go_on(env: gym.Env, steps: int, seed: int = 0) -> list:
+    """Return all that is seen in so many steps, resets included."""
+    rng, seen = np.random.default_rng(seed), []
+    for _ in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        try:
+            results = env.step(action)
+        except ResetNeeded:
+            results = env.reset()
+        own = env.unwrapped
+        seen.append([*(np.array(x).tolist() for x in results[:4]), np.array(own.state).tolist(), _drawn(own)])
+        if not hasattr(own, "num_envs") and len(results) > 2 and results[3]:
+            seen.append(env.reset()[0].tolist())
+    return seen
+
+
+def _drawn(env):
+    return {name: np.array(values).tolist() for name, values in env.parameters.items()}
+
+
+@pytest.mark.parametrize(("env_id", "keywords"), CASES)
+def test_a_single_environment_goes_on_with_the_same_bits(env_id, keywords):
+    env, other = (gym.make(env_id, **keywords) for _ in range(2))
+    env.reset(seed=3)
+    go_on(env, 13)
+    snapshot = env.unwrapped.get_state()
+    first = go_on(env, 40)
+    assert go_on(env, 40) != first
+    env.unwrapped.set_state(snapshot)
+    assert go_on(env, 40) == first
+    other.reset(seed=99)  # which Gymnasium's checker asks for
+    other.unwrapped.set_state(pickle.loads(pickle.dumps(snapshot)))
+    assert go_on(other, 40) == first
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize(("env_id", "keywords"), CASES)
+def test_a_batch_goes_on_with_the_same_bits(env_id, keywords, mode):
+    envs, other = (gym.make_vec(env_id, num_envs=3, autoreset_mode=mode, **keywords) for _ in range(2))
+    envs.reset(seed=3)
+    go_on(envs, 24)
+    for _ in range(4):  # before, at and after the end of the episodes, which is after step 25
+        snapshot = envs.unwrapped.get_state()
+        first = go_on(envs, 30)
+        for again in (envs, other):
+            again.unwrapped.set_state(snapshot)
+            assert go_on(again, 30) == first
+        envs.unwrapped.set_state(snapshot)
+        go_on(envs, 1)
+
+
+def test_a_mask_sets_some_and_leaves_the_others():
+    envs = gym.make_vec(ID, num_envs=3, **ALL)
+    own, zero = envs.unwrapped, np.zeros((3, 1), np.float32)
+    with pytest.raises(ResetNeeded, match="before get_state"):
+        own.get_state()
+    envs.reset(seed=1)
+    before, snapshot = own.state, own.get_state()
+    for _ in range(5):
+        envs.step(zero)
+    after = own.state
+    own.set_state(snapshot, mask=np.array([True, False, True]))
+    assert np.array_equal(own.state, np.where([[True], [False], [True]], before, after))
+    with pytest.raises(ValueError, match="mask must have shape"):
+        own.set_state(snapshot, mask=np.array([True, False]))
+    with pytest.raises(TypeError, match="mask must be a NumPy array of bool"):
+        own.set_state(snapshot, mask=[1, 0, 1])
+
+
+def test_a_snapshot_is_a_copy():
+    env = gym.make(ID)
+    env.reset(seed=1)
+    snapshot = env.unwrapped.get_state()
+    before = {name: values.copy() for name, values in snapshot.rows.items()}
+    go_on(env, 5)
+    assert all(np.array_equal(before[name], values) for name, values in snapshot.rows.items())
+
+
+@pytest.mark.slow
+def test_another_process_goes_on_with_the_same_bits(tmp_path):
+    env = gym.make(ID, duration=0.5, **ALL)
+    env.reset(seed=3)
+    go_on(env, 13)
+    (tmp_path / "snapshot").write_bytes(pickle.dumps(env.unwrapped.get_state()))
+    code = (
+        "import pickle, sys, gymnasium as gym, lag_envs, test_snapshots as t\n"
+        "env = gym.make(t.ID, duration=0.5, **t.ALL, disable_env_checker=True)\n"
+        f"env.unwrapped.set_state(pickle.load(open({str(tmp_path / 'snapshot')!r}, 'rb')))\n"
+        "sys.stdout.buffer.write(pickle.dumps(t.go_on(env, 40)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert pickle.loads(done.stdout) == go_on(env, 40)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_id", covering())
+def test_every_environment(env_id):
+    for make in (gym.make, lambda id: gym.make_vec(id, num_envs=3)):
+        env = make(env_id)
+        env.reset(seed=2)
+        try:
+            go_on(env, 50)
+            snapshot = env.unwrapped.get_state()
+            first = go_on(env, 100)
+        except StepRefused:
+            continue
+        env.unwrapped.set_state(snapshot)
+        assert go_on(env, 100) == first
+
+
+# --- snapshots of another environment -----------------------------------------------------------------------
+
+OTHERS = [
+    (ID, {"damping": 0.5}, "damping is 0.5 there, and 0.001 here"),
+    (ID, {"dt": 0.01}, "dt is 0.01 there, and 0.02 here"),
+    (ID, {"duration": 3.0}, "duration is 3.0 there, and 10.0 here"),
+    (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) there, and \(\) here"),
+    ("PivotedBarFree-v0", {}, "task is .*SwingUpFree' there, and .*SwingUp' here"),
+    ("CylinderInCylinderPump-v0", {}, "task is .*Pump' there"),
+]
+
+
+@pytest.mark.parametrize(("env_id", "keywords", "message"), OTHERS, ids=str)
+def test_a_snapshot_of_another_environment_is_refused(env_id, keywords, message):
+    other, here = gym.make(env_id, **keywords), gym.make(ID)
+    other.reset(seed=1)
+    here.reset(seed=1)
+    before = here.unwrapped.state
+    with pytest.raises(ValueError, match=f"snapshot of another environment: {message}"):
+        here.unwrapped.set_state(other.unwrapped.get_state())
+    assert np.array_equal(here.unwrapped.state, before)
+
+
+def test_other_ranges_are_refused():
+    here, other = (gym.make(ID, **ALL | {"randomize": {"mass": (0.5, high)}}) for high in (2.0, 3.0))
+    snapshot = snapshots.Snapshot(other.unwrapped._about, {}, *[np.zeros(1)] * 3)
+    with pytest.raises(ValueError, match=r"randomize is .* 0.6.* there, and .* 0.4.* here"):
+        here.unwrapped.set_state(snapshot)
+
+
+def test_other_batches_are_refused():
+    here = gym.make_vec(ID, num_envs=3, damping=[0.1, 0.2, 0.3])
+    for keywords, message in (
+        ({"num_envs": 4}, "num_envs is 4 there, and 3 here"),
+        ({"num_envs": 3, "autoreset_mode": "SameStep"}, "autoreset_mode is 'SameStep' there"),
+        ({"num_envs": 3, "max_episode_steps": 7}, "max_episode_steps is 7.0 there, and 500.0 here"),
+        ({"num_envs": 3}, r"damping is 0.001 there, and \(0.1, 0.2, 0.3\) here"),
+    ):
+        other = gym.make_vec(ID, **keywords)
+        other.reset(seed=1)
+        with pytest.raises(ValueError, match=message):
+            here.unwrapped.set_state(other.unwrapped.get_state())
+    single = gym.make(ID)
+    single.reset(seed=1)
+    with pytest.raises(ValueError, match="num_envs is None there, and 3 here"):
+        here.unwrapped.set_state(single.unwrapped.get_state())
+    with pytest.raises(TypeError, match="set_state takes what get_state returned, got 3"):
+        here.unwrapped.set_state(3)
