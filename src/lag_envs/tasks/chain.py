@@ -161,7 +161,7 @@ Best known is planning anew for each start. One recorded plan with time-varying 
 for all starts are near to each other.
 """
 
-    steps_of_plan, steps_of_quick, batch, iterations, price, reserve = 65, 68, 32, 120, 0.05, 0.95
+    steps_of_plan, steps_of_quick, batch, iterations, price, strength = 65, 68, 32, 120, 0.05, 0.95
 
     @property
     def plans(self) -> Plans:
@@ -171,7 +171,7 @@ for all starts are near to each other.
             weights |= {name: 1.0, f"{name}_dot": 0.02}
         return Plans(
             "lag_envs.controllers.chain:easier",
-            {"effort": self.price, "share": self.reserve},
+            {"effort": self.price, "share": self.strength},
             steps=self.steps_of_plan,
             quick={"steps": self.steps_of_quick, "batch": 64, "share": 1.0, "edge": 0.97, "effort": 0.02},
             batch=self.batch,
@@ -234,7 +234,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     id = "DoubleBarWeak-v0"
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
-    steps_of_plan, steps_of_quick, reserve = 115, 108, 0.9
+    steps_of_plan, steps_of_quick, strength = 115, 108, 0.9
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -247,7 +247,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     id = "TripleBar-v0"
     defaults = {"bars": 3, "mass": 0.1, "length": 0.2, "damping": 5e-4, "track": 0.8}
     largest = 15.0
-    steps_of_plan, steps_of_quick, batch, iterations, price, reserve = 150, 140, 28, 180, 0.02, 0.85
+    steps_of_plan, steps_of_quick, batch, iterations, price, strength = 150, 140, 28, 180, 0.02, 0.85
 
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0, 2.5, -4.0, 1.0, 2.0]},
