@@ -25,6 +25,10 @@ WORDS_AND_NUMBERS = frozenset(
 )
 
 
+#: Those that are stepped as their tasks say; the others have hidden parameters, or imperfect sensors or actuators.
+PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
+
+
 @cache
 def features(kind: type[Task]) -> frozenset[str]:
     """Return what code depends on in a task's record, in words."""

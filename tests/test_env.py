@@ -11,7 +11,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
+from covering import PERFECT, covering
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
@@ -27,7 +27,9 @@ from lag_envs.tasks import TASKS, Task, cylinder_in_cylinder, incline, pivoted_b
 from lag_envs.tasks.incline import Brake
 
 each_id = pytest.mark.parametrize("env_id", covering())
+each_perfect = pytest.mark.parametrize("env_id", covering(PERFECT))
 each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
+each_perfect_single = pytest.mark.parametrize("env_id", covering(i for i in SINGLE if i in PERFECT))
 
 #: Parameters that a scene, or a task, must refuse.
 IMPOSSIBLE = {
@@ -310,7 +312,7 @@ def test_parameters_reach_the_scene():
     assert env.scene is env.task.scene
 
 
-@each_id
+@each_perfect
 def test_steps_are_those_of_simulate(env_id):
     env = make(env_id)
     env.reset(seed=1, options={"state": TASKS[env_id].examples.start["state"]})
@@ -487,7 +489,7 @@ def test_other_actions_mean_their_value(env_id, given, meant):
     assert trace(env, [given]) == trace(twin, [np.array([meant])])
 
 
-@each_single
+@each_perfect_single
 def test_actions_are_not_rounded(env_id):
     env, twin = running_twins(env_id)
     env.step(np.array([0.3]))
@@ -542,7 +544,7 @@ def test_going_on_after_truncation_is_allowed(env_id):
     assert [env.step(nothing(env))[3] for _ in range(7)] == [False] * 4 + [True] * 3
 
 
-@each_id
+@each_perfect
 def test_options_state(env_id):
     env = make(env_id)
     start = TASKS[env_id].examples.start["state"]
@@ -669,7 +671,7 @@ def test_an_endless_episode():
     assert not any(env.step(nothing(env))[3] for _ in range(2000))
 
 
-@pytest.mark.parametrize("env_id", covering(i for i, task in TASKS.items() if task.scaled))
+@pytest.mark.parametrize("env_id", covering(i for i in PERFECT if TASKS[i].scaled))
 def test_running_rewards_scale_with_the_interval(env_id):
     start = TASKS[env_id].examples.start["state"]
     rates = []
@@ -684,7 +686,7 @@ def test_running_rewards_scale_with_the_interval(env_id):
 # --- diagnostics ---
 
 
-@each_single
+@each_perfect_single
 def test_diagnostics(env_id):
     env = make(env_id, diagnostics=True)
     _, info = env.reset(seed=1)

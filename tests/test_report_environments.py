@@ -7,7 +7,7 @@ from fractions import Fraction
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
+from covering import PERFECT, covering
 from mpmath import mp, mpf
 from rollouts import actions
 
@@ -128,7 +128,7 @@ def same(path, start, given):
         assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
 
 
-@pytest.mark.parametrize("id", covering())
+@pytest.mark.parametrize("id", covering(PERFECT))
 def test_one_second_of_every_environment(id):
     (row,) = environments.ours(id, seed=0, duration=1.0)
     assert row["seconds"] > 0.2
@@ -140,7 +140,7 @@ def test_one_second_of_every_environment(id):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("id", covering())
+@pytest.mark.parametrize("id", covering(PERFECT))
 def test_every_step_of_whole_episodes(id, seed):
     """What README says of random actions; beside it stubborn ones, that spin a bar round and round."""
     (row,) = environments.ours(id, seed)

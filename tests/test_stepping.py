@@ -11,7 +11,7 @@ from itertools import product
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
+from covering import PERFECT, covering
 from mpmath import mp, mpf
 from reference import (
     EPS,
@@ -720,7 +720,7 @@ def test_against_dop853(kind):
 # --- one source, several backends -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", covering())
+@pytest.mark.parametrize("name", covering(PERFECT))
 def test_simulate_is_the_environments_step(name):
     """From a given state, with the control that was applied: the same bits, but for the kicked speed."""
     env = gym.make(name).unwrapped

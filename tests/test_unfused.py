@@ -7,7 +7,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
+from covering import PERFECT, covering
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -19,7 +19,7 @@ from lag_envs.stepping.general import stepper_of
 from lag_envs.stepping.script import LARGEST, Script
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, pivoted_bar
 
-REGISTERED = sorted(TASKS)
+REGISTERED = sorted(PERFECT)
 
 
 def made(task):
@@ -28,7 +28,7 @@ def made(task):
     return gym.make(task.id).unwrapped
 
 
-@pytest.mark.parametrize("id", covering())
+@pytest.mark.parametrize("id", covering(PERFECT))
 def test_unfused_is_the_environments_step_to_rounding(id):
     """Synchronised before each step, at most 1e-15 times size times condition."""
     check_against_fused(gym.make(id).unwrapped, range(2))
@@ -168,7 +168,7 @@ def test_a_picture_that_cannot_be_printed_is_left_out():
 
 def test_scripts_do_not_depend_on_the_process():
     code = "from lag_envs.envs.unfused import UnfusedProgram as U; from lag_envs.tasks import TASKS as T;"
-    code += "print(*(U(T[id]()).digest for id in sorted(T)))"
+    code += "print(*(U(T[id]()).digest for id in sorted(T) if not T[id].imperfections))"
     seen = {
         subprocess.run(
             [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, stdout=-1, check=True

@@ -8,6 +8,7 @@ follow.
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -71,6 +72,8 @@ STAGES = (
 
 #: Whose rows scenes of energies are, and how many bars the longest chain has.
 ENERGIES, LONGEST = "lag_envs, energies", 6
+#: Whose rows environments with other keywords are.
+VARIED = "lag_envs, varied"
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -106,6 +109,7 @@ class Settings:
 
     ids: tuple[str, ...] = tuple(TASKS)
     files: tuple[str, ...] = ()  #: users' own, which register some of the ids
+    keywords: tuple[str, ...] = ()  #: each as a call takes them: measured beside the defaults
     energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
     jacobians: bool = False  #: what derivatives of a step cost beside it
     sizes: tuple[int, ...] = SIZES
@@ -138,18 +142,41 @@ class Contestant:
 # --- the contestants ---
 
 
-def contestants(ids: Sequence[str], sizes: Sequence[int]) -> list[Contestant]:
-    """Return ours and the peers."""
+def contestants(ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = ()) -> list[Contestant]:
+    """Return ours, with other keywords too, and the peers."""
     rows = []
     for id in ids:
         rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
         rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
         rows += [Contestant("lag_envs", id, "vector", n, partial(ours, id, n)) for n in sizes]
+        for text in keywords:
+            given, name = keywords_of(text), f"{id}, {text}"
+            rows += [Contestant(VARIED, name, "unwrapped", 1, partial(unwrapped, id, **given))]
+            rows += [Contestant(VARIED, name, "vector", n, partial(ours, id, n, **given)) for n in sizes]
     for id in ("CartPole-v1", "Pendulum-v1"):
         rows += [Contestant("gymnasium", id, "made", 1, partial(made, id))]
     for library, id, prepare in PEERS:
         rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
     return rows
+
+
+def keywords_of(text: str) -> dict[str, Any]:
+    """Return keywords as they stand in a call, or raise a ValueError.
+
+    Examples
+    --------
+    >>> keywords_of("observation_noise=0.01, push=(2, 0.5)")
+    {'observation_noise': 0.01, 'push': (2, 0.5)}
+    """
+    try:
+        call = ast.parse(f"_({text})", mode="eval").body
+        if not isinstance(call, ast.Call) or call.args or not all(k.arg for k in call.keywords):
+            raise SyntaxError
+        return {str(k.arg): ast.literal_eval(k.value) for k in call.keywords}
+    except (SyntaxError, ValueError):
+        raise ValueError(
+            f"keywords must be as in a call, such as 'observation_noise=0.01, push=(2, 0.5)', got {text!r}"
+        ) from None
 
 
 def of_energies(sizes: Sequence[int]) -> list[Contestant]:
@@ -199,9 +226,9 @@ def made(id: str) -> Run:
     return single(gym.make(id))
 
 
-def unwrapped(id: str) -> Run:
+def unwrapped(id: str, **keywords: Any) -> Run:
     """Prepare one environment without wrappers."""
-    return single(gym.make(id).unwrapped)
+    return single(gym.make(id, **keywords).unwrapped)
 
 
 def single(env: gym.Env) -> Run:
@@ -232,9 +259,9 @@ def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
     return run
 
 
-def ours(id: str, n: int) -> Run:
+def ours(id: str, n: int, **keywords: Any) -> Run:
     """Prepare a native vector environment."""
-    envs = gym.make_vec(id, num_envs=n)
+    envs = gym.make_vec(id, num_envs=n, **keywords)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)
@@ -336,7 +363,7 @@ def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
     for name in settings.files:
         registered(name)
-    rows = contestants(settings.ids, settings.sizes) if settings.speed else []
+    rows = contestants(settings.ids, settings.sizes, settings.keywords) if settings.speed else []
     if settings.speed and settings.energies:
         rows += of_energies(settings.sizes)
     stages: dict[str, list[list[float]]] = {}

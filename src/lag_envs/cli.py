@@ -144,6 +144,14 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         help="take everything over into docs/speed.json, docs/speed.md and README.md of this checkout",
     )
     parser.add_argument(
+        "--with",
+        dest="keywords",
+        metavar="KEYWORDS",
+        action="append",
+        type=_keywords,
+        help="measure with these keywords too, as in --with 'action_delay=0.013'; repeatable",
+    )
+    parser.add_argument(
         "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
     )
     parser.add_argument(
@@ -175,10 +183,10 @@ def run_bench(args: argparse.Namespace) -> int:
     if args.output:
         _check_writable(Path(args.output))
     if args.checkout is not None:
-        for option in ("ids", "quick", "cold", "sizes"):
+        for option in ("ids", "quick", "cold", "sizes", "keywords"):
             if getattr(args, option):
                 raise UserError(
-                    "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes"
+                    "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with"
                 )
         for name in ("README.md", "docs/speed.json", "docs/speed.md"):
             if not os.access(Path(args.checkout, name), os.W_OK):
@@ -194,6 +202,7 @@ def run_bench(args: argparse.Namespace) -> int:
     plain = {
         "ids": ids,
         "files": files,
+        "keywords": tuple(args.keywords or ()),
         "energies": not (args.quick or args.ids),
         "jacobians": not (args.quick or args.ids or args.cold),
         "speed": not args.cold,
@@ -224,6 +233,16 @@ def _check_writable(path: Path) -> None:
         raise UserError(f"--output: there is no folder {path.absolute().parent}")
     if not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
         raise UserError(f"--output: {path} cannot be written to")
+
+
+def _keywords(text: str) -> str:
+    from lag_envs.benchmark import keywords_of
+
+    try:
+        keywords_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
 
 
 def _sizes(text: str) -> tuple[int, ...]:
@@ -662,6 +681,7 @@ examples:
   lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
+  lag-envs bench --quick --with 'action_delay=0.013'  what keywords cost
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
         declare_bench,

@@ -163,6 +163,10 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
         if drive.id not in TASKS:
             raise LinkError(f"there is no environment {_short(drive.id)}; {hint(drive.id, TASKS)}")
         task = TASKS[drive.id]()
+    if task.imperfections:
+        raise LinkError(
+            f"{drive.id} has hidden parameters or imperfect sensors or actuators; nobody can have driven it"
+        )
     env = Unfused(task)
     if env.program.digest != drive.step:
         raise LinkError(

@@ -54,6 +54,7 @@ def numbers_of(task: Task) -> dict[str, float]:
         ("shake", found.action_noise),
         ("slew", found.slew),
         ("push", found.push),
+        ("draw_base", [d.base for d in found.drawn]),
         ("draw_low", [d.low for d in found.drawn]),
         ("draw_high", [d.high for d in found.drawn]),
         ("rest", _listed(task.formulas.rest_action) if task.formulas.acting else []),
@@ -351,31 +352,27 @@ class ImperfectProgram(Program):
     def launch(self) -> Callable:
         """``launch(f, base, stride, par, key, state_given, target_given)``: begin an episode."""
         found, n = self.options, len(self.o)
+        sent = {f"sent{i}": a for i, a in enumerate(self.a)}
         body = [
             *self._parameters,
             *self._load_row([*self._undrawn, *self.y[: self.n_state], *self.g]),
             *self._draw_parameters,
             *self._start, *self.at_rest,
-            *(
-                f"f[base + {self.kept.index(f'sent{i}_{slot}')} * stride] = {a}"
-                for slot in range(found.commands if found.commands > 1 else 0)
-                for i, a in enumerate(self.a)
-            ),
-            *(
-                f"f[base + {self.kept.index(f'at_{slot}')} * stride] = 0.0"
-                for slot in range(found.commands if found.commands > 1 else 0)
-            ),
+            *self._fill(found.commands if found.commands > 1 else 0, {**sent, "at": "0.0"}),
             *self.observe,
-            *(
-                f"f[base + {self.kept.index(f'seen{i}_{slot}')} * stride] = o{i}"
-                for slot in range(found.readings)
-                for i in range(n)
-            ),
+            *self._fill(found.readings, {f"seen{i}": o for i, o in enumerate(self.o)}),
             *self.sense,
             *(f"{self._at(f'h{i}')} = o{i}" for i in range(n)),
             *self._store_row([*self.y, *self.g, *self.u, *self.c, "n", *self.p, *self._drawn_rows]),
         ]  # fmt: skip
         return _compiled("launch", "f, base, stride, par, key, state_given, target_given", body)
+
+    def _fill(self, slots: int, values: dict[str, str]) -> list[str]:
+        """Return the lines that fill all slots of a ring."""
+        if not slots:
+            return []
+        lines = (f"    {self._at(row, 'slot')} = {value}" for row, value in values.items())
+        return [f"for slot in range({slots}):", *lines]
 
     @property
     def _drawn_rows(self) -> list[str]:
@@ -574,14 +571,16 @@ class _Constants:
         trace = ElementaryTrace()
         outputs: dict[str, Any] = {}
         for j, d in enumerate(self._draws):
-            low, high, share = trace.inputs(f"k_draw_low{j}", f"k_draw_high{j}", f"share{j}")
-            if d.log:  # a negative range is that of the sizes, turned round
-                size = trace.exp(trace.log(abs(low)) + share * (trace.log(abs(high)) - trace.log(abs(low))))
-                value = trace.copysign(size, low)
+            given = (constants[f"draw_{name}{j}"] for name in ("base", "low", "high"))
+            base, low, high = (trace.inputs(x)[0] if isinstance(x, str) else x for x in given)
+            (share,) = trace.inputs(f"share{j}")
+            if d.log:
+                factor = trace.exp(trace.log(low) + share * (trace.log(high) - trace.log(low)))
             else:
-                value = low + share * (high - low)
-            outputs[f"p_{d.name}"] = trace.minimum(trace.maximum(value, low), high)
+                factor = low + share * (high - low)
+            outputs[f"p_{d.name}"] = base * trace.minimum(trace.maximum(factor, low), high)
         code, values = record_block(trace, outputs, fused=False)
+        code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
         # Those that follow are made as Python makes them: one rounding for each operation.
         trace = ElementaryTrace()
         numbers = self._given(trace, constants)

@@ -67,7 +67,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     show_tiles : int, optional
         Show the first so many environments at most, side by side in one picture.
     **options
-        Parameters of the scene and of the task. `num_envs` values give each environment its own.
+        Parameters of the scene and of the task. `num_envs` values give each environment its own. Hidden
+        parameters, imperfect sensors and actuators as in `LagrangianEnv`: the same for all, with draws of its
+        own for each environment.
 
     Notes
     -----

@@ -35,7 +35,7 @@ KEYWORDS = (
 #: No normal draw is larger: √(2 · 53 log 2), since the uniform number that it is made of is at least 2^-53.
 LARGEST_NORMAL = math.sqrt(106.0 * math.log(2.0)) * (1.0 + 1e-9)
 #: Control steps by which actions and observations may be late.
-LATEST = 1000
+LATEST = 20_000
 #: Parameters that may be drawn: all corners of their ranges are tried.
 MOST_DRAWN = 8
 #: A delay this near to a whole number of control steps [steps] is one.
@@ -46,12 +46,21 @@ _UNBOUNDED = float(np.finfo(np.float32).max)
 
 
 class Draw(NamedTuple):
-    """The range of a parameter that is drawn anew for each episode, in its unit."""
+    """A parameter that is drawn anew for each episode: `base` times a factor between `low` and `high`."""
 
     name: str
+    base: float
     low: float
     high: float
     log: bool
+
+    def at(self, share: float) -> float:
+        """Return the value at a share of the range."""
+        if self.log:
+            factor = self.low * (self.high / self.low) ** share
+        else:
+            factor = self.low + share * (self.high - self.low)
+        return self.base * min(max(factor, self.low), self.high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,19 +312,19 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
     low, high = (check_number(where, x) for x in given[:2])
     if not low < high:
         raise ValueError(f"{where}: low must be below high, got {shown(given)}")
-    log, value = "log" in words, getattr(scene, name)
+    log, base = "log" in words, 1.0
     if "absolute" not in words:
+        base = getattr(scene, name)
         if not 0.0 <= low:
             raise ValueError(f"{where}: factors must be at least 0, got {low:g}")
-        if not 0.0 < abs(value) < math.inf:
+        if math.isinf(base):
             raise ValueError(
-                f"{where}: {name} is {value:g}, which has no range of factors; give its range in its unit, "
+                f"{where}: {name} is {base:g}, which has no range of factors; give its range in its unit, "
                 '(low, high, "absolute")'
             )
-        low, high = sorted((low * value, high * value))
-    if log and not low * high > 0.0:
-        raise ValueError(f'{where}: a "log" range cannot contain 0, got {low:g} to {high:g}')
-    return Draw(name, low, high, log)
+    if log and not low > 0.0:
+        raise ValueError(f'{where}: a "log" range must be above 0, got {low:g} to {high:g}')
+    return Draw(name, base, low, high, log)
 
 
 _READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
@@ -352,9 +361,11 @@ class Drawn:
         self.task = task
         assert task.imperfections is not None
         self.draws = task.imperfections.drawn
-        self._corners = [self.at(ends) for ends in itertools.product(*((d.low, d.high) for d in self.draws))]
+        self._corners = [
+            self.at(ends) for ends in itertools.product(*((d.at(0.0), d.at(1.0)) for d in self.draws))
+        ]
         #: One with values inside of all ranges.
-        self.inner = self.at([_middle(d, 0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
+        self.inner = self.at([d.at(0.37 + 0.03 * i) for i, d in enumerate(self.draws)])
         for corner in self._corners:
             self._compare(corner)
 
@@ -379,9 +390,9 @@ class Drawn:
     @cached_property
     def tried(self) -> list[Task]:
         """Tasks at the corners, and along lines through the middle of the ranges."""
-        middle = [_middle(d, 0.5) for d in self.draws]
+        middle = [d.at(0.5) for d in self.draws]
         lines = [
-            [_middle(d, share) if d is other else m for other, m in zip(self.draws, middle, strict=True)]
+            [d.at(share) if d is other else m for other, m in zip(self.draws, middle, strict=True)]
             for d in self.draws
             for share in (0.0, 0.25, 0.5, 0.75, 1.0)
         ]
@@ -397,14 +408,6 @@ class Drawn:
             name for name, value in self.task.given.items() if value is not None
         }
         return {name: fields[name] for name in scene._numbers() if fields[name] and name not in given}
-
-
-def _middle(draw: Draw, share: float) -> float:
-    if draw.log:
-        value = draw.low * (draw.high / draw.low) ** share
-    else:
-        value = draw.low + share * (draw.high - draw.low)
-    return min(max(value, draw.low), draw.high)
 
 
 def _listed(values: Mapping[str, float]) -> str:

@@ -237,6 +237,88 @@ which is too cautious without a track to watch.
 """
 
 
+class SwingUpUnknown(SwingUp):
+    """Swing up a bar of unknown length and friction, through noise and a delay, and hold it upright.
+
+    ## Description
+
+    The swing-up of `PivotedBar-v0` with a bar that is another one in each episode. How far its centre of mass
+    is from the pivot, and how much the pivot is damped, is drawn anew and cannot be observed; the bar's
+    moment of inertia follows. Sensors are noisy, and each action takes effect one step late.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step, the one after
+    that in which it is given; in the first step the support moves on as it is.
+
+    The support must be able to stop inside its track, braking at 5 m/s². Where the wanted acceleration would
+    make that impossible, the nearest one that does not is applied.
+
+    ## Observation Space
+
+    Each entry has normal noise with a standard deviation of 0.01. The bounds are those of all bars, wider by
+    the largest noise that can be drawn.
+
+    ## Rewards
+
+    Each step pays h² - 0.02 (u/5)², as in `PivotedBar-v0`: h = (1 - cosθ)/2 at the step's end, u the
+    acceleration that was applied. Noise does not enter.
+
+    ## Starting State
+
+    The bar hangs, nearly at rest. The distance of its centre of mass is 0.3 m times a factor in [1/2, 2], the
+    damping 0.001 N m s times one in [1/10, 10], both uniform in the logarithm. `env.unwrapped.parameters` has
+    them.
+
+    ## Episode End
+
+    Termination: never. The ends of the track are guarded, as described above.
+
+    ## Arguments
+
+    Those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and `action_delay=None` switch off
+    what makes the bar unknown. Factors refer to the parameters that are given.
+
+    ## Signs and Units
+
+    SI units. θ = 0 hangs straight down and θ = π stands; θ grows counter-clockwise and is not wrapped. s is
+    positive to the right and 0 in the middle of the track.
+
+    ## Known Returns
+
+    The optimum is not known. It is below that of a controller that is designed for each episode's bar.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.2.0).
+    """
+
+    id = "PivotedBarUnknown-v0"
+    imperfections = {
+        "randomize": {"com_distance": (0.5, 2.0, "log"), "damping": (0.1, 10.0, "log")},
+        "observation_noise": 0.01,
+        "action_delay": SwingUp.interval,
+    }
+    controllers = {
+        "energy shaping + LQR": Controller("lag_envs.controllers.pivoted_bar:EnergyShapingLQR"),
+    }
+    value_iteration = None
+    examples = Examples(
+        start=SwingUp.examples.start,
+        refused=SwingUp.examples.refused,
+        reach=SwingUp.examples.reach,
+        batch={"gravity": [9.81, 5.0, 20.0, 9.81, 9.81, 50.0, 1.6]},
+        variants={"known": {"randomize": None}, "perfect": {"observation_noise": None, "action_delay": None}},
+    )
+    difficulty = (
+        "A short bar falls three times as fast as a long one: energy to pump and gains to balance with have "
+        "to be found from noisy observations while the bar moves."
+    )
+    note = """
+Energy shaping is designed for the nominal bar, and fails with bars that are much longer or shorter.
+"""
+
+
 class Balance(_Bar):
     """Keep a bar upright against kicks by moving its support.
 

@@ -27,9 +27,12 @@ MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 
 
 def script(env_id: str) -> str | None:
-    """Return the file with which a page drives an environment of the package; None for an unknown id."""
+    """Return the file with which a page drives an environment of the package.
+
+    None for an unknown id, and for one with hidden parameters or imperfect sensors or actuators.
+    """
     kind: Any = TASKS.get(env_id)
-    return script_of(kind) if kind else None
+    return script_of(kind) if kind and not kind.imperfections else None
 
 
 @cache
