@@ -132,11 +132,15 @@ class Policy:
     layers : sequence of (weight, bias)
         Arrays (out, in) and (out,) of each layer.
     choices : tuple of int
-        How many values each action is chosen from; empty where actions are numbers in [-1, 1].
+        How many values each action is chosen from; empty where actions are numbers.
+    largest : float
+        The largest of these numbers, and minus the lowest.
     """
 
-    def __init__(self, layers: Sequence[tuple[Array, Array]], choices: tuple[int, ...]) -> None:
-        self.layers, self.choices = layers, choices
+    def __init__(
+        self, layers: Sequence[tuple[Array, Array]], choices: tuple[int, ...], largest: float = 1.0
+    ) -> None:
+        self.layers, self.choices, self.largest = layers, choices, largest
 
     def outputs(self, observation: NDArray) -> tuple[Array, Array]:
         """Return the last hidden layer (n, width) and the last layer (n, outputs)."""
@@ -157,14 +161,15 @@ class Policy:
     ) -> tuple[NDArray, Any]:
         """Return the best action for each observation."""
         last = self.outputs(np.asarray(observation, np.float32))[1]
-        return self.chosen(last) if self.choices else np.clip(last, -1.0, 1.0), state
+        return self.chosen(last) if self.choices else np.clip(last, -self.largest, self.largest), state
 
     def save(self, path: Path) -> None:
         """Write the weights as the leaderboard has them, in a zip that `numpy.load` reads."""
         file = io.BytesIO()
         layers = [{f"weight_{k}": w, f"bias_{k}": b} for k, (w, b) in enumerate(self.layers)]
         arrays = {name: array for layer in layers for name, array in layer.items()}
-        np.savez(file, choices=np.array(self.choices, np.int64), **arrays)  # type: ignore[arg-type]
+        arrays |= {"choices": np.array(self.choices, np.int64), "largest": np.array(self.largest)}
+        np.savez(file, allow_pickle=False, **arrays)
         write(path, file.getvalue())
 
     @classmethod
@@ -173,7 +178,7 @@ class Policy:
         with np.load(path, allow_pickle=False) as found:
             count = sum(name.startswith("weight_") for name in found)
             layers = [(found[f"weight_{k}"], found[f"bias_{k}"]) for k in range(count)]
-            return cls(layers, tuple(found["choices"].tolist()))
+            return cls(layers, tuple(found["choices"].tolist()), float(found["largest"]))
 
 
 class Continuous:
@@ -181,7 +186,7 @@ class Continuous:
 
     The noise is features · E, where E (features, actions) is drawn with a learned standard deviation of each
     entry. Features are the actor's last hidden layer (gSDE), or 1, so that the noise does not depend on the
-    state. Beyond [-1, 1] the environment clips.
+    state. What is beyond the action space the environment clips.
     """
 
     def __init__(self, settings: Settings, actions: int) -> None:
@@ -281,7 +286,7 @@ class Learner:
         self.actions, self.shape = formulas.actions, self.envs.action_space.shape
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
-        self.policy = Policy([], formulas.choices)
+        self.policy = Policy([], formulas.choices, formulas.largest)
         self.head = Choices(self.policy) if formulas.choices else Continuous(settings, formulas.actions)
         # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
@@ -374,8 +379,8 @@ class Learner:
         """Return everything that changes, for a checkpoint."""
         return {
             "trained": self.trained, "parameters": self.parameters.detach().numpy(),
-            "adam": self.adam.state_dict(), "rng": self.rng, "envs": self.envs,
-            "observation": self.observation,
+            "adam": self.adam.state_dict(), "rng": self.rng,
+            "envs": self.envs.get_state(), "observation": self.observation,
         }  # fmt: skip
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -383,7 +388,8 @@ class Learner:
         with torch.no_grad():
             self.parameters.copy_(torch.from_numpy(state["parameters"]))
         self.adam.load_state_dict(state["adam"])
-        for name in ("trained", "rng", "envs", "observation"):
+        self.envs.set_state(state["envs"])
+        for name in ("trained", "rng", "observation"):
             setattr(self, name, state[name])
 
 

@@ -56,12 +56,12 @@ CHOICES: Mapping[str, Sequence[Any]] = {
     "first_layer_scale": (1.0, 2.0, 3.0),
 }
 RESULTS = ROOT / "agents" / "results" / "tuning"
-EPILOG = f"""By default the numbers of the environment's controllers are looked for, by differential evolution,
-and printed; those that are the controllers' defaults were found in this way.
+EPILOG = f"""By default the numbers of the environment's controllers are looked for, by differential
+evolution, and printed; those that are the controllers' defaults were found in this way.
 
 With --settings settings of {LEARNER} are tried: first the task's own, then others that are drawn at random,
-each with some training seeds. FILE keeps every training, so that the command can be interrupted and run again,
-also with more --settings or --seeds. What is best goes by hand into the task's `hyperparameters`.
+each with some training seeds. FILE keeps every training, so that the command can be interrupted and run
+again, also with more --settings or --seeds. What is best goes by hand into the task's `hyperparameters`.
 
 examples:
   python -m agents.tune PivotedBar-v0 --only "energy shaping + LQR"

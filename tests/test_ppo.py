@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,7 +15,7 @@ import pytest
 import torch
 
 import lag_envs
-from agents import learners, ppo, submit, train
+from agents import learners, ppo, race, submit, train, tune
 from agents.learners import hyperparameters, load_policy
 from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
@@ -121,6 +123,18 @@ def learnt(run):
         [(s, r) for s, _, r in result["curve"]],
         result["trained"],
     )
+
+
+@contextmanager
+def here(*_):
+    """Work in this process in place of others."""
+
+    def submit(function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    yield submit
 
 
 # --- runs ---
@@ -346,6 +360,63 @@ def test_five_seeds_are_a_submission(tmp_path):
     ours = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
     theirs = dict(load(tmp_path / "out").policies)[2].agent()
     np.testing.assert_allclose(ours.predict(seen)[0], theirs.predict(seen)[0], atol=1e-6)
+
+
+def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "tuning.json"
+    monkeypatch.setattr(tune, "hyperparameters", lambda *_: hyperparameters(ppo.NAME, ENV) | SHORT)
+    monkeypatch.setattr(tune, "CHOICES", {"gamma": (0.9, 0.95), "ent_coef": (0.1, 0.2), "critic": ([8], [9])})
+    monkeypatch.setattr(tune.workers, "processes", here)
+    given = [ENV, "--settings", "2", "--seeds", "1", "--steps", "256", "--episodes", "2"]
+    given += ["--output", str(file)]
+    assert tune.main(given) == 0
+    first = json.loads(file.read_text())["settings"]
+    assert [s["number"] for s in first] == [0, 1] and first[0]["changed"] == {} != first[1]["changed"]
+    # More of them, or of seeds: what was tried is kept.
+    given[2], given[4] = "3", "2"
+    assert tune.main(given) == 0
+    output = capsys.readouterr().out
+    assert output.count("setting 0, seed 0: ") == 1 and output.count("setting 0, seed 1: ") == 1
+    second = json.loads(file.read_text())["settings"]
+    assert [[r["seed"] for r in s["runs"]] for s in second] == [[0, 1]] * 3
+    assert [s["runs"][0] for s in second[:2]] == [s["runs"][0] for s in first]
+    best = max(second, key=lambda s: sum(r["return"] for r in s["runs"]))
+    assert output.splitlines()[-4].split()[0] == str(best["number"])  # below the head, above the last line
+    given[6] = "512"
+    assert (
+        tune.main(given) == 2 and "is of a search with steps 256; choose another" in capsys.readouterr().err
+    )
+    file.write_text("{}")
+    assert tune.main(given) == 2 and "cannot be read" in capsys.readouterr().err
+
+
+def test_every_setting_that_may_be_drawn_is_one():
+    for number in range(200):
+        ppo.Settings.of(hyperparameters(ppo.NAME, ENV) | tune.drawn(number))
+    assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
+
+
+def test_race_tells_when_levels_are_reached(tmp_path, monkeypatch, capsys):
+    file, picture = tmp_path / "race.jsonl", tmp_path / "race.png"
+    short = lambda name, env: hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})  # noqa: E731
+    monkeypatch.setattr(race, "hyperparameters", short)
+    monkeypatch.setattr(race, "EPISODES", 2)
+    monkeypatch.setattr(race, "LEVELS", (-9.0, 9.0))
+    monkeypatch.setattr(race.workers, "processes", here)
+    given = [ENV, "--seeds", "1", "--steps", "256", "--output", str(file), "--picture", str(picture)]
+    assert race.main(given) == 0
+    output = capsys.readouterr().out
+    assert "fast PPO, seed 0: -9 in 0.0 s, 9 never" in output and "PPO, seed 0: " in output
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [row["algo"] for row in rows] == ["fast_ppo", "ppo"]
+    for row in rows:
+        steps, seconds, processor, _ = zip(*row["curve"], strict=True)
+        assert steps[0] == 0 and steps[-1] >= 256
+        assert sorted(seconds) == list(seconds) and sorted(processor) == list(processor)
+        assert seconds[-1] == pytest.approx(row["seconds"], abs=1e-3) and seconds[-1] < row["process_seconds"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert race.main(given) == 0 and len(file.read_text().splitlines()) == 2  # nothing is trained again
+    assert race.main(["PivotedBra-v0"]) == 2 and race.main([ENV, "--seeds", "0"]) == 2
 
 
 @pytest.mark.slow

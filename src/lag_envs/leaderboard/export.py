@@ -150,12 +150,12 @@ def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | No
     """
     try:
         with np.load(file, allow_pickle=False) as found:
-            arrays = {name: found[name] for name in found if name != "choices"}
-            choices = found["choices"].tolist()
+            choices, largest = found["choices"].tolist(), float(found["largest"])
+            arrays = {name: found[name] for name in found if name.startswith(("weight_", "bias_"))}
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None
-    if len(choices) > 1:
-        raise ExportError(f"{file}: several actions that are chosen from lists cannot be submitted yet")
+    if len(choices) > 1 or largest != 1.0:
+        raise ExportError(f"{file}: actions must be in [-1, 1], or one that is chosen, to be submitted")
     hidden = [len(arrays[f"bias_{k}"]) for k in range(len(arrays) // 2 - 1)]
     table = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
     return table | ({"bins": choices[0]} if choices else {"squash": "clip"}), arrays
