@@ -25,7 +25,7 @@ WORDS_AND_NUMBERS = frozenset(
 )
 
 
-#: Those that are stepped as their tasks say; the others have hidden parameters, or imperfect sensors or actuators.
+#: Those without hidden parameters and imperfect sensors and actuators: they are stepped as their tasks say.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
 

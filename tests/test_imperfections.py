@@ -32,6 +32,7 @@ ALL = {
     "action_noise": 0.1,
     "action_delay": (0.0, 0.05),
     "slew": 100.0,
+    "lag": 0.01,
     "push": (4.0, 0.7),
 }
 
@@ -102,7 +103,7 @@ def test_tasks_of_ones_own(task, monkeypatch):
     try:
         keywords = {"observation_noise": 0.1, "observation_delay": 0.07, "push": (5.0, 0.1)}
         if task.action:
-            keywords |= {"action_delay": (0.01, 0.1), "slew": 50.0}
+            keywords |= {"action_delay": (0.01, 0.1), "slew": 50.0, "lag": 0.05}
         if task is own_tasks.Deliver:
             keywords |= {"action_noise": {"pull": 0.2}, "randomize": {"load_mass": (0.5, 2.0)}}
         if task is own_tasks.Drift:
@@ -122,6 +123,7 @@ NEUTRAL = {
     "action_noise": {"s_ddot": 0.0},
     "action_delay": (0.0, 0.0),
     "slew": math.inf,
+    "lag": {"s_ddot": 0.0},
     "push": (0.0, 1.0),
 }
 
@@ -209,6 +211,7 @@ def test_draws_are_spread_as_they_should_be():
         )
 
 
+@pytest.mark.slow
 def test_an_environment_has_the_bits_of_one_made_with_the_drawn_values():
     drawn = gym.make(ID, randomize=ALL["randomize"])
     for seed in range(3):
@@ -277,6 +280,35 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
         s, s_dot, theta, theta_dot = task.scene.simulate(at, [control], max(seen_at - when, 1e-15))[-1]
         true = [s / 0.5, s_dot / 2, math.cos(theta), math.sin(theta), theta_dot / 8]
         assert observation == pytest.approx(true, abs=1e-6)
+
+
+@slow
+def test_lag_against_simulate():
+    keywords = {
+        "lag": 0.03,
+        "action_delay": 0.013,
+        "randomize": {"damping": (0.1, 10), "com_distance": (0.5, 2)},
+    }
+    env = gym.make("PivotedBarFree-v0", **keywords)
+    env.reset(seed=3)
+    own, reached, last, dt, tau = env.unwrapped, 0.0, 0.0, 0.02, 0.03
+    scene, state = own.drawn_task.scene, own.state
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        action = rng.uniform(-1, 1, 1).astype(np.float32)
+        _, reward, *_ = env.step(action)
+        mean = 0.0
+        for command, h in ((last, 0.013), (5.0 * float(action[0]), 0.007)):
+            state = scene.simulate(state, [command], h, lag=tau, applied=[reached])[-1]
+            gap = (reached - command) * -math.expm1(-h / tau)
+            mean += (command * h + gap * tau) / dt
+            reached -= gap
+        last = command
+        assert own.state == pytest.approx(state, abs=1e-11) and own.control == pytest.approx(
+            reached, abs=1e-12
+        )
+        height = 0.5 - 0.5 * math.cos(state[0])
+        assert reward == pytest.approx(height**2 - 0.02 * (mean / 5) ** 2, abs=1e-11)
 
 
 def test_first_commands_under_way_are_zero_control():
@@ -412,6 +444,8 @@ REFUSED = [
     ({"action_delay": (0.1, 0.2, 0.3)}, "the shortest and the longest"),
     ({"action_delay": None, "slew": 0.0}, "slew must be above 0"),
     ({"slew": math.nan}, "slew must be finite, got nan"),
+    ({"lag": -0.1}, "lag must be 0 or at least .*got -0.1 s; 0 is no lag"),
+    ({"lag": {"torque": 0.1}}, r"lag\['torque'\]: there is no such control, only s_ddot"),
     ({"push": 1.0}, r"push must be \(pushes per second, largest size\), got 1.0"),
     ({"push": (-1.0, 1.0)}, "its rate must be at least 0, got -1"),
     ({"push": (1.0, {"s_dot": 1.0})}, "no free velocity 's_dot', only theta_dot"),
@@ -430,8 +464,8 @@ def test_what_is_impossible_is_refused(keywords, message):
 def test_noise_on_what_does_not_exist_is_refused():
     with pytest.raises(ValueError, match=r"action_noise is for actions in .*choices from a list"):
         own_tasks.Switched(action_noise=0.1)
-    for keyword in ("action_noise", "action_delay", "slew"):
-        with pytest.raises(ValueError, match=f"{keyword}: there is no .* here, got 0.1; leave it out"):
+    for keyword in ("action_noise", "action_delay", "slew", "lag"):
+        with pytest.raises(ValueError, match=f"{keyword}.* no .*; leave it out"):
             own_tasks.Drift(**{keyword: 0.1})
 
 

@@ -64,6 +64,11 @@ def numbers_of(task: Task) -> dict[str, float]:
     # Pushes that come at a rate: the chance that there is one in a step.
     numbers["push_chance"] = -math.expm1(-found.push_rate * task.dt)
     numbers["late_low"], numbers["late_high"] = found.action_delay
+    if found.lag:
+        scene = (task.drawn.inner if task.drawn else task).scene
+        numbers |= {f"lagged_{name}": x for name, x in scene._constants(lagged=True).items()}
+        numbers |= {f"decay{i}": x for i, x in enumerate(found.lag)}
+        numbers["lagged_order"] = scene._limit(task.dt, lagged=True)
     numbers["shown_at"] = (1.0 - found.observation_delay % 1.0) * task.dt
     return numbers | {"every": float(found.observation_every)}
 
@@ -101,6 +106,10 @@ class ImperfectProgram(Program):
         self._absent, self._drawn = absent, task.drawn
         source = task.drawn.inner if task.drawn else task
         self._made = _Constants(task, absent) if task.drawn else None
+        self._lagged: Any = None
+        if found.lag:
+            gone = frozenset(n.removeprefix("lagged_") for n in absent if n.startswith("lagged_"))
+            self._lagged = source.scene._lagged.code(gone)
         drawn = frozenset(self._made.changed) if self._made else frozenset()
         formulas = source.formulas
         self.a = [f"a{i}" for i in range(formulas.actions)]
@@ -159,18 +168,28 @@ class ImperfectProgram(Program):
             self.command += [f"{c} = {w}" for c, w in zip(self.c, wanted, strict=True)]
         else:
             self.command = record(asked, self.a, wanted)
-        # Here an actuator that follows its command with a lag would find it, in w.
         self.command += record(guarded, [*wanted, *self.y, *given.values()], self.u)
         #: The command before the first.
         self.at_rest = [f"{a} = {self._constant(f'rest{i}')}" for i, a in enumerate(self.a)]
         if self.c:
             self.at_rest += record(asked, self.a, self.c)
+        self._lift_end = formulas.lift("z")
         self.perturb = self._perturb(formulas)
         self.sense = self._noisy(self.o, "observation", found.observation_noise, "sigma", formulas)
         self.sense += [self._between(f"o{i}", f"seen_low{i}", f"seen_high{i}") for i in range(len(self.o))]
         self.push = self._pushes()
         self.begin = self._made.lines(constants) if self._made else []
         self.respond = [f"k_{name}" for name in ("late_low", "late_high", "shown_at", "every", "push_chance")]
+        if self._lagged:
+            self.respond += [*self._decays, "k_lagged_order", *self._lagged_constants]
+
+    @property
+    def _decays(self) -> list[str]:
+        return [self._constant(f"decay{i}") for i in range(len(self.u))]
+
+    @property
+    def _lagged_constants(self) -> list[str]:
+        return [name.replace("k_", "k_lagged_", 1) for name in self._lagged.constants]
 
     def _constant(self, name: str) -> str:
         return str(self._numbers[name])
@@ -257,69 +276,12 @@ class ImperfectProgram(Program):
 
         `work` has the action; it gets what is shown, or the controls of a step that is refused.
         """
-        found, n_act, n_seen = self.options, len(self.a), len(self.o)
-        ring, within = found.commands, found.within
-        divided = ring > 1 or within
-        send, choose = [], []
-        if ring > 1:
-            jitter = found.action_delay[0] < found.action_delay[1]
-            late, high = self._constant("late_low"), self._constant("late_high")
-            drawn = f" + ({high} - {late}) * uniform({self._key('delay')}, np.uint64(n), np.uint64(0))"
-            send = [
-                "now = np.int64(n)", f"slot = now % {ring}",
-                *(f"{self._at(f'sent{i}', 'slot')} = {a}" for i, a in enumerate(self.a)),
-                f"{self._at('at', 'slot')} = {late}{drawn if jitter else ''}",
-            ]  # fmt: skip
-            # The command in force is the last sent of those that have come; the others' times end this piece.
-            choose = [
-                f"for back in range({ring}):",
-                f"    slot = (now + {ring} - back) % {ring}",
-                f"    comes = ({self._at('at', 'slot')} - back) * k_dt",
-                "    if comes <= t:", "        break",
-                "    if comes < switch:", "        switch = comes",
-                *(f"{a} = {self._at(f'sent{i}', 'slot')}" for i, a in enumerate(self.a)),
-            ]  # fmt: skip
-        arguments = [*self.y, *self.u, "h", "dt_limit", *self._stepper.constants]
-        if self.general:
-            arguments = ["room", *arguments]
-        limit = str(self._x) if self.general or self._x == 0.0 else f"{self._x} * (h / k_dt)"
-        move = [
-            "h = end - t", f"dt_limit = {limit}",
-            f"{', '.join(self.z)}, status = advance({', '.join(arguments)})",
-            "if status < 0:",
-            *(f"    work[{n_act + n_seen + j}] = {u}" for j, u in enumerate(self.u)),
-            f"    return 0.0, {SLOW}",
-            *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
-            "t = end",
-        ]  # fmt: skip
-        watch = ["if t == k_shown_at:", *_indent([*self.observe, *(f"m{i} = o{i}" for i in range(n_seen))])]
-        pieces = [
-            *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
-            "t, switch = 0.0, 0.0",
-            "while t < k_dt:",
-            *_indent([
-                "if t == switch:",
-                *_indent([
-                    "switch = k_dt", *choose, "h = switch - t", *self.command,
-                    *(f"mean_{u} += (h / k_dt) * {u}" for u in self.u),
-                ]),
-                "end = switch",
-                *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
-                *move,
-                *(watch if within else []),
-            ]),
-            *(f"{y} = b_{y}" for y in self.y),
-            *(f"last_{u}, {u} = {u}, mean_{u}" for u in self.u),
-        ]  # fmt: skip
-        whole = [
-            "h, t, end = k_dt, 0.0, k_dt", *self.command, *(f"last_{u} = {u}" for u in self.u),
-            *(f"b_{y} = {y}" for y in self.y), *move, *(f"{y} = b_{y}" for y in self.y),
-        ]  # fmt: skip
+        n_act, n_seen = len(self.a), len(self.o)
         body = [
             *self._parameters,
             *self._load_row([*self._rows_of_constants, *self.y, *self.g, *self.c, "n"]),
             *(f"a{i} = work[{i}]" for i in range(n_act)),
-            *self.perturb, *send, *(pieces if divided else whole),
+            *self.perturb, *self._send, *self._through,
             *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
             "n = n + 1.0", *self.kick, *self.move, *self.push,
             "if n >= k_limit:", "    over = over + 2.0",
@@ -329,7 +291,114 @@ class ImperfectProgram(Program):
             *(f"{self._at(u)} = last_{u}" for u in self.u),
             "return r, np.int64(over)",
         ]  # fmt: skip
-        return _compiled("take", "f, base, stride, par, work, room, key", body, self.advance)
+        advance = self._lagged.compile() if self._lagged else self.advance
+        return _compiled("take", "f, base, stride, par, work, room, key", body, advance)
+
+    @property
+    def _send(self) -> list[str]:
+        """The lines that put a command on its way, where it takes time."""
+        ring = self.options.commands
+        if ring == 1:
+            return []
+        low, high = self._constant("late_low"), self._constant("late_high")
+        draw = f" + ({high} - {low}) * uniform({self._key('delay')}, np.uint64(n), np.uint64(0))"
+        jitter = self.options.action_delay[0] < self.options.action_delay[1]
+        return [
+            "now = np.int64(n)",
+            f"slot = now % {ring}",
+            *(f"{self._at(f'sent{i}', 'slot')} = {a}" for i, a in enumerate(self.a)),
+            f"{self._at('at', 'slot')} = {low}{draw if jitter else ''}",
+        ]
+
+    @property
+    def _choose(self) -> list[str]:
+        """The lines that find the command in force at `t`, and when it will be followed by another.
+
+        It is the last sent of those that have come; the others' times end this piece of the step.
+        """
+        ring = self.options.commands
+        if ring == 1:
+            return []
+        return [
+            f"for back in range({ring}):",
+            f"    slot = (now + {ring} - back) % {ring}",
+            f"    comes = ({self._at('at', 'slot')} - back) * k_dt",
+            "    if comes <= t:", "        break",
+            "    if comes < switch:", "        switch = comes",
+            *(f"{a} = {self._at(f'sent{i}', 'slot')}" for i, a in enumerate(self.a)),
+        ]  # fmt: skip
+
+    @property
+    def _through(self) -> list[str]:
+        """The lines that go through a step: from ``y`` to ``z``, with the mean controls in ``u``."""
+        within = self.options.within
+        # Where nothing changes within the step it is one piece, and its mean control is the control.
+        mean = [] if self._lagged else [f"mean_{u} += (h / k_dt) * {u}" for u in self.u]
+        move = [
+            "h = end - t", *(self._move_lagged if self._lagged else self._move),
+            "if status < 0:",
+            *(f"    work[{len(self.a) + len(self.o) + j}] = {u}" for j, u in enumerate(self.u)),
+            f"    return 0.0, {SLOW}",
+            *(self._follow if self._lagged else []),
+            *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
+            "t = end",
+        ]  # fmt: skip
+        watch = ["if t == k_shown_at:", *_indent([*self.observe, *(f"m{o[1:]} = {o}" for o in self.o)])]
+        whole = ["h, t, end = k_dt, 0.0, k_dt", *self.command, *mean, *move]
+        pieces = [
+            "t, switch = 0.0, 0.0",
+            "while t < k_dt:",
+            *_indent([
+                "if t == switch:",
+                *_indent(["switch = k_dt", *self._choose, "h = switch - t", *self.command, *mean]),
+                "end = switch",
+                *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
+                *move,
+                *(watch if within else []),
+            ]),
+        ]  # fmt: skip
+        last = [f"reached{i}" for i in range(len(self.u))] if self._lagged else self.u
+        return [
+            *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
+            *(f"reached{i} = {self._at(u)}" for i, u in enumerate(self.u) if self._lagged),
+            *(pieces if within or self.options.commands > 1 else whole),
+            *(f"{y} = b_{y}" for y in self.y),
+            *(f"last_{u}, {u} = {now}, mean_{u}" for u, now in zip(self.u, last, strict=True)),
+        ]  # fmt: skip
+
+    @property
+    def _move(self) -> list[str]:
+        """The lines that move from ``y`` to ``z`` in a time `h`, under controls that are held."""
+        arguments = [*(["room"] if self.general else []), *self.y, *self.u, "h", "limit"]
+        limit = str(self._x) if self.general or self._x == 0.0 else f"{self._x} * (h / k_dt)"
+        call = f"advance({', '.join([*arguments, *self._stepper.constants])})"
+        return [f"limit = {limit}", f"{', '.join(self.z)}, status = {call}"]
+
+    @property
+    def _move_lagged(self) -> list[str]:
+        """The same under controls that go from where they are, ``reached``, towards their commands ``u``."""
+        n = range(len(self.u))
+        arguments = [
+            "room", *self.y[: self.n_state], *(f"reached{i}" for i in n), *self.u, *self._decays,
+            "h", "k_lagged_order", *self._lagged_constants,
+        ]  # fmt: skip
+        found = [*self.z[: self.n_state], *(f"end{i}" for i in n), *(f"within{i}" for i in n), "status"]
+        return [f"{', '.join(found)} = advance({', '.join(arguments)})"]
+
+    @property
+    def _follow(self) -> list[str]:
+        """The lines behind `_move_lagged`: cosine and sine of the angle; where the controls are now."""
+        n = range(len(self.u))
+        return [
+            *self._lift_end,
+            *(f"reached{i} = end{i}" for i in n),
+            *(f"mean_{u} += (h / k_dt) * within{i}" for i, u in zip(n, self.u, strict=True)),
+        ]
+
+    @property
+    def room(self) -> int:
+        """Numbers that the series needs."""
+        return self._lagged.scratch if self._lagged else super().room
 
     def _read(self) -> list[str]:
         """Return the lines that show what is observed: late, with noise, and not after every step."""
@@ -517,6 +586,7 @@ class _Constants:
         self._task, self._draws, self._made = drawn.inner, drawn.draws, drawn.made
         self._absent = absent
         self._scene = self._task.scene
+        self._lags = bool(task.imperfections and task.imperfections.lag)
         inner = {name: getattr(self._scene, name) for name in self._scene._numbers()}
         trace = ElementaryTrace()
         for d in self._draws:
@@ -550,10 +620,12 @@ class _Constants:
 
     def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
         """Return the constants of the motion that depend on parameters that change."""
-        form = self._scene._form
-        expressions = form.expressions if form else self._scene._stepper.expressions()
+        form, scene = self._scene._form, self._scene
         below = {s.name for s in form.inertia.symbols()} if form else set()
-        wanted = {n: e for n, e in expressions.items() if changed & ({s.name for s in e.symbols()} | below)}
+        wanted = dict(form.expressions if form else scene._stepper.expressions())
+        wanted = {n: e for n, e in wanted.items() if changed & ({s.name for s in e.symbols()} | below)}
+        lagged = scene._lagged.expressions() if self._lags else {}
+        lagged = {f"lagged_{n}": e for n, e in lagged.items() if changed & {s.name for s in e.symbols()}}
         values = {
             parameter(name): _Twice(x) if isinstance(x, Number) else Fraction(x)
             for name, x in numbers.items()
@@ -564,7 +636,8 @@ class _Constants:
         if form:
             (inertia,) = evaluate([form.inertia], values, functions)
             found = [x / inertia for x in found]
-        return {name: _rounded(x) for name, x in zip(wanted, found, strict=True)}
+        found += evaluate(list(lagged.values()), values, functions)
+        return {name: _rounded(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
 
     def lines(self, constants: dict[str, Any]) -> list[str]:
         """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""

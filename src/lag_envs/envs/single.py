@@ -51,8 +51,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...;
         and hidden parameters, imperfect sensors and actuators: ``randomize``, ``observation_noise``,
         ``observation_delay`` [s], ``observation_every``, ``action_noise``, ``action_delay`` [s], ``slew``,
-        ``push``. All are off by default. Delays are exact: a step is divided where the command in force
-        changes. See docs/usage.md.
+        ``lag`` [s], ``push``. All are off by default. Delays are exact: a step is divided where the command
+        in force changes. See docs/usage.md.
 
     Notes
     -----

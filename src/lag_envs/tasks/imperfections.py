@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.scenes.checks import check_number, shown
+from lag_envs.scenes.checks import check_lags, check_number, shown
 from lag_envs.scenes.declaring import complete
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ KEYWORDS = (
     "action_noise",
     "action_delay",
     "slew",
+    "lag",
     "push",
 )
 #: No normal draw is larger: √(2 · 53 log 2), since the uniform number that it is made of is at least 2^-53.
@@ -83,6 +84,8 @@ class Imperfections:
         Shortest and longest time from an action to its effect [control steps].
     slew : tuple of float
         For each control that actions set its largest change [SI unit per second]; infinity for any.
+    lag : tuple of float
+        For each control of the scene 1/τ of its actuator [1/s]; 0 for one that does as it is told.
     push : tuple of float
         For each entry of the state the largest size of a random impulse.
     push_rate : float
@@ -96,6 +99,7 @@ class Imperfections:
     action_noise: tuple[float, ...] = ()
     action_delay: tuple[float, float] = (0.0, 0.0)
     slew: tuple[float, ...] = ()
+    lag: tuple[float, ...] = ()
     push: tuple[float, ...] = ()
     push_rate: float = 0.0
 
@@ -126,6 +130,7 @@ class Imperfections:
             self.commands,
             self.action_delay[0] < self.action_delay[1],
             tuple(map(math.isfinite, self.slew)),
+            bool(self.lag),
             tuple(x > 0.0 for x in self.push),
         )
 
@@ -264,6 +269,11 @@ def _slew(task: Task, value: Any) -> dict[str, Any]:
     return {"slew": rates if any(map(math.isfinite, rates)) else ()}
 
 
+def _lag(task: Task, value: Any) -> dict[str, Any]:
+    decays = check_lags(task.scene.control_names, value, task.dt)
+    return {"lag": tuple(decays.tolist()) if decays.any() else ()}
+
+
 def _push(task: Task, value: Any) -> dict[str, Any]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise ValueError(f"push must be (pushes per second, largest size), got {shown(value)}")
@@ -335,6 +345,7 @@ _READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
     "action_noise": _action_noise,
     "action_delay": _action_delay,
     "slew": _slew,
+    "lag": _lag,
     "push": _push,
 }
 assert tuple(_READERS) == KEYWORDS
@@ -421,8 +432,9 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
     """Return the lowest and highest values that an environment of this task shows.
 
     Its bounds are those of the task, for all parameters that may be drawn, and wider by the largest noise.
-    Tasks prove their bounds for parameters that are given and for the ends of control steps; what is seen
-    within one, and what parameters between those that were tried would need, has a margin.
+    Tasks prove their bounds for given parameters, for controls that do as they are told and for the ends of
+    control steps. What parameters between those that were tried would need has a margin, and so has what is
+    seen within a step, or behind a lag that no guard can foresee.
     """
     found = task.imperfections
     if found is None:
@@ -436,7 +448,7 @@ def seen_box(task: Task) -> tuple[list[float], list[float]]:
         for values, end, side, out in ((ends[0], min, -1.0, low), (ends[1], max, 1.0, high)):
             bound = end(values)
             if abs(bound) < _UNBOUNDED:
-                if found.within or min(values) != max(values):
+                if found.within or found.lag or min(values) != max(values):
                     bound += side * MARGIN * abs(bound)
                 bound += side * sigma * LARGEST_NORMAL
             out.append(min(max(bound, -_UNBOUNDED), _UNBOUNDED))
