@@ -85,7 +85,9 @@ def test_one_policy_in_both(env_id, peer_id, capsys):
             print(f"{name:20} {TASKS[env_id].reference:24} {returns.mean():8.2f} ± {error(returns):.2f}")
     theirs, ours = found.values()
     assert abs(theirs.mean() - ours.mean()) < 4.0 * np.hypot(error(theirs), error(ours)) + 1e-9
-    assert min(theirs.mean(), ours.mean()) > {"CartPole-v1": 499.0, "Pendulum-v1": -250.0}.get(peer_id, -120.0)
+    assert min(theirs.mean(), ours.mean()) > {"CartPole-v1": 499.0, "Pendulum-v1": -250.0}.get(
+        peer_id, -120.0
+    )
 
 
 def error(returns):
@@ -137,4 +139,6 @@ def test_the_wrapped_angle():
     for angle in angles:
         found = wrapped(np.cos(angle), np.sin(angle), np)
         off = angle - found
-        assert abs(found) <= np.pi and off == pytest.approx(2.0 * np.pi * np.rint(off / (2.0 * np.pi)), abs=4e-15)
+        assert abs(found) <= np.pi and off == pytest.approx(
+            2.0 * np.pi * np.rint(off / (2.0 * np.pi)), abs=4e-15
+        )
