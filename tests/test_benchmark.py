@@ -292,7 +292,7 @@ def test_exact_cart_pole_is_gymnasiums_but_for_its_steps():
 
     from lag_envs.envs.single import LagrangianEnv
 
-    ours = LagrangianEnv("lag_envs.benchmark_tasks:ExactCartPole", dt=1e-4)
+    ours = LagrangianEnv("lag_envs.tasks.cart_pole:CartPoleExact", dt=1e-4)
     theirs = gym.make("CartPole-v1", max_episode_steps=100_000).unwrapped
     theirs.tau = 1e-4
     start = np.array([0.01, -0.02, 0.03, 0.04])

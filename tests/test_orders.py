@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lag_envs import orders
-from lag_envs.benchmark_tasks import ExactCartPole
 from lag_envs.cli import main
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.cart_pole import CartPoleExact
 
 EXAMPLE = str(Path(__file__).parents[1] / "examples" / "ball_on_beam.py")
 PENDULUM = TASKS["PivotedBar-v0"]
@@ -21,7 +21,7 @@ def test_any_order_takes_the_same_steps():
     """To rounding: each of them is certified."""
     seen = {}
     for order in (8, 10, 24):
-        envs = LagrangianVectorEnv(ExactCartPole, 5)
+        envs = LagrangianVectorEnv(CartPoleExact, 5)
         envs.order = order
         assert envs.order == order
         envs.reset(seed=3)
@@ -35,10 +35,10 @@ def test_any_order_takes_the_same_steps():
 
 @pytest.mark.parametrize("order", [5, 25, 10.0, True, None])
 def test_an_order_out_of_range_changes_nothing(order):
-    envs = LagrangianVectorEnv(ExactCartPole, 2)
+    envs = LagrangianVectorEnv(CartPoleExact, 2)
     with pytest.raises(ValueError, match="order must be a whole number from 6 to 24"):
         envs.order = order
-    assert envs.order == ExactCartPole.order
+    assert envs.order == CartPoleExact.order
 
 
 def test_closed_forms_have_none():
@@ -56,7 +56,7 @@ def test_the_best_is_the_lowest_of_the_fastest():
     ("now", "said"), [(16, "Write `order = 10` into"), (10, "is as fast as any"), (9, "is as fast as any")]
 )
 def test_advice(now, said):
-    text = orders.lines(ExactCartPole, {8: 90.0, 10: 45.0, 12: 50.0, 14: 60.0, 16: 70.0}, now)
+    text = orders.lines(CartPoleExact, {8: 90.0, 10: 45.0, 12: 50.0, 14: 60.0, 16: 70.0}, now)
     assert said in text[-1]
 
 

@@ -184,9 +184,12 @@ def of_energies(sizes: Sequence[int]) -> list[Contestant]:
     # Batches of some thousand long chains would take minutes until their episodes are spread out.
     middle = max((n for n in sizes if n <= 1024), default=min(sizes))
     some: list[tuple[str, str, dict[str, Any], int]]
-    some = [("CartPole, exact", "ExactCartPole", {}, n) for n in sizes]
-    some += [("Chain(2)", "ChainSwing", {"bars": 2}, n) for n in sizes]
-    some += [(f"Chain({i})", "ChainSwing", {"bars": i}, middle) for i in (1, *range(3, LONGEST + 1))]
+    some = [("CartPole, exact", "lag_envs.tasks.cart_pole:CartPoleExact", {}, n) for n in sizes]
+    some += [("Chain(2)", "lag_envs.benchmark_tasks:ChainSwing", {"bars": 2}, n) for n in sizes]
+    some += [
+        (f"Chain({i})", "lag_envs.benchmark_tasks:ChainSwing", {"bars": i}, middle)
+        for i in (1, *range(3, LONGEST + 1))
+    ]
     return [
         Contestant(ENERGIES, id, "vector", n, partial(energies, task, given, n))
         for id, task, given, n in some
@@ -194,10 +197,10 @@ def of_energies(sizes: Sequence[int]) -> list[Contestant]:
 
 
 def energies(task: str, given: dict[str, Any], n: int) -> Run:
-    """Prepare a vector environment of a task of `benchmark_tasks`."""
+    """Prepare a vector environment of a task, "module:Class"."""
     from lag_envs.envs.vector import LagrangianVectorEnv
 
-    envs = LagrangianVectorEnv(f"lag_envs.benchmark_tasks:{task}", n, **given)
+    envs = LagrangianVectorEnv(task, n, **given)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)

@@ -1,34 +1,12 @@
-"""Tasks that ``lag-envs bench`` sets beside Gymnasium's CartPole, one of them its own."""
+"""A task that ``lag-envs bench`` sets beside Gymnasium's CartPole."""
 
 from __future__ import annotations
 
 import math
 from typing import Any, ClassVar
 
-from lag_envs.scenes import CartPole, Chain
+from lag_envs.scenes import Chain
 from lag_envs.tasks import Task
-
-
-class ExactCartPole(Task):
-    """Gymnasium's `CartPole-v1`: its model, choices, start, reward and endings, without Euler's error."""
-
-    scene: Any = CartPole
-    interval, steps = 0.02, 500
-    action: ClassVar = {"force": [-10.0, 10.0]}
-    start: ClassVar = dict.fromkeys(("x", "x_dot", "theta", "theta_dot"), 0.05)
-    order = 10  # a pole that hardly leans: 16 takes half as long again, 8 twice as long
-
-    def observe(self, after: Any, target: Any, xp: Any) -> dict[str, Any]:
-        """Return the state."""
-        return {name: after[name] for name in self.scene.state_names}
-
-    def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return 1."""
-        return 1.0
-
-    def terminated(self, after: Any, target: Any, xp: Any) -> Any:
-        """Tell whether the cart has left its track, or the pole leans by more than 12 degrees."""
-        return (xp.abs(after.x) > 2.4) | (xp.abs(after.theta) > math.radians(12.0))
 
 
 class ChainSwing(Task):

@@ -67,6 +67,7 @@ def page(
     prose = {name: _linked(text) for name, text in sections(type(task)).items()}
     parts: dict[str, list[str]] = {name: [prose.get(name, "")] for name in HEADINGS}
     parts["Description"].append(" ".join(task.difficulty.split()))
+    parts["Description"].append(_energy(env_id, task))
     parts["Action Space"].append(_actions(task))
     parts["Observation Space"].append(_observation(task))
     parts["Starting State"].append(_start(task))
@@ -146,6 +147,16 @@ def _picture(env_id: str) -> str:
     if not (ROOT / "docs" / "images" / "moving" / f"{env_id}.webp").exists():
         return ""
     return f"![{env_id}: a trained agent at work](../images/moving/{env_id}.webp)"
+
+
+def _energy(env_id: str, task: Task) -> str:
+    if not (ROOT / "docs" / "images" / f"energy-{env_id}.png").exists():
+        return ""
+    return (
+        f"![Energy less work against time in {task.peer} and {env_id}](../images/energy-{env_id}.png)\n\n"
+        "The energy less the work that the control has done, under random actions from a start in mid-task. "
+        "Nothing rubs, so it must stay what it was."
+    )
 
 
 def _summary(env_id: str, task: Task) -> str:

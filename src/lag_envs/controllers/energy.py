@@ -178,24 +178,27 @@ class PivotEnergyLQR(Pumped):
         return (wanted - still) / (pushed - still)
 
 
-class Pump(FeedbackController):
-    """Push a joint the way it turns, with all one has: that always adds energy.
+class Switch:
+    """The largest control to one side or the other, by the sign of a sum of observations.
 
     Parameters
     ----------
     task : Task
-        A task with one control, a torque in a joint.
-    rate : str
-        The joint's rate.
+        The task, ``env.unwrapped.task``, with one control.
+    weights : mapping
+        What each entry of the observation counts in the sum.
     """
 
-    def __init__(self, task: Task, *, rate: str) -> None:
-        super().__init__(task)
-        self.column = task.scene.state_names.index(rate)
+    def __init__(self, task: Task, *, weights: Mapping[str, float]) -> None:
+        self.task = task
+        self.weights = np.array([weights.get(name, 0.0) for name in task.observation])
 
-    def control(self, state: Array, target: Array) -> Array:
-        """Return the largest torque, by the sign of the rate."""
-        return np.where(state[..., self.column] < 0.0, -1.0, 1.0) * self.task.limit_control
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation."""
+        side = np.where(observation @ self.weights < 0.0, -1.0, 1.0)
+        return actions_for(self.task, side * self.task.limit_control), state
 
 
 class PublishedLQR(FeedbackController):
