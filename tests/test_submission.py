@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.leaderboard.policies import bin_centres
+from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
@@ -148,7 +148,7 @@ def test_network_is_what_the_arrays_say(tmp_path):
 @pytest.mark.parametrize("name", ["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"])
 def test_activations_are_those_of_torch(name):
     torch = pytest.importorskip("torch")
-    from lag_envs.leaderboard.policies import ACTIVATIONS
+    from lag_envs.leaderboard.networks import ACTIVATIONS
 
     x = np.linspace(-30.0, 30.0, 1001)
     module = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
