@@ -25,7 +25,7 @@ WORDS_AND_NUMBERS = frozenset(
 )
 
 
-#: Those that are stepped as their tasks say; the others have hidden parameters, or imperfect sensors or actuators.
+#: Those that are stepped as their tasks say: without hidden parameters, imperfect sensors or actuators.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
 

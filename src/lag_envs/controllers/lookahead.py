@@ -30,7 +30,7 @@ class Clocked(ABC):
     def __init__(self, task: Task) -> None:
         self.read = ObservationDecoder(task)
         self._chooses = bool(task.formulas.choices)
-        self.largest = getattr(task.formulas, "largest", 1.0)
+        self.largest = task.formulas.largest
         #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
         self.pace = 1.0
 

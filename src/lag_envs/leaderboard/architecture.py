@@ -82,7 +82,7 @@ class Head:
         formulas = task.formulas
         self.choices = formulas.choices
         self.size = sum(self.choices) or formulas.actions
-        self.largest = getattr(formulas, "largest", 1.0)
+        self.largest = formulas.largest
         self._single = len(self.choices) == 1
         self._ends = np.cumsum(self.choices)[:-1]
 

@@ -101,7 +101,7 @@ class Table(Architecture):
         grid = _Grid(self, axes, arrays["table"])
         if self.kind == "action":
             return _LookUp(self.task, grid)
-        listed, largest = self.task.formulas.choices, getattr(self.task.formulas, "largest", 1.0)
+        listed, largest = self.task.formulas.choices, self.task.formulas.largest
         tried = np.arange(float(listed[0])) if listed else np.linspace(-largest, largest, self.actions)
         return LookAhead(self.task, grid.value, tried)
 

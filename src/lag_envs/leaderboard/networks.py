@@ -243,7 +243,7 @@ class _Layers:
 class _Plain(Agent):
     def __init__(self, layers: _Layers) -> None:
         super().__init__(layers.head)
-        self.layers = layers
+        self.layers, self.centres = layers, layers.centres
 
     def outputs(self, observations: Array) -> Array:
         """Return what the last layer puts out, shape (n, outputs)."""
