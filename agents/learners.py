@@ -352,7 +352,7 @@ class Policy:
         action, state = self.model.predict(observation, state, episode_start, deterministic)
         bins = getattr(self.model.action_space, "n", None)
         if self.bins and bins is not None:
-            from lag_envs.leaderboard.policies import bin_centres
+            from lag_envs.leaderboard.networks import bin_centres
 
             action = bin_centres(int(bins)).astype(np.float32)[np.asarray(action)][..., None]
         return action, state

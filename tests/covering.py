@@ -25,7 +25,7 @@ WORDS_AND_NUMBERS = frozenset(
 )
 
 
-#: Those without hidden parameters and imperfect sensors and actuators: they are stepped as their tasks say.
+#: Those that are stepped as their tasks say: without hidden parameters, imperfect sensors or actuators.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
 

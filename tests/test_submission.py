@@ -17,7 +17,7 @@ from safetensors.numpy import save
 
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.kernels import affine
-from lag_envs.leaderboard.policies import bin_centres
+from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.leaderboard.submission import Refused, load, write
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
@@ -148,7 +148,7 @@ def test_network_is_what_the_arrays_say(tmp_path):
 @pytest.mark.parametrize("name", ["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"])
 def test_activations_are_those_of_torch(name):
     torch = pytest.importorskip("torch")
-    from lag_envs.leaderboard.policies import ACTIVATIONS
+    from lag_envs.leaderboard.networks import ACTIVATIONS
 
     x = np.linspace(-30.0, 30.0, 1001)
     module = {"tanh": "Tanh", "relu": "ReLU", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU"}
@@ -744,7 +744,7 @@ def test_every_single_bit_flip_is_refused_or_harmless(folder):
 # --- export -------------------------------------------------------------------------------------------------
 
 
-def model(algo, seed=0, bins=0, normalise=False, **options):
+def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
     """Return an untrained model with steep layers, and its normalisation, as a training would leave them."""
     sb3 = pytest.importorskip("stable_baselines3")
     import gymnasium as gym
@@ -754,7 +754,7 @@ def model(algo, seed=0, bins=0, normalise=False, **options):
     import lag_envs  # noqa: F401  (registers the environments)
 
     def make():
-        env = gym.make(ENV)
+        env = gym.make(env_id)
         return gym.wrappers.DiscretizeAction(env, bins=bins) if bins else env
 
     torch.set_num_threads(1)
@@ -807,6 +807,21 @@ def test_export_acts_as_the_model(algo, options, tmp_path):
     arrays["weight_0"] = -arrays["weight_0"]
     agent = network(tmp_path / "b", table, arrays).policies[0][1].agent()
     assert difference(made, normalise, agent, ENV)[0] > 1e-3
+
+
+@pytest.mark.parametrize("algo", ["PPO", "DQN"])
+def test_export_of_a_model_that_chooses_what_the_environment_lists(algo, tmp_path):
+    from lag_envs.leaderboard.export import convert, difference
+
+    env = next(env_id for env_id, task in TASKS.items() if len(task().formulas.choices) == 1)
+    made, _ = model(algo, env_id=env, policy_kwargs={"net_arch": [8]})
+    table, arrays = convert(made, listed=True)
+    assert not {"bins", "squash"} & set(table)
+    agent = network(tmp_path / "a", table, arrays, env=env).policies[0][1].agent()
+    assert difference(made, None, agent, env) == (0.0, 16_384)
+    arrays["weight_0"] = -arrays["weight_0"]
+    agent = network(tmp_path / "b", table, arrays, env=env).policies[0][1].agent()
+    assert difference(made, None, agent, env)[0] == 1.0
 
 
 @pytest.fixture(scope="module")
@@ -977,7 +992,8 @@ def test_page_tells_the_limits():
         f"{p.CURVE} points",
     ):
         assert told in text
-    from lag_envs.leaderboard.policies import ACTIVATIONS, ARCHITECTURES
+    from lag_envs.leaderboard.networks import ACTIVATIONS
+    from lag_envs.leaderboard.policies import ARCHITECTURES
 
     assert all(f"`{name}`" in text for name in (*ACTIVATIONS, *ARCHITECTURES))
 

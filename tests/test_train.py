@@ -23,7 +23,7 @@ from agents.run import Run, UserError
 from lag_envs import cli
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import as_yaml
-from lag_envs.leaderboard.policies import bin_centres
+from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.tasks import TASKS, incline
 
 ROOT = Path(__file__).parents[1]

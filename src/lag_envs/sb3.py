@@ -29,7 +29,7 @@ except ModuleNotFoundError as error:
 
 import lag_envs  # noqa: F401  (registers the environments)
 from lag_envs.envs.stagger import stagger
-from lag_envs.leaderboard.policies import bin_centres
+from lag_envs.leaderboard.networks import bin_centres
 
 
 def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any) -> VecEnv:

@@ -171,7 +171,7 @@ class Model:
         self.model, self.normalise = model, normalise
         self.centres: NDArray[np.float64] | None = None
         if isinstance(space, gym.spaces.Box) and isinstance(model.action_space, gym.spaces.Discrete):
-            from lag_envs.leaderboard.policies import bin_centres
+            from lag_envs.leaderboard.networks import bin_centres
 
             self.centres = bin_centres(int(model.action_space.n))
 

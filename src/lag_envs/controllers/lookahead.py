@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import ObservationDecoder, as_actions
+from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.envs.model import Model
 from lag_envs.tasks.base import Task
 
@@ -29,12 +29,24 @@ class Clocked(ABC):
 
     def __init__(self, task: Task) -> None:
         self.read = ObservationDecoder(task)
+        self._chooses = bool(task.formulas.choices)
+        self.largest = task.formulas.largest
         #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
         self.pace = 1.0
 
     @abstractmethod
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
-        """Return actions (n,), not clipped yet, for states (n, n_state), targets and steps taken (n,)."""
+        """Return actions, not clipped yet, for states (n, n_state), targets and steps taken (n,).
+
+        Their shape is (n,) where an action has one number, and (n, n_actions) otherwise.
+        """
+
+    def finish(self, values: Array) -> NDArray:
+        """Return what `act` returned as the environment takes it."""
+        if self._chooses:
+            return values.astype(np.int64)
+        clipped = np.clip(values, -self.largest, self.largest).astype(np.float32)
+        return clipped if clipped.ndim > 1 else clipped[:, None]
 
     def predict(
         self,
@@ -42,7 +54,7 @@ class Clocked(ABC):
         state: ArrayLike | None = None,
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Array]:
+    ) -> tuple[NDArray, Array]:
         """Return the action for each observation, and the steps taken then."""
         values = np.asarray(observation, np.float64)
         batch = np.atleast_2d(values)
@@ -50,14 +62,14 @@ class Clocked(ABC):
         if episode_start is not None:
             taken = np.where(np.broadcast_to(episode_start, len(batch)), 0.0, taken)
         with np.errstate(all="ignore"):
-            actions = as_actions(self.act(*self.read(batch), taken))
-        return actions.reshape(*values.shape[:-1], 1), taken + self.pace
+            actions = self.finish(self.act(*self.read(batch), taken))
+        return actions.reshape((*values.shape[:-1], *actions.shape[1:])), taken + self.pace
 
 
 class LookAhead(Clocked):
     """Takes the action with the largest reward + value after one step of the exact, undisturbed model.
 
-    It tries a set of actions, and then finer ones around the best.
+    It tries a set of actions, and then, unless they are listed, finer ones around the best.
 
     Parameters
     ----------
@@ -67,7 +79,7 @@ class LookAhead(Clocked):
         Given where steps end (n, n_state), targets (n,) and the steps taken before them (n,), it returns the
         mean return that is still to be had (n,).
     actions : ndarray
-        The first actions to try, evenly spaced.
+        The first actions to try, evenly spaced; all that are listed.
     """
 
     def __init__(self, task: Task, value: Callable[[Array, Array, Array], Array], actions: Array) -> None:
@@ -78,8 +90,10 @@ class LookAhead(Clocked):
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
         """Return the best actions."""
         best = self._best(states, targets, taken, np.tile(self.actions, (len(states), 1)))
+        if self._chooses:
+            return best
         around = best[:, None] + (self.actions[1] - self.actions[0]) * np.linspace(-1.0, 1.0, 17)
-        return self._best(states, targets, taken, np.clip(around, -1.0, 1.0))
+        return self._best(states, targets, taken, np.clip(around, -self.largest, self.largest))
 
     def _best(self, states: Array, targets: Array, taken: Array, actions: Array) -> Array:
         """Return the best of each row's actions."""

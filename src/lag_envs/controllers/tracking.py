@@ -31,16 +31,16 @@ class Tracking(Clocked):
     Parameters
     ----------
     task : Task
-        The task, with one control.
+        The task.
     states : array_like, shape (steps + 1, n_state)
         The plan's states. Without any step, the feedback at rest is all there is.
-    actions : array_like, shape (steps,)
-        Its actions.
-    gains : array_like, shape (steps, n_state)
+    actions : array_like, shape (steps,) or (steps, n_actions)
+        Its actions, without the last axis where they have one number.
+    gains : array_like, shape (steps, n_state) or (steps, n_actions, n_state)
         The feedback K_t, actions per deviation.
     rest : array_like, shape (n_state,)
-        The equilibrium that is held.
-    hold : array_like, shape (n_state,)
+        The equilibrium that is held, by the action 0.
+    hold : array_like, shape (n_state,) or (n_actions, n_state)
         The feedback K there.
     """
 
@@ -58,15 +58,25 @@ class Tracking(Clocked):
         hold: ArrayLike,
     ) -> None:
         super().__init__(task)
-        self.task, n = task, len(task.scene.state_names)
+        self.task = task
         self.states, self.actions, self.gains, self.rest, self.hold = (
             np.asarray(values, np.float64) for values in (states, actions, gains, rest, hold)
         )
         steps = len(self.actions)
-        wanted = {"states": (steps + 1, n), "gains": (steps, n), "rest": (n,), "hold": (n,)}
-        for name, shape in wanted.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
+        for name, shape in self.shapes(task).items():
+            wanted = tuple({"steps": steps, "steps + 1": steps + 1}.get(n, n) for n in shape)
+            if getattr(self, name).shape != wanted:
+                raise ValueError(f"{name} must have shape {wanted}, got {getattr(self, name).shape}")
+
+    @staticmethod
+    def shapes(task: Task) -> dict[str, tuple[Any, ...]]:
+        """Return the shapes of its numbers by name; "steps" and "steps + 1" depend on the plan."""
+        n, m = len(task.scene.state_names), task.formulas.actions
+        each = () if m == 1 else (m,)
+        return {
+            "states": ("steps + 1", n), "actions": ("steps", *each), "gains": ("steps", *each, n),
+            "rest": (n,), "hold": (*each, n),
+        }  # fmt: skip
 
     @classmethod
     def load(cls, task: Task, file: Path) -> Tracking:
@@ -106,9 +116,10 @@ class Tracking(Clocked):
         following = np.minimum(step + 1, steps)
         planned = self.states[step] + share * (self.states[following] - self.states[step])
         planned = np.where((step < steps)[:, None], planned, self.rest)
-        gains = np.vstack([self.gains, self.hold])[step]
+        gains = np.concatenate([self.gains, self.hold[None]])[step]
         off = self.read.difference(states, planned)
-        return np.append(self.actions, 0.0)[step] - np.einsum("ij,ij->i", gains, off)
+        actions = np.concatenate([self.actions, np.zeros((1, *self.actions.shape[1:]))])[step]
+        return actions - np.einsum("i...j,ij->i...", gains, off)
 
 
 def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:

@@ -43,16 +43,18 @@ class Condition:
         return int(TASKS[env_id](**self.options).limit)
 
     def suits(self, agent: Any, plans: bool) -> bool:
-        """Tell whether an agent can act under it: one that plans does so for one control interval.
+        """Tell whether an agent can act under it: one that plans or remembers does so for one interval.
 
         Parameters
         ----------
         agent : object
-            The agent; with a `pace` it counts steps, and can be told how long they are.
+            The agent; with a `pace` it counts steps, and can be told how long they are. It says by
+            `of_one_interval` that it remembers what it saw at such steps.
         plans : bool
             Whether it plans.
         """
-        return "dt" not in self.options or hasattr(agent, "pace") or not plans
+        of_one = plans or getattr(agent, "of_one_interval", False)
+        return "dt" not in self.options or hasattr(agent, "pace") or not of_one
 
 
 def often(env_id: str) -> Condition:

@@ -80,21 +80,28 @@ class Track:
             memory, total = None, 0.0
             for observation, own, running in zip(seen, did, self.played.running, strict=True):
                 action, memory = act(agent, observation, memory, start, own.shape)
-                off = np.where(running[:, None], action - own, 0.0)
+                off = np.where(running[:, None], self._off(action, own), 0.0)
                 total += float(np.sum(off * off))
                 start = np.zeros_like(start)
         except PolicyError:
             return FAR.actions**2
-        return total / float(self.played.steps.sum()) / did.shape[-1]
+        return total / float(self.played.steps.sum()) / off.shape[-1]
+
+    def _off(self, action: Array, own: Array) -> Array:
+        """Return how far actions are from the own ones, shape (n, numbers): 1 where others are chosen."""
+        off = np.asarray(action, np.float64) - own
+        if self.played.task.formulas.choices:
+            off = np.sign(np.abs(off))
+        return off.reshape(len(off), -1)
 
     def _asked_at_once(self, agent: Any) -> float:
         where = np.flatnonzero(self.played.running.ravel())
         # Evenly over all times and episodes; which episodes these are follows from the nonce.
         where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
         arrays = self.played.observations, self.played.actions
-        seen, did = (array.reshape(-1, array.shape[-1])[where] for array in arrays)
+        seen, did = (array.reshape(-1, *array.shape[2:])[where] for array in arrays)
         action, _ = act(agent, seen, None, np.ones(len(seen), np.bool_), did.shape)
-        off = action.astype(np.float64) - did
+        off = self._off(action, did)
         return float(np.mean(off * off))
 
 

@@ -141,30 +141,24 @@ def _load(source: Source, algo: str) -> tuple[Any, Any]:
 
 
 def arrays_of(file: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | None:
-    """Return a network's table ``[policy]`` and its arrays, where a file holds arrays and no model.
-
-    Raises
-    ------
-    ExportError
-        For a network that the leaderboard does not take.
-    """
+    """Return a network's table ``[policy]`` and its arrays, where a file holds arrays and no model."""
     try:
         with np.load(file, allow_pickle=False) as found:
-            choices, largest = found["choices"].tolist(), float(found["largest"])
+            choices = found["choices"].tolist()
             arrays = {name: found[name] for name in found if name.startswith(("weight_", "bias_"))}
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None
-    if len(choices) > 1 or largest != 1.0:
-        raise ExportError(f"{file}: actions must be in [-1, 1], or one that is chosen, to be submitted")
     hidden = [len(arrays[f"bias_{k}"]) for k in range(len(arrays) // 2 - 1)]
     table = {"architecture": "mlp", "hidden": hidden, "activation": "tanh"}
-    return table | ({"bins": choices[0]} if choices else {"squash": "clip"}), arrays
+    return table | ({} if choices else {"squash": "clip"}), arrays
 
 
 # --- converting ---------------------------------------------------------------------------------------------
 
 
-def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def convert(
+    model: Any, normalise: Any = None, listed: bool = False
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return a model's policy as the table ``[policy]`` and its arrays.
 
     Parameters
@@ -173,6 +167,8 @@ def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str
         A model of Stable-Baselines3; of its distribution the mode is taken.
     normalise : VecNormalize, optional
         Its normalisation of observations.
+    listed : bool, optional
+        Whether the environment itself has actions to choose from, and not a wrapper.
 
     Raises
     ------
@@ -183,9 +179,9 @@ def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str
 
     policy, space = model.policy, model.action_space
     table: dict[str, Any] = {"architecture": "mlp"}
-    discrete = isinstance(space, spaces.Discrete)
+    discrete = isinstance(space, spaces.Discrete | spaces.MultiDiscrete if listed else spaces.Discrete)
     numbers = isinstance(space, spaces.Box) and len(space.shape) == 1
-    if not discrete and not (numbers and (space.low == -1.0).all() and (space.high == 1.0).all()):
+    if not discrete and not (numbers and len({*-space.low, *space.high}) == 1):
         raise ExportError(f"the action space must be numbers in [-1, 1], or Discrete, got {space}")
     if hasattr(policy, "mlp_extractor"):  # PPO, A2C
         owner, parts = policy, [policy.mlp_extractor.policy_net, policy.action_net]
@@ -226,7 +222,8 @@ def convert(model: Any, normalise: Any = None) -> tuple[dict[str, Any], dict[str
     table["hidden"] = [layer.out_features for layer in linear[:-1]]
     if names:
         table["activation"] = ACTIVATIONS[names.pop()]
-    table |= {"bins": int(space.n)} if discrete else {"squash": squash}
+    if not listed:
+        table |= {"bins": int(space.n)} if discrete else {"squash": squash}
     if normalise is not None:
         table["normalise"] = {"epsilon": float(normalise.epsilon), "clip": float(normalise.clip_obs)}
         arrays["obs_mean"] = np.array(normalise.obs_rms.mean, np.float64)
@@ -253,6 +250,7 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     import gymnasium as gym
 
     rng, seen = np.random.default_rng(0), []
+    choices = TASKS[env_id]().formulas.choices
 
     def act(observation: NDArray) -> NDArray:
         values = observation if normalise is None else normalise.normalize_obs(observation)
@@ -265,13 +263,18 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
     for _ in range(int(TASKS[env_id]().limit)):
         seen.append(observation)
         action = act(observation)
-        action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))
+        if choices:
+            action[48:] = rng.integers(0, choices, (16, len(choices))).reshape(16, *action.shape[1:])
+        else:
+            action[48:] = rng.uniform(-1.0, 1.0, (16, *action.shape[1:]))
         observation = envs.step(action)[0]
     envs.close()
     path = rng.permutation(np.concatenate(seen))[:8192]
     far = np.abs(path).max(axis=0)
     both = np.concatenate([path, rng.uniform(-far, far, path.shape).astype(path.dtype)])
     model_action, action = act(both), agent.predict(both)[0]
+    if choices:
+        return _lost(agent.outputs(both.astype(np.float64)), model_action, choices), len(both)
     off = np.abs(model_action.astype(np.float64) - action).max(axis=1)
     if agent_centres is not None:
         worth = agent.outputs(both.astype(np.float64))
@@ -279,6 +282,16 @@ def difference(model: Any, normalise: Any, agent: Any, env_id: str) -> tuple[flo
         lost = worth.max(axis=1) - worth[np.arange(len(worth)), chosen]
         off[lost <= 1e-5 * np.maximum(1.0, np.abs(worth).max(axis=1))] = 0.0
     return float(off.max()), len(both)
+
+
+def _lost(worth: NDArray, chosen: NDArray, choices: Sequence[int]) -> float:
+    """Return 1 where something is chosen that is worth less, by more than float32 rounds, else 0."""
+    parts = np.split(worth, np.cumsum(choices)[:-1], axis=1)
+    for each, index in zip(parts, chosen.reshape(len(worth), -1).T, strict=True):
+        lost = each.max(axis=1) - each[np.arange(len(each)), index]
+        if (lost > 1e-5 * np.maximum(1.0, np.abs(each).max(axis=1))).any():
+            return 1.0
+    return 0.0
 
 
 # --- exporting ----------------------------------------------------------------------------------------------
@@ -346,7 +359,7 @@ def export(
         else:
             kind = algo or _algorithm(source.model)
             model, normalise = _load(source, kind)
-            table, content = convert(model, normalise)
+            table, content = convert(model, normalise, bool(TASKS[env]().formulas.choices))
         try:
             made = architecture(env, table)
             shapes = {key: value.shape for key, value in content.items()}

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured
 
-#: Version of ``submission.toml``.
-SCHEMA = 1
+#: Newest version of ``submission.toml``. What an older one says, it says in every later one too.
+SCHEMA = 2
 #: Episodes of each policy, and those under each disturbance.
 EPISODES, DISTURBED_EPISODES = 1000, 100
 #: Policies that a learner submits at least, one per training seed; and that anyone submits at most.
@@ -40,6 +40,8 @@ TOML_BYTES, POLICY_BYTES, FOLDER_BYTES, LINE = 65_536, 4_194_304, 16_777_216, 1_
 HEADER_BYTES = 16_384
 #: Hidden layers, their width, and numbers of a network.
 LAYERS, WIDTH, NUMBERS = 8, 1_024, 131_072
+#: Observations that a network sees at once, and numbers that a recurrent one remembers.
+FRAMES, MEMORY = 64, 256
 #: Numbers of all networks of a submission, and CPU time of a verification [s].
 ALL_NUMBERS, CPU_SECONDS = 1_048_576, 3_600.0
 #: Numbers nearer to 0 count as 0: arithmetic with subnormal ones takes fifty times as long.

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.architecture import Architecture
 from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, plain, shown
 from lag_envs.leaderboard.files import read_plain
 from lag_envs.leaderboard.names import wordless
-from lag_envs.leaderboard.policies import MLP, Architecture, Controller, Policy, Table, architecture
+from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.protocol import Refused
 
 __all__ = ["About", "Refused", "Submission", "about", "digest_of", "load", "read_files", "write"]
@@ -139,7 +140,7 @@ class Training(Strict):
 class Toml(Strict):
     """All of the file."""
 
-    version: Annotated[int, between(protocol.SCHEMA, protocol.SCHEMA)] = Field(alias="schema")
+    version: Annotated[int, between(1, protocol.SCHEMA)] = Field(alias="schema")
     #: The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
     stated: Annotated[int, between(1, 10**6)] = Field(default=1, alias="protocol")
     env: Annotated[str, AfterValidator(_on_a_board)]
@@ -185,7 +186,7 @@ def load(folder: Path | str) -> Submission:
             raise Refused(f"{name}: {error}" if made.arrays else f"{TOML}: {error}") from error
         policies.append((seed, policy))
     numbers = sum(array.size for _, policy in policies for array in policy.arrays.values())
-    if isinstance(made, MLP) and numbers > protocol.ALL_NUMBERS:
+    if made.counts_as == "learned" and numbers > protocol.ALL_NUMBERS:
         raise Refused(
             f"the networks have {numbers:,} numbers together, {protocol.ALL_NUMBERS:,} are the most"
         )
@@ -209,6 +210,8 @@ def about(files: Mapping[str, bytes]) -> About:
     """
     told = accepted(Toml, _parse(files[TOML]), TOML)
     made = architecture(told.env, told.policy)
+    if told.version < made.schema:
+        raise Refused(f"{TOML}: this policy needs schema = {made.schema}, got {told.version}")
     found = sorted(int(match[1]) for name in files if (match := POLICY.fullmatch(name)))
     training = _training(told.training, found) if told.training else {}
     kind = _kind(made, bool(training), told.kind)
@@ -313,16 +316,8 @@ def _training(told: Training, found: list[int]) -> dict[str, Any]:
 
 def _kind(made: Architecture, trained: bool, stated: Any) -> str:
     """Return the kind, which follows from the architecture; refuse another that is stated."""
-    if isinstance(made, Controller):
-        kind = "controller"
-    elif isinstance(made, Table):
-        kind = "optimal"
-    elif isinstance(made, MLP) or trained:
-        kind = "learned"
-    else:
-        kind = "controller"
+    kind = made.counts_as or ("learned" if trained else "controller")
     if stated not in (None, kind):
-        # A linear feedback is either; all others have one kind.
         raise Refused(
             f'{TOML}: kind must be "{kind}" for this architecture {"with" if trained else "without"}'
             f" [training], or left out, got {shown(stated)}"
@@ -410,13 +405,18 @@ def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Archit
             raise Refused(f"{name}: {key} must have {len(needed)} axes, got the shape {shape}")
         for n, wanted in zip(shape, needed, strict=True):
             if isinstance(wanted, str):
-                wanted = lengths.setdefault(wanted, max(n, 2))
+                of, _, more = wanted.partition(" + ")
+                wanted = lengths.setdefault(of, max(n - int(more or 0), 2)) + int(more or 0)
             if n != wanted:
                 raise Refused(f"{name}: {key} must have the shape {_told(needed, lengths)}, got {shape}")
 
 
 def _told(shape: tuple[int | str, ...], lengths: Mapping[str, int]) -> str:
-    return "(" + ", ".join(str(lengths.get(n, n) if isinstance(n, str) else n) for n in shape) + ")"
+    def length(n: int | str) -> int | str:
+        of, _, more = str(n).partition(" + ")
+        return lengths[of] + int(more or 0) if of in lengths else n
+
+    return "(" + ", ".join(str(length(n)) for n in shape) + ")"
 
 
 # --- writing ------------------------------------------------------------------------------------------------
@@ -466,8 +466,10 @@ def write(
     folder, arrays = Path(folder), arrays or {}
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} is there already")
+    # The oldest that knows such policies, so that what is written stays what it is.
+    schema = architecture(env, policy).schema if env in protocol.boards() else 1
     told: dict[str, Any] = {
-        "schema": protocol.SCHEMA, "env": env, "name": name, "authors": list(authors), "license": license,
+        "schema": schema, "env": env, "name": name, "authors": list(authors), "license": license,
     }  # fmt: skip
     told |= {
         key: text for key, text in (("kind", kind), ("code", code), ("description", description)) if text

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from lag_envs.envs.unfused import Unfused
-from lag_envs.leaderboard.policies import MLP, Linear, Policy, Table
+from lag_envs.leaderboard.grids import Table
+from lag_envs.leaderboard.networks import MLP, Linear
+from lag_envs.leaderboard.policies import Policy
 from lag_envs.leaderboard.site.scenery import picture
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.replay import LEVELS, VERSION
@@ -192,6 +194,8 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     """
     made = policy.architecture
     about: dict[str, Any]
+    if made.schema > 1:
+        return None
     if isinstance(made, MLP):
         about = {
             "kind": "mlp",

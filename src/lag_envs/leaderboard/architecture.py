@@ -1,0 +1,162 @@
+"""What an architecture of a submission is: it takes a table, names the arrays it needs, and acts by them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.leaderboard.fields import Strict
+from lag_envs.tasks.base import Task
+
+Array = NDArray[np.float64]
+#: Lengths of an array's axes. A name stands for any length of at least 2, the same wherever it occurs, and
+#: "name + 1" for one more.
+Shape = tuple[int | str, ...]
+
+#: How messages call the table.
+POLICY = "[policy]"
+
+
+class PolicyTable(Strict):
+    """The table ``[policy]``."""
+
+    architecture: str
+
+
+class Architecture(ABC):
+    """One entry of the list, checked.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of the environment.
+    table : Strict
+        The table ``[policy]``, as `table` describes it.
+
+    Raises
+    ------
+    Refused
+        For anything wrong in the table.
+    """
+
+    #: What the table ``[policy]`` must be.
+    table: type[Strict] = PolicyTable
+    #: Version of ``submission.toml`` that it came with.
+    schema = 1
+    #: The kind of such policies; empty where they are learned with a training, and else controllers.
+    counts_as = ""
+    #: Names and shapes of the arrays in each policy's file; nothing where there are no files.
+    arrays: dict[str, Shape]
+    #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
+    plans = False
+
+    @abstractmethod
+    def __init__(self, env_id: str, table: Any) -> None: ...
+
+    @abstractmethod
+    def agent(self, arrays: Mapping[str, Array]) -> Any:
+        """Return what acts; raise Refused where values do not fit."""
+
+
+class Head:
+    """How numbers become actions of a task: clipped where they lie in a range, else the largest chooses.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+
+    Attributes
+    ----------
+    choices : tuple of int
+        Lengths of the lists from which actions are chosen; empty where they lie in a range.
+    size : int
+        How many numbers it takes: one for each number of an action, or one for each value of each list.
+    """
+
+    def __init__(self, task: Task) -> None:
+        formulas = task.formulas
+        self.choices = formulas.choices
+        self.size = sum(self.choices) or formulas.actions
+        self.largest = formulas.largest
+        self._single = len(self.choices) == 1
+        self._ends = np.cumsum(self.choices)[:-1]
+
+    def __call__(self, numbers: Array) -> NDArray:
+        """Return actions (n, ...) for numbers (n, size)."""
+        if not self.choices:
+            return np.clip(numbers, -self.largest, self.largest).astype(np.float32)
+        if not np.isfinite(numbers).all():
+            raise ValueError("what chooses its actions is not finite")
+        chosen = [part.argmax(axis=1) for part in np.split(numbers, self._ends, axis=1)]
+        return chosen[0] if self._single else np.stack(chosen, axis=1)
+
+
+class Agent(ABC):
+    """Base of the agents without memory; a subclass defines `act`.
+
+    Parameters
+    ----------
+    head : Head
+        What makes actions of numbers.
+    """
+
+    def __init__(self, head: Head) -> None:
+        self.head = head
+
+    @abstractmethod
+    def act(self, observations: Array) -> Array:
+        """Return numbers (n, size) for the head, for observations (n, n_observation)."""
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation."""
+        values = np.asarray(observation, np.float64)
+        # Whatever overflows ends in an action that is no number, which the verification refuses.
+        with np.errstate(all="ignore"):
+            actions = self.head(self.act(np.atleast_2d(values)))
+        return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
+
+
+class Remembering(ABC):
+    """Base of the agents that remember so many numbers in each episode; a subclass defines `begin` and `act`.
+
+    Parameters
+    ----------
+    head : Head
+        What makes actions of numbers.
+    """
+
+    #: What it remembers is of steps of one length.
+    of_one_interval = True
+
+    def __init__(self, head: Head) -> None:
+        self.head = head
+
+    @abstractmethod
+    def begin(self, observations: Array) -> Array:
+        """Return the memories (n, ...) before the first step, for the first observations."""
+
+    @abstractmethod
+    def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
+        """Return numbers (n, size) for the head, and the memories after the step."""
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[NDArray, Array]:
+        """Return the action for each observation, and what is remembered of each episode."""
+        values = np.asarray(observation, np.float64)
+        batch = np.atleast_2d(values)
+        with np.errstate(all="ignore"):
+            memories = self.begin(batch)
+            if state is not None:
+                start = np.broadcast_to(False if episode_start is None else episode_start, len(batch))
+                memories[~start] = np.asarray(state)[~start]
+            numbers, memories = self.act(batch, memories)
+            actions = self.head(numbers)
+        return actions.reshape((*values.shape[:-1], *actions.shape[1:])), memories

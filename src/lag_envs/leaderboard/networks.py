@@ -1,0 +1,327 @@
+"""Networks and linear maps from observations to actions."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lag_envs.leaderboard import protocol
+from lag_envs.leaderboard.architecture import (
+    POLICY,
+    Agent,
+    Architecture,
+    Array,
+    Head,
+    PolicyTable,
+    Remembering,
+)
+from lag_envs.leaderboard.fields import Strict, between, many
+from lag_envs.leaderboard.protocol import Refused
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
+
+
+def _sigmoid(x: Array) -> Array:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+    "elu": lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+    "leaky_relu": lambda x: np.where(x > 0.0, x, 0.01 * x),
+    "silu": lambda x: x * _sigmoid(x),
+    "sigmoid": _sigmoid,
+}
+
+
+def bin_centres(bins: int) -> Array:
+    """Return the middles of equal parts of [-1, 1], the actions of Gymnasium's ``DiscretizeAction``."""
+    return (2.0 * np.arange(bins) + 1.0) / bins - 1.0
+
+
+class Normalise(Strict):
+    """How a network's observations are normalised."""
+
+    epsilon: Annotated[float, between(1e-12, 1.0)] = 1e-8
+    clip: Annotated[float, between(1e-3, 1e9)] = 10.0
+
+
+class NetworkTable(PolicyTable):
+    """What the tables of all networks have."""
+
+    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)]
+    activation: Literal["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"] = "tanh"
+    bins: Annotated[int, between(2, 1_001)] | None = None
+    squash: Literal["clip", "tanh"] | None = None
+    mean_limit: Annotated[float, between(0.0, 1e6)] = 0.0
+    normalise: Normalise | None = None
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        given = self.model_fields_set & {"squash", "mean_limit"}
+        if self.bins and given:
+            raise ValueError(f"{min(given)} means nothing beside bins; leave it out")
+        return self
+
+
+class MLPTable(NetworkTable):
+    """The table of a network of fully connected layers."""
+
+    frames: Annotated[int, between(1, protocol.FRAMES)] = 1
+    padding: Literal["zero", "first"] = "zero"
+
+    @model_validator(mode="after")
+    def _framed(self) -> Self:
+        if self.frames == 1 and "padding" in self.model_fields_set:
+            raise ValueError("padding means nothing without frames; leave it out")
+        return self
+
+
+class GRUTable(NetworkTable):
+    """The table of a network with a gated recurrent unit."""
+
+    memory: Annotated[int, between(1, protocol.MEMORY)]
+    hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)] = Field(
+        default=[]
+    )
+
+
+class Network(Architecture):
+    """Base of the networks: fully connected layers, whose last outputs become actions."""
+
+    counts_as = "learned"
+
+    def _layers(self, task: Task, table: NetworkTable, wide: int, features: int) -> None:
+        """Note what the table says, and what arrays layers need that so many features enter.
+
+        Of so many numbers as are `wide` each can be normalised.
+        """
+        self.head, self.controls = Head(task), task.formulas.actions
+        self.activation, self.bins, self.squash = table.activation, table.bins, table.squash
+        self.mean_limit, self.normalise = table.mean_limit, table.normalise
+        given = table.model_fields_set & {"bins", "squash", "mean_limit"}
+        if self.head.choices:
+            self.schema = 2
+            if given:
+                raise Refused(f"{POLICY}: {min(given)} means nothing where actions are listed; leave it out")
+        elif not self.bins and self.squash is None:
+            raise Refused(f"{POLICY}: squash or bins is missing")
+        widths = [features, *table.hidden, self.head.size * (self.bins or 1)]
+        for k, (rows, columns) in enumerate(zip(widths[1:], widths[:-1], strict=True)):
+            self.arrays |= {f"weight_{k}": (rows, columns), f"bias_{k}": (rows,)}
+        self.layers = len(widths) - 1
+        numbers = sum(math.prod(map(int, shape)) for shape in self.arrays.values())
+        if numbers > protocol.NUMBERS:
+            raise Refused(f"the network has {numbers} numbers, at most {protocol.NUMBERS} are accepted")
+        if self.normalise:
+            self.arrays |= {"obs_mean": (wide,), "obs_var": (wide,)}
+
+    def agent(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+        """Return the network."""
+        if self.normalise and (arrays["obs_var"] < 0.0).any():
+            raise Refused("obs_var must not be below 0")
+        return self._made(arrays)
+
+    @abstractmethod
+    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering: ...
+
+
+class MLP(Network):
+    """A network of fully connected layers, evaluated in float64.
+
+    In the table: `hidden`, the layers' widths, none for a linear map; `activation`; `squash` is "clip" or
+    "tanh"; `mean_limit`, to which the last layer's output is clipped before squashing (the mean under SAC's
+    gSDE), optional; `bins`, with which the network has so many outputs, the largest of which chooses the
+    middle of one of so many equal parts of [-1, 1], instead of squashing; and the table ``normalise`` with
+    `epsilon` and `clip`, with which the network sees (o - obs_mean)/√(obs_var + epsilon), clipped. Where
+    actions are listed, it has an output for each value of each list, the largest of which chooses, and there
+    are neither `squash`, `mean_limit` nor `bins`.
+
+    With `frames`, optional, it sees so many observations, the oldest first, the last one last; before the
+    first there are zeros, or with `padding` "first" the first one over and over.
+
+    Arrays: ``weight_0`` (out, in), ``bias_0`` (out,) and so on; with ``normalise`` also ``obs_mean`` and
+    ``obs_var``.
+    """
+
+    table = MLPTable
+
+    def __init__(self, env_id: str, table: MLPTable) -> None:
+        task = TASKS[env_id]()
+        self.frames, self.padding = table.frames, table.padding
+        if "frames" in table.model_fields_set:
+            self.schema = 2
+        wide = len(task.observation) * self.frames
+        self.arrays = {}
+        self._layers(task, table, wide, wide)
+
+    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+        layers = _Layers(self, arrays)
+        return _Plain(layers) if self.frames == 1 else _Stacked(layers, self.frames, self.padding)
+
+
+class GRU(Network):
+    """A gated recurrent unit, followed by fully connected layers, evaluated in float64.
+
+    In the table: `memory`, the size m of the unit, and what ``mlp`` has but for `frames`; `hidden` is that of
+    the layers after the unit, none if left out. The unit is PyTorch's: with the logistic function σ and the
+    observation o, normalised if the table says so, the memory h, zero at first, becomes
+
+        r, z = σ(W_r o + b_r + V_r h + c_r), σ(W_z o + b_z + V_z h + c_z)
+        h = (1 - z) tanh(W_n o + b_n + r (V_n h + c_n)) + z h
+
+    Arrays: ``weight_ih`` (3m, n_observation) and ``bias_ih`` (3m,), which hold W and b of r, z and n, one
+    below the other; ``weight_hh`` (3m, m) and ``bias_hh`` (3m,), which hold V and c; and those of the layers.
+    """
+
+    table = GRUTable
+    schema = 2
+
+    def __init__(self, env_id: str, table: GRUTable) -> None:
+        task = TASKS[env_id]()
+        wide, self.memory = len(task.observation), table.memory
+        tall = 3 * self.memory
+        self.arrays = {"weight_ih": (tall, wide), "bias_ih": (tall,)}
+        self.arrays |= {"weight_hh": (tall, self.memory), "bias_hh": (tall,)}
+        self._layers(task, table, wide, self.memory)
+
+    def _made(self, arrays: Mapping[str, Array]) -> Agent | Remembering:
+        return _Recurrent(_Layers(self, arrays), arrays)
+
+
+class _Layers:
+    """The layers of a network."""
+
+    def __init__(self, made: Network, arrays: Mapping[str, Array]) -> None:
+        self.made, self.head, self.f = made, made.head, ACTIVATIONS[made.activation]
+        self.weights = [
+            (np.ascontiguousarray(arrays[f"weight_{k}"].T), np.ascontiguousarray(arrays[f"bias_{k}"]))
+            for k in range(made.layers)
+        ]
+        self.centres = bin_centres(made.bins) if made.bins else None
+        if made.normalise:
+            self.clip, self.mean = made.normalise.clip, arrays["obs_mean"]
+            self.deviation = np.sqrt(arrays["obs_var"] + made.normalise.epsilon)
+
+    def normalised(self, observations: Array) -> Array:
+        """Return the observations as the network sees them."""
+        if not self.made.normalise:
+            return observations
+        return np.clip((observations - self.mean) / self.deviation, -self.clip, self.clip)
+
+    def outputs(self, features: Array) -> Array:
+        """Return what the last layer puts out."""
+        from lag_envs.leaderboard.kernels import affine
+
+        x = features
+        for k, (weight, bias) in enumerate(self.weights):
+            x = affine(np.ascontiguousarray(x), weight, bias)
+            if k + 1 < len(self.weights):
+                x = self.f(x)
+        return x
+
+    def numbers(self, features: Array) -> Array:
+        """Return numbers for the head."""
+        x = self.outputs(features)
+        if self.head.choices:
+            return x
+        if self.centres is not None:
+            worth = x.reshape(len(x), self.made.controls, -1)
+            chosen = np.where(np.isfinite(worth).all(axis=2), self.centres[worth.argmax(axis=2)], math.nan)
+            return self.head.largest * chosen
+        if self.made.mean_limit:
+            x = np.clip(x, -self.made.mean_limit, self.made.mean_limit)
+        return self.head.largest * np.tanh(x) if self.made.squash == "tanh" else x
+
+
+class _Plain(Agent):
+    def __init__(self, layers: _Layers) -> None:
+        super().__init__(layers.head)
+        self.layers, self.centres = layers, layers.centres
+
+    def outputs(self, observations: Array) -> Array:
+        """Return what the last layer puts out, shape (n, outputs)."""
+        return self.layers.outputs(self.layers.normalised(observations))
+
+    def act(self, observations: Array) -> Array:
+        return self.layers.numbers(self.layers.normalised(observations))
+
+
+class _Stacked(Remembering):
+    """Remembers the last observations, shape (n, frames, n_observation)."""
+
+    def __init__(self, layers: _Layers, frames: int, padding: str) -> None:
+        super().__init__(layers.head)
+        self.layers, self.frames, self.padding = layers, frames, padding
+
+    def begin(self, observations: Array) -> Array:
+        filled = np.repeat(observations[:, None], self.frames, axis=1)
+        return filled if self.padding == "first" else np.zeros_like(filled)
+
+    def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
+        seen = np.concatenate([memories[:, 1:], observations[:, None]], axis=1)
+        return self.layers.numbers(self.layers.normalised(seen.reshape(len(seen), -1))), seen
+
+
+class _Recurrent(Remembering):
+    """Remembers the unit's numbers, shape (n, memory)."""
+
+    def __init__(self, layers: _Layers, arrays: Mapping[str, Array]) -> None:
+        super().__init__(layers.head)
+        self.layers, self.size = layers, arrays["weight_hh"].shape[1]
+        self.seen, self.kept = (
+            (np.ascontiguousarray(arrays[f"weight_{part}"].T), np.ascontiguousarray(arrays[f"bias_{part}"]))
+            for part in ("ih", "hh")
+        )
+
+    def begin(self, observations: Array) -> Array:
+        return np.zeros((len(observations), self.size))
+
+    def act(self, observations: Array, memories: Array) -> tuple[Array, Array]:
+        from lag_envs.leaderboard.kernels import affine
+
+        seen = affine(np.ascontiguousarray(self.layers.normalised(observations)), *self.seen)
+        kept = affine(np.ascontiguousarray(memories), *self.kept)
+        (r_o, z_o, n_o), (r_h, z_h, n_h) = (np.split(part, 3, axis=1) for part in (seen, kept))
+        z = _sigmoid(z_o + z_h)
+        memories = (1.0 - z) * np.tanh(n_o + _sigmoid(r_o + r_h) * n_h) + z * memories
+        return self.layers.numbers(memories), memories
+
+
+class Linear(Architecture):
+    """Action = gain · observation + offset, clipped to [-1, 1].
+
+    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), each with an axis for the numbers of an action
+    where these are several. Where actions are listed, there is a number for each value of each list, the
+    largest of which chooses. `lag-envs info ID` lists the observation.
+    """
+
+    def __init__(self, env_id: str, table: PolicyTable) -> None:
+        task = TASKS[env_id]()
+        self.head, wide = Head(task), len(task.observation)
+        if self.head.choices:
+            self.schema = 2
+        count = self.head.size
+        self.arrays = {"gain": (wide,) if count == 1 else (wide, count), "offset": (count,)}
+
+    def agent(self, arrays: Mapping[str, Array]) -> _Feedback:
+        """Return the feedback."""
+        return _Feedback(self.head, arrays["gain"], arrays["offset"])
+
+
+class _Feedback(Agent):
+    def __init__(self, head: Head, gain: Array, offset: Array) -> None:
+        super().__init__(head)
+        self.gain = np.ascontiguousarray(gain.reshape(len(gain), -1))
+        self.offset = np.ascontiguousarray(offset)
+
+    def act(self, observations: Array) -> Array:
+        from lag_envs.leaderboard.kernels import affine
+
+        return affine(np.ascontiguousarray(observations), self.gain, self.offset)

@@ -1,0 +1,36 @@
+"""A plan that is followed by time-varying feedback, as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from lag_envs.controllers.tracking import Tracking
+from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
+from lag_envs.leaderboard.protocol import Refused
+from lag_envs.tasks import TASKS
+
+
+class Plan(Architecture):
+    """Action = planned action - gain · (state - planned state), with a gain for each step.
+
+    After the plan, action = -hold · (state - rest). States are read from the observation; an angle that is
+    observed by its cosine and sine differs from the planned one by the shorter way around. For one who acts
+    more often, planned states are interpolated.
+
+    Arrays: ``states`` (T + 1, n_state), ``actions`` (T,), ``gains`` (T, n_state), ``rest`` (n_state,),
+    ``hold`` (n_state,), states in SI units. Where an action has m numbers, ``actions`` is (T, m), ``gains``
+    (T, m, n_state), and ``hold`` (m, n_state).
+    """
+
+    schema = 2
+
+    def __init__(self, env_id: str, table: PolicyTable) -> None:
+        self.task = task = TASKS[env_id]()
+        if task.formulas.choices or task.formulas.targets > 1:
+            raise Refused(f"{POLICY}: plans are for actions in a range, and one target at most")
+        self.arrays = Tracking.shapes(task)
+
+    def agent(self, arrays: Mapping[str, Array]) -> Any:
+        """Return what follows the plan."""
+        return Tracking(self.task, **arrays)
