@@ -213,7 +213,7 @@ class Choices:
 
 
 class Rollout(NamedTuple):
-    """What n environments did in T steps; `next_values` is filled in where an episode was truncated."""
+    """What n environments did in T steps."""
 
     observations: Array  #: (T + 1, n, n_observation)
     actions: NDArray  #: (T, n, n_actions)
@@ -243,25 +243,22 @@ class Learner:
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
-        limit = make_task(env_id).limit
-        if limit == math.inf:
+        task = make_task(env_id)
+        formulas = task.formulas
+        if task.limit == math.inf:
             raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
-        limit = max(1, round(settings.episode_share * limit))
+        if not formulas.actions:
+            raise UserError(f"{env_id} has no control: there is nothing to learn")
+        limit = max(1, round(settings.episode_share * task.limit))
         self.envs: Any = gym.make_vec(
             env_id, settings.n_envs, autoreset_mode="SameStep", max_episode_steps=limit
         )
         first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
         self.envs.reset(seed=first)
         self.observation, _ = stagger(self.envs, limit, first)
-
-        formulas = make_task(env_id).formulas
-        if not formulas.actions:
-            raise UserError(f"{env_id} has no control: there is nothing to learn")
-        (inputs,), outputs = (
-            self.envs.single_observation_space.shape,
-            sum(formulas.choices) or formulas.actions,
-        )
         self.actions, self.shape = formulas.actions, self.envs.action_space.shape
+
+        inputs, outputs = self.observation.shape[1], sum(formulas.choices) or formulas.actions
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
         self.policy = Policy([], formulas.choices, formulas.largest)
@@ -269,11 +266,10 @@ class Learner:
         # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
         self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
-        self.parameters.grad = torch.zeros_like(self.parameters)
+        self.gradient = self.parameters.grad = torch.zeros_like(self.parameters)
         sizes = [p.numel() for p in parts]
-        for p, values, gradients in zip(
-            parts, self.parameters.data.split(sizes), self.parameters.grad.split(sizes), strict=True
-        ):
+        places = zip(self.parameters.data.split(sizes), self.gradient.split(sizes), strict=True)
+        for p, (values, gradients) in zip(parts, places, strict=True):
             p.data, p.grad = values.view_as(p), gradients.view_as(p)
         self.adam = torch.optim.Adam([self.parameters], eps=1e-5, fused=True)
         linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
@@ -336,8 +332,6 @@ class Learner:
         with torch.no_grad():
             features = body(observations)
             before, _ = self.head.log_prob(features, last(features), actions)
-        gradient = self.parameters.grad
-        assert gradient is not None
         for _ in range(s.n_epochs):
             for batch in torch.from_numpy(self.rng.permutation(advantages.size)).split(s.batch_size):
                 seen, gain = observations[batch], advantage[batch]
@@ -348,9 +342,9 @@ class Learner:
                 limited = ratio.clamp(1.0 - s.clip_range, 1.0 + s.clip_range)
                 better = torch.min(ratio * gain, limited * gain).mean()
                 off = (self.critic(seen)[:, 0] - target[batch]).square().mean()
-                gradient.zero_()
+                self.gradient.zero_()
                 (s.vf_coef * off - better - s.ent_coef * entropy.mean()).backward()
-                gradient.mul_((s.max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0))
+                self.gradient.mul_((s.max_grad_norm / (self.gradient.norm() + 1e-6)).clamp(max=1.0))
                 self.adam.step()
 
     def state(self) -> dict[str, Any]:
