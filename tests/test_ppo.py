@@ -422,6 +422,17 @@ def test_race_tells_when_levels_are_reached(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
+# Other tests load JAX, which warns of any fork in this process; Ray's forks only start programs.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_seeds_over_a_ray_cluster_are_the_same(tmp_path):
+    given = [ENV, "--algo", ppo.NAME, "--steps", "12288", "--seeds", "2", "--output"]
+    runs = [Run(tmp_path / n / ENV / ppo.NAME / "seed1", "", "", 0, 0, {}) for n in ("ray", "here")]
+    assert train.main([*given, str(tmp_path / "ray"), "--ray", "local"]) == 0
+    assert ppo.main([ENV, *given[3:], str(tmp_path / "here")]) == 0
+    assert learnt(runs[0])[0] == learnt(runs[1])[0]
+
+
+@pytest.mark.slow
 def test_killed_and_interrupted_runs_go_on(tmp_path):
     arguments = [sys.executable, "-m", "agents.ppo", ENV, "--steps", "200000", "--output", str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
