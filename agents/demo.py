@@ -20,7 +20,7 @@ import numpy as np
 
 from agents.learners import LEARNERS, hyperparameters, label, load_policy
 from agents.run import RESULT, Run, UserError, check_name, fresh_seeds, own_env, reports_errors
-from agents.train import command, follow, processes
+from agents.train import command, follow, here
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{run.env}, {run.algo}, seed {run.seed}: {run.trained:,} of {run.steps:,} steps trained")
         if run.load_result() is None:
             print("Loading PyTorch and compiling the environment (kept for the next time) ...", flush=True)
-            failed, stopped = follow([run], processes)
+            failed, stopped = follow([run], here)
             for reason in failed.values():
                 print(f"agents.demo: error: {reason}", file=sys.stderr)
             if stopped or failed:

@@ -16,30 +16,30 @@ References
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import io
 import math
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
 from agents import learners
-from agents.run import CHECKPOINT, FIRST_FRESH_SEED, MODEL, Run, UserError, reports_errors, terminable
-from agents.train import command, plan, summarise
+from agents.run import CHECKPOINT, FIRST_FRESH_SEED, MODEL, Run, UserError, reports_errors
+from agents.train import command, follow, here, plan, summarise
 from lag_envs.envs.stagger import stagger
-from lag_envs.errors import hint
 from lag_envs.evaluation.rollout import play
-from lag_envs.scores import score
+from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.store import write
 from lag_envs.tasks.registration import make_task
 
@@ -50,65 +50,43 @@ Array = NDArray[np.float32]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-def setting(text: str, least: float = -math.inf, most: float = math.inf) -> Any:
-    """Declare a setting: what it is, and between which values it lies."""
-    return dataclasses.field(metadata={"help": text, "range": (least, most)})
+class Settings(Strict):
+    """What a training is made with; `lag_envs.hyperparams` has the values."""
 
+    n_timesteps: float = Field(ge=1, description="steps of all environments together")
+    n_envs: int = Field(ge=1, description="environments stepped together")
+    n_steps: int = Field(ge=1, description="steps of each environment between updates")
+    n_epochs: int = Field(ge=1, description="passes over these steps in an update")
+    batch_size: int = Field(ge=2, description="steps of a minibatch")
+    learning_rate: float = Field(ge=0, description="of Adam at the start; it falls linearly to 0")
+    gamma: float = Field(ge=0, le=1, description="discount of a step")
+    gae_lambda: float = Field(ge=0, le=1, description="decay of the advantage's weights")
+    clip_range: float = Field(ge=0, description="how far an update moves a probability, relatively")
+    ent_coef: float = Field(ge=0, description="weight of the entropy in the loss")
+    vf_coef: float = Field(ge=0, description="weight of the critic's squared error in the loss")
+    max_grad_norm: float = Field(ge=0, description="largest norm of a gradient")
+    reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
+    episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
+    state_noise: bool = Field(description="whether noise of continuous actions depends on the state (gSDE)")
+    noise_steps: int = Field(ge=1, description="steps for which that noise is held")
+    log_std_init: float = Field(ge=-20, le=5, description="its log standard deviation at the start")
+    actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
+    critic: list[PositiveInt] = Field(min_length=1, description="widths of the critic's hidden layers")
+    first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What a training is made with; `lag_envs.hyperparams` has the values.
-
-    Raises
-    ------
-    UserError
-        For a value that is out of its range, or of another kind.
-    """
-
-    n_timesteps: float = setting("steps of all environments together", 1)
-    n_envs: int = setting("environments stepped together", 1)
-    n_steps: int = setting("steps of each environment between updates", 1)
-    n_epochs: int = setting("passes over these steps in an update", 1)
-    batch_size: int = setting("steps of a minibatch", 2)
-    learning_rate: float = setting("of Adam at the start; it falls linearly to 0", 0.0)
-    gamma: float = setting("discount of a step", 0.0, 1.0)
-    gae_lambda: float = setting("decay of the advantage's weights", 0.0, 1.0)
-    clip_range: float = setting("how far an action's probability moves in an update, relatively", 0.0)
-    ent_coef: float = setting("weight of the entropy in the loss", 0.0)
-    vf_coef: float = setting("weight of the critic's squared error in the loss", 0.0)
-    max_grad_norm: float = setting("largest norm of a gradient", 0.0)
-    reward_scale: float = setting("what rewards are multiplied by", 0.0)
-    episode_share: float = setting("part of its length after which an episode is truncated", 0.0, 1.0)
-    state_noise: bool = setting("whether the noise of continuous actions depends on the state (gSDE)")
-    noise_steps: int = setting("steps for which that noise is held", 1)
-    log_std_init: float = setting("its log standard deviation at the start")
-    actor: Sequence[int] = setting("widths of the policy's hidden layers", 1)
-    critic: Sequence[int] = setting("widths of the value function's hidden layers", 1)
-    first_layer_scale: float = setting("what the first layers' weights are multiplied by at the start", 0.0)
-
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value, (least, most) = getattr(self, field.name), field.metadata["range"]
-            kind = {"float": (int, float), "int": int, "bool": bool}.get(str(field.type), (list, tuple))
-            if not isinstance(value, kind) or isinstance(value, bool) != (kind is bool):
-                raise UserError(f"{field.name} must be {field.type}, got {value!r}")
-            for number in value if isinstance(value, list | tuple) else [value]:
-                if not isinstance(number, int | float) or not least <= number <= most:
-                    raise UserError(f"{field.name} must lie between {least:g} and {most:g}, got {value!r}")
-        if self.n_envs * self.n_steps % self.batch_size:
-            size = self.n_envs * self.n_steps
-            raise UserError(f"batch_size must divide n_envs * n_steps = {size}, got {self.batch_size}")
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if (size := self.n_envs * self.n_steps) % self.batch_size:
+            raise ValueError(f"batch_size must divide n_envs * n_steps = {size}, got {self.batch_size}")
+        return self
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Any]) -> Settings:
-        """Return settings by name, or raise a UserError that knows which name was meant."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        for name in hyperparameters:
-            if name not in names:
-                raise UserError(f"{NAME} has no setting {name!r}; {hint(name, names)}")
-        if missing := [name for name in names if name not in hyperparameters]:
-            raise UserError(f"{NAME} needs a value of {', '.join(missing)}")
-        return cls(**hyperparameters)
+        """Return settings by name, or raise a UserError that says which is wrong."""
+        try:
+            return checked(cls, dict(hyperparameters))
+        except ValueError as error:
+            raise UserError(f"settings of {NAME}: {error}") from error
 
 
 # --- the policy ---------------------------------------------------------------------------------------------
@@ -120,7 +98,7 @@ def network(widths: Sequence[int], scale: float) -> nn.Sequential:
     for inputs, outputs in pairwise(widths):
         layers += [nn.Linear(inputs, outputs), nn.Tanh()]
     with torch.no_grad():
-        layers[0].weight.mul_(scale)  # type: ignore[operator]
+        layers[0].weight.mul_(scale)
     return nn.Sequential(*layers[:-1])
 
 
@@ -228,14 +206,14 @@ class Choices:
         """Return the values' log probability and the entropy, (n,) each."""
         parts = [part.log_softmax(1) for part in logits.split(self.policy.choices, dim=1)]
         taken = [part.gather(1, a[:, None])[:, 0] for part, a in zip(parts, actions.unbind(1), strict=True)]
-        return sum(taken), sum(-(part.exp() * part).sum(1) for part in parts)  # type: ignore[return-value]
+        return sum(taken), sum(-(part.exp() * part).sum(1) for part in parts)
 
 
 # --- learning -----------------------------------------------------------------------------------------------
 
 
 class Rollout(NamedTuple):
-    """What n environments did in T steps; `next_values` is filled in where an episode was truncated."""
+    """What n environments did in T steps."""
 
     observations: Array  #: (T + 1, n, n_observation)
     actions: NDArray  #: (T, n, n_actions)
@@ -265,25 +243,22 @@ class Learner:
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
-        limit = make_task(env_id).limit
-        if limit == math.inf:
+        task = make_task(env_id)
+        formulas = task.formulas
+        if task.limit == math.inf:
             raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
-        limit = max(1, round(settings.episode_share * limit))
+        if not formulas.actions:
+            raise UserError(f"{env_id} has no control: there is nothing to learn")
+        limit = max(1, round(settings.episode_share * task.limit))
         self.envs: Any = gym.make_vec(
             env_id, settings.n_envs, autoreset_mode="SameStep", max_episode_steps=limit
         )
         first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last
         self.envs.reset(seed=first)
         self.observation, _ = stagger(self.envs, limit, first)
-
-        formulas = make_task(env_id).formulas
-        if not formulas.actions:
-            raise UserError(f"{env_id} has no control: there is nothing to learn")
-        (inputs,), outputs = (
-            self.envs.single_observation_space.shape,
-            sum(formulas.choices) or formulas.actions,
-        )
         self.actions, self.shape = formulas.actions, self.envs.action_space.shape
+
+        inputs, outputs = self.observation.shape[1], sum(formulas.choices) or formulas.actions
         self.actor = network([inputs, *settings.actor, outputs], settings.first_layer_scale)
         self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
         self.policy = Policy([], formulas.choices, formulas.largest)
@@ -291,11 +266,10 @@ class Learner:
         # All parameters lie in one array, as do their gradients: Adam and the gradient's norm cost one call.
         parts = [*self.actor.parameters(), *self.critic.parameters(), *self.head.parameters]
         self.parameters = nn.Parameter(torch.cat([p.detach().flatten() for p in parts]))
-        self.parameters.grad = torch.zeros_like(self.parameters)
+        self.gradient = self.parameters.grad = torch.zeros_like(self.parameters)
         sizes = [p.numel() for p in parts]
-        for p, values, gradients in zip(
-            parts, self.parameters.data.split(sizes), self.parameters.grad.split(sizes), strict=True
-        ):
+        places = zip(self.parameters.data.split(sizes), self.gradient.split(sizes), strict=True)
+        for p, (values, gradients) in zip(parts, places, strict=True):
             p.data, p.grad = values.view_as(p), gradients.view_as(p)
         self.adam = torch.optim.Adam([self.parameters], eps=1e-5, fused=True)
         linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
@@ -358,8 +332,6 @@ class Learner:
         with torch.no_grad():
             features = body(observations)
             before, _ = self.head.log_prob(features, last(features), actions)
-        gradient = self.parameters.grad
-        assert gradient is not None
         for _ in range(s.n_epochs):
             for batch in torch.from_numpy(self.rng.permutation(advantages.size)).split(s.batch_size):
                 seen, gain = observations[batch], advantage[batch]
@@ -370,9 +342,9 @@ class Learner:
                 limited = ratio.clamp(1.0 - s.clip_range, 1.0 + s.clip_range)
                 better = torch.min(ratio * gain, limited * gain).mean()
                 off = (self.critic(seen)[:, 0] - target[batch]).square().mean()
-                gradient.zero_()
+                self.gradient.zero_()
                 (s.vf_coef * off - better - s.ent_coef * entropy.mean()).backward()
-                gradient.mul_((s.max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0))
+                self.gradient.mul_((s.max_grad_norm / (self.gradient.norm() + 1e-6)).clamp(max=1.0))
                 self.adam.step()
 
     def state(self) -> dict[str, Any]:
@@ -446,6 +418,9 @@ examples:
   python -m agents.ppo examples/ball_on_beam.py            a task of your own; this runs the file
 """
 
+#: Settings that are options; n_timesteps is --steps.
+OPTIONS = [name for name in Settings.model_fields if name != "n_timesteps"]
+
 
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
@@ -462,11 +437,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
     p.add_argument("--new", action="store_true", help="start anew, overwriting what these seeds have left")
     group = p.add_argument_group("settings, of which each task has its own")
-    for field in dataclasses.fields(Settings)[1:]:
-        kind = {"int": int, "float": float, "bool": truth}.get(str(field.type), int)
-        many = {"nargs": "+"} if "Sequence" in str(field.type) else {}
-        option = "--" + field.name.replace("_", "-")
-        group.add_argument(option, type=kind, metavar="X", help=field.metadata["help"], **many)  # type: ignore[arg-type]
+    for name in OPTIONS:
+        field = Settings.model_fields[name]
+        kind: Any = {float: float, bool: truth}.get(field.annotation, int)
+        many: Any = {"nargs": "+"} if field.annotation == list[PositiveInt] else {}
+        group.add_argument(
+            "--" + name.replace("_", "-"), type=kind, metavar="X", help=field.description, **many
+        )
     return p
 
 
@@ -479,41 +456,21 @@ def truth(text: str) -> bool:
 
 @reports_errors("agents.ppo")
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 0, 2 for a user's mistake, 130 when interrupted."""
-    from tqdm import tqdm
-
+    """Run the command; return 0, 1 where a seed failed, 2 for a user's mistake, 130 when interrupted."""
     args = parser().parse_args(arguments)
-    names = [field.name for field in dataclasses.fields(Settings)[1:]]
-    changed = {name: value for name in names if (value := getattr(args, name)) is not None}
-    args.algo, args.config, args.ray, args.jobs = [NAME], None, None, None
-    runs = plan(args, changed)
+    given = {name: getattr(args, name) for name in OPTIONS}
+    changed = {name: value for name, value in given.items() if value is not None}
+    runs = plan(Namespace(**vars(args), algo=[NAME], config=None, ray=None, jobs=None), changed)
     for run in runs:
         Settings.of(run.hyperparameters)  # better now than when another seed is trained
-    try:
-        with terminable():
-            for run in runs:
-                if run.load_result() is not None:
-                    print(f"{run.name}: finished before")
-                    continue
-                with tqdm(total=run.steps, unit=" steps", unit_scale=True, disable=None) as bar:
-
-                    def show(run: Run, bar: Any = bar) -> None:
-                        bar.update(min(run.trained, run.steps) - bar.n)
-
-                    def tested(run: Run, bar: Any = bar) -> None:
-                        trained, seconds, mean = run.curve[-1]
-                        value = score(run.env, mean)
-                        tail = "" if value is None else f", score {value:.3f}"
-                        bar.write(
-                            f"{run.name}: {trained:>9,} steps, {seconds:5.1f} s, return {mean:.2f}{tail}"
-                        )
-                        sys.stdout.flush()
-
-                    train(run, show=show, tested=tested)
-    except KeyboardInterrupt:
-        print(f"\nTo go on:  {command('agents.ppo', arguments)}")
-        return 130
-    summarise(runs)
+    todo = [run for run in runs if run.load_result() is None]
+    failed, stopped = follow(todo, here) if todo else ({}, False)
+    summarise([run for run in runs if run.name not in failed])
+    for name, reason in failed.items():
+        print(f"{name} failed: {reason}", file=sys.stderr)
+    if stopped or failed:
+        print(f"To go on:  {command('agents.ppo', arguments)}")
+        return 130 if stopped else 1
     print(
         f"Since the command began, with imports, compiling, tests and evaluation: "
         f"{time.perf_counter() - agents.STARTED:.1f} s, {time.process_time():.1f} s of them on the processor"

@@ -12,9 +12,11 @@ import queue
 import shlex
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from itertools import groupby, product
@@ -36,6 +38,7 @@ from agents.run import (
 )
 from lag_envs import TASKS, workers
 from lag_envs.own_files import is_file
+from lag_envs.scores import score
 from lag_envs.store import write
 from lag_envs.tables import columns
 from lag_envs.workers import SpreadError, check_address, died
@@ -238,6 +241,25 @@ def processes(runs: Sequence[Run], jobs: int | None = None) -> Iterator[Callable
 
 
 @contextmanager
+def here(runs: Sequence[Run]) -> Iterator[Callable]:
+    """Train runs in this process, one after the other: nothing is imported twice. Else like `processes`."""
+    events: queue.Queue = queue.Queue()
+    stopped = threading.Event()
+
+    def tell(event: tuple) -> None:
+        if stopped.is_set():
+            raise SystemExit
+        events.put(event)
+
+    with ThreadPoolExecutor(1) as pool:
+        try:
+            yield partial(poll, events, {pool.submit(work, run, tell): run for run in runs})
+        finally:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
 def on_ray(runs: Sequence[Run], address: str) -> Iterator[Callable]:
     """Train runs on a Ray cluster; otherwise like `processes`."""
     try:
@@ -298,7 +320,8 @@ def follow(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str],
                 elif kind == "tested":
                     run.curve = what
                     trained, seconds, mean = what[-1]
-                    _say(bar, f"{run.name}: {trained:>9,} steps, {seconds:4.0f} s, return {mean:.2f}")
+                    about = f"{trained:>9,} steps, {seconds:5.1f} s, return {mean:.2f}{_score(run, mean)}"
+                    _say(bar, f"{run.name}: {about}")
                 else:
                     del left[name]
                     if what:
@@ -307,11 +330,16 @@ def follow(runs: Sequence[Run], parallel_map: Callable) -> tuple[dict[str, str],
                     run.path(CHECKPOINT).unlink(missing_ok=True)
                     steps[name] = run.steps
                     result = run.load_result() or {}
-                    tail = "" if result.get("score") is None else f", score {result['score']:.3f}"
-                    _say(bar, f"{run.name}: finished, return {result['mean_return']:.2f}{tail}")
+                    mean = result["mean_return"]
+                    _say(bar, f"{run.name}: finished, return {mean:.2f}{_score(run, mean)}")
     except KeyboardInterrupt:
         return failed, True
     return failed, False
+
+
+def _score(run: Run, mean: float) -> str:
+    value = score(run.env, mean)
+    return "" if value is None else f", score {value:.3f}"
 
 
 def _say(bar: Any, line: str) -> None:
