@@ -32,6 +32,7 @@ ALL = {
     "action_noise": 0.1,
     "action_delay": (0.0, 0.05),
     "slew": 100.0,
+    "lag": 0.03,
     "push": (4.0, 0.7),
 }
 
@@ -122,6 +123,7 @@ NEUTRAL = {
     "action_noise": {"s_ddot": 0.0},
     "action_delay": (0.0, 0.0),
     "slew": math.inf,
+    "lag": {"s_ddot": 0.0},
     "push": (0.0, 1.0),
 }
 

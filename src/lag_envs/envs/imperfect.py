@@ -12,11 +12,13 @@ follows from the episode's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
+
+import numpy as np
 
 from lag_envs.envs.program import (
     DRAWS,
@@ -28,9 +30,10 @@ from lag_envs.envs.program import (
     constants_of,
     program_for,
 )
-from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.algebra import Expr, evaluate
 from lag_envs.mechanics.recording import formula as naming
 from lag_envs.mechanics.recording import parameter, twin
+from lag_envs.scenes.checks import inverse_lags
 from lag_envs.stepping.compiling import BLOCK, compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
@@ -48,7 +51,13 @@ def numbers_of(task: Task) -> dict[str, float]:
     found = task.imperfections
     if found is None:
         return constants_of(task)
-    numbers = dict(constants_of(task.drawn.inner if task.drawn else task))
+    source = task.drawn.inner if task.drawn else task
+    numbers = source.lagged_formulas.constants() if found.lag else dict(constants_of(source))
+    if found.lag:
+        lags = dict(zip((a.control for a in task.formulas.acting), found.lag, strict=True))
+        controls = task.scene.control_names
+        decays = inverse_lags(np.array([lags.get(name, 0.0) for name in controls]))
+        numbers |= {f"decay{i}": decay for i, decay in enumerate(decays.tolist())}
     for name, values in (
         ("sigma", found.observation_noise),
         ("shake", found.action_noise),
@@ -100,9 +109,9 @@ class ImperfectProgram(Program):
         self.options = found = task.imperfections
         self._absent, self._drawn = absent, task.drawn
         source = task.drawn.inner if task.drawn else task
-        self._made = _Constants(task, absent) if task.drawn else None
+        formulas = self._formulas(source)
+        self._made = _Constants(task, formulas, absent) if task.drawn else None
         drawn = frozenset(self._made.changed) if self._made else frozenset()
-        formulas = source.formulas
         self.a = [f"a{i}" for i in range(formulas.actions)]
         seen = range(len(formulas.observation))
         self.c = [f"c{i}" for i in range(formulas.actions)] if any(found.slew) else []
@@ -115,6 +124,9 @@ class ImperfectProgram(Program):
         ]  # fmt: skip
         super().__init__(source, absent, varying | drawn, list(numbers_of(task)))
         self.scratch = [*self.a, *self.o, *self.held]
+
+    def _formulas(self, task: Task) -> Any:
+        return task.lagged_formulas if self.options.lag else task.formulas
 
     # --- lines ----------------------------------------------------------------------------------------------
 
@@ -159,7 +171,6 @@ class ImperfectProgram(Program):
             self.command += [f"{c} = {w}" for c, w in zip(self.c, wanted, strict=True)]
         else:
             self.command = record(asked, self.a, wanted)
-        # Here an actuator that follows its command with a lag would find it, in w.
         self.command += record(guarded, [*wanted, *self.y, *given.values()], self.u)
         #: The command before the first.
         self.at_rest = [f"{a} = {self._constant(f'rest{i}')}" for i, a in enumerate(self.a)]
@@ -171,6 +182,7 @@ class ImperfectProgram(Program):
         self.push = self._pushes()
         self.begin = self._made.lines(constants) if self._made else []
         self.respond = [f"k_{name}" for name in ("late_low", "late_high", "shown_at", "every", "push_chance")]
+        self.respond += [f"k_decay{i}" for i in range(len(self.u)) if found.lag]
 
     def _constant(self, name: str) -> str:
         return str(self._numbers[name])
@@ -279,13 +291,19 @@ class ImperfectProgram(Program):
                 "    if comes < switch:", "        switch = comes",
                 *(f"{a} = {self._at(f'sent{i}', 'slot')}" for i, a in enumerate(self.a)),
             ]  # fmt: skip
-        arguments = [*self.y, *self.u, "h", "dt_limit", *self._stepper.constants]
+        # Behind a lag, what is applied goes on from where it is; what counts is its mean.
+        lagged, now = bool(found.lag), [f"now_{u}" for u in self.u]
+        got = [f"got_{u}" for u in self.u] if lagged else self.u
+        decays = [self._constant(f"decay{i}") for i in range(len(self.u))] if lagged else []
+        controls = [*now, *self.u, *decays] if lagged else self.u
+        results = [*self.z, *now, *got] if lagged else self.z
+        arguments = [*self.y, *controls, "h", "dt_limit", *self._stepper.constants]
         if self.general:
             arguments = ["room", *arguments]
         limit = str(self._x) if self.general or self._x == 0.0 else f"{self._x} * (h / k_dt)"
         move = [
             "h = end - t", f"dt_limit = {limit}",
-            f"{', '.join(self.z)}, status = advance({', '.join(arguments)})",
+            f"{', '.join(results)}, status = advance({', '.join(arguments)})",
             "if status < 0:",
             *(f"    work[{n_act + n_seen + j}] = {u}" for j, u in enumerate(self.u)),
             f"    return 0.0, {SLOW}",
@@ -293,6 +311,8 @@ class ImperfectProgram(Program):
             "t = end",
         ]  # fmt: skip
         watch = ["if t == k_shown_at:", *_indent([*self.observe, *(f"m{i} = o{i}" for i in range(n_seen))])]
+        means = [f"mean_{u} += (h / k_dt) * {x}" for u, x in zip(self.u, got, strict=True)]
+        ends = now if lagged else self.u
         pieces = [
             *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
             "t, switch = 0.0, 0.0",
@@ -301,23 +321,25 @@ class ImperfectProgram(Program):
                 "if t == switch:",
                 *_indent([
                     "switch = k_dt", *choose, "h = switch - t", *self.command,
-                    *(f"mean_{u} += (h / k_dt) * {u}" for u in self.u),
+                    *([] if lagged else means),
                 ]),
                 "end = switch",
                 *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
-                *move,
+                *move, *(means if lagged else []),
                 *(watch if within else []),
             ]),
             *(f"{y} = b_{y}" for y in self.y),
-            *(f"last_{u}, {u} = {u}, mean_{u}" for u in self.u),
+            *(f"last_{u}, {u} = {last}, mean_{u}" for u, last in zip(self.u, ends, strict=True)),
         ]  # fmt: skip
         whole = [
-            "h, t, end = k_dt, 0.0, k_dt", *self.command, *(f"last_{u} = {u}" for u in self.u),
+            "h, t, end = k_dt, 0.0, k_dt", *self.command,
             *(f"b_{y} = {y}" for y in self.y), *move, *(f"{y} = b_{y}" for y in self.y),
+            *(f"last_{u}, {u} = {last}, {x}" for u, last, x in zip(self.u, ends, got, strict=True)),
         ]  # fmt: skip
         body = [
             *self._parameters,
             *self._load_row([*self._rows_of_constants, *self.y, *self.g, *self.c, "n"]),
+            *(f"{x} = {self._at(u)}" for x, u in zip(now, self.u, strict=True) if lagged),
             *(f"a{i} = work[{i}]" for i in range(n_act)),
             *self.perturb, *send, *(pieces if divided else whole),
             *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
@@ -511,12 +533,12 @@ class _Constants:
     environment has the bits of one that is made with the values.
     """
 
-    def __init__(self, task: Task, absent: frozenset[str]) -> None:
+    def __init__(self, task: Task, formulas: Any, absent: frozenset[str]) -> None:
         drawn = task.drawn
         assert drawn is not None
         self._task, self._draws, self._made = drawn.inner, drawn.draws, drawn.made
         self._absent = absent
-        self._scene = self._task.scene
+        self._scene, self._formulas = self._task.scene, formulas
         inner = {name: getattr(self._scene, name) for name in self._scene._numbers()}
         trace = ElementaryTrace()
         for d in self._draws:
@@ -537,11 +559,11 @@ class _Constants:
 
     def _starts(self, trace: Any, numbers: dict[str, Any]) -> dict[str, Any]:
         """Return centres and half widths of the start."""
-        k = SimpleNamespace(**self._task.formulas.constants())
+        k = SimpleNamespace(**self._formulas.constants())
         vars(k).update({f"self_{name}": x for name, x in numbers.items()})
         found = {}
         with naming(self._task, "start"):
-            given = dict(self._task.formulas._self(k).start)
+            given = dict(self._formulas._self(k).start)
         for i, name in enumerate(self._scene.state_names):
             if name in given:
                 pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
@@ -550,21 +572,31 @@ class _Constants:
 
     def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
         """Return the constants of the motion that depend on parameters that change."""
-        form = self._scene._form
-        expressions = form.expressions if form else self._scene._stepper.expressions()
-        below = {s.name for s in form.inertia.symbols()} if form else set()
-        wanted = {n: e for n, e in expressions.items() if changed & ({s.name for s in e.symbols()} | below)}
+        form, lagged = self._scene._form, self._formulas.lagged
         values = {
             parameter(name): _Twice(x) if isinstance(x, Number) else Fraction(x)
             for name, x in numbers.items()
             if isinstance(x, Number) or math.isfinite(x)
         }
         functions = _Functions(trace)
-        found = evaluate(list(wanted.values()), values, functions)
-        if form:
-            (inertia,) = evaluate([form.inertia], values, functions)
-            found = [x / inertia for x in found]
-        return {name: _rounded(x) for name, x in zip(wanted, found, strict=True)}
+
+        def of(expressions: Mapping[str, Expr], inertia: Expr | None = None) -> dict[str, Any]:
+            below = {s.name for s in inertia.symbols()} if inertia is not None else set()
+            wanted = {
+                name: e
+                for name, e in expressions.items()
+                if changed & ({s.name for s in e.symbols()} | below)
+            }
+            found = evaluate(list(wanted.values()), values, functions)
+            if inertia is not None:
+                (divisor,) = evaluate([inertia], values, functions)
+                found = [x / divisor for x in found]
+            return {name: _rounded(x) for name, x in zip(wanted, found, strict=True)}
+
+        found = of(form.expressions, form.inertia) if form else {}
+        if lagged or not form:
+            found |= of((self._scene._lagged if lagged else self._scene._stepper).expressions())
+        return found
 
     def lines(self, constants: dict[str, Any]) -> list[str]:
         """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""

@@ -72,7 +72,7 @@ class Program:
         varying: frozenset[str] = frozenset(),
         names: Sequence[str] | None = None,
     ) -> None:
-        formulas = task.formulas
+        formulas = self._formulas(task)
         names = names or list(formulas.constants())
         self._stepper = formulas.stepper(absent)
         #: Whether steps are taken by the general series, block by block, and not lane by lane.
@@ -97,6 +97,10 @@ class Program:
         self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
         self.scratch = [*self.flow, *self.z, *self.a, "r", "over", "ordinary", *self.o, *self.held]
+
+    def _formulas(self, task: Any) -> Any:
+        """Return what is recorded."""
+        return task.formulas
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
         width, actions, controls, targets = len(self.y), len(self.a), len(self.u), len(self.g)

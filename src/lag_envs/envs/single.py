@@ -347,7 +347,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         program, rows = self._program, self._rows
         held = self._read(program.held)
         if self.task.imperfections:
-            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+            raise self.task.stepping_formulas.refusal(
+                self.state, single_number(held), self.task.dt, None, "the step"
+            )
         constants = constants_of(self.task)
         start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
         *end, status = program.advance(

@@ -406,7 +406,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
         Another order takes another time; each step is certified to the same tolerance with any.
         """
-        return None if self.scene._form else int(self._par[self._program.uniform.index("x")])
+        return int(self._par[self._program.uniform.index("x")]) if self._program.general else None
 
     @order.setter
     def order(self, value: int) -> None:
@@ -513,7 +513,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     def _refusal(self, i: int, results: tuple) -> StepRefused:
         where = f"the step of environment {i}"
         control = self.control[i]
-        error = self._tasks[i].formulas.refusal(self.state[i], control, self.task.dt, None, where)
+        task = self._tasks[i]
+        error = task.stepping_formulas.refusal(self.state[i], control, self.task.dt, None, where)
         error.results = results
         return error
 

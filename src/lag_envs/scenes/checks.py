@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -166,12 +166,12 @@ def check_sequence(scene: Any, controls: ArrayLike | int) -> Array:
 SMALLEST_LAG = 1e-6
 
 
-def check_lags(names: tuple[str, ...], lag: Any, dt: float) -> Array:
-    """Return 1/τ of the controls of these names [1/s], 0 where there is no lag; or raise a ValueError.
+def check_lags(names: Sequence[str], lag: Any, dt: float) -> Array:
+    """Return the lags τ of the controls of these names [s], 0 where there is none; or raise a ValueError.
 
     Parameters
     ----------
-    names : tuple of str
+    names : sequence of str
         The controls.
     lag : float or mapping from str to float
         τ [s], one for all or by the control's name.
@@ -180,32 +180,36 @@ def check_lags(names: tuple[str, ...], lag: Any, dt: float) -> Array:
     """
     by_name = lag if isinstance(lag, Mapping) else dict.fromkeys(names, lag)
     if not names:
-        raise ValueError(f"lag={shown(lag)}: this scene has no control that could lag; leave it out")
-    decays = dict.fromkeys(names, 0.0)
+        raise ValueError(f"lag: there is no control that could lag here, got {shown(lag)}; leave it out")
+    lags = dict.fromkeys(names, 0.0)
     for name, value in by_name.items():
         what = f"lag[{name!r}]" if by_name is lag else "lag"
-        if name not in decays:
+        if name not in lags:
             raise ValueError(f"{what}: there is no such control, only {', '.join(names)}")
-        seconds = check_number(what, value, "s")
-        if seconds != 0.0 and not seconds >= SMALLEST_LAG * dt:
+        lags[name] = check_number(what, value, "s")
+        if lags[name] != 0.0 and not lags[name] >= SMALLEST_LAG * dt:
             raise ValueError(
-                f"{what} must be 0 or at least {SMALLEST_LAG:g} of the step of {dt:g} s, got {seconds:g} s; "
-                "0 is no lag"
+                f"{what} must be 0 or at least {SMALLEST_LAG:g} of the step of {dt:g} s, got {lags[name]:g} "
+                "s; 0 is no lag"
             )
-        decays[name] = 1.0 / seconds if seconds else 0.0
-    return np.array([decays[name] for name in names])
+    return np.array([lags[name] for name in names])
 
 
-def check_applied(names: tuple[str, ...], applied: ArrayLike, decays: Array) -> Array:
+def inverse_lags(lags: Array) -> Array:
+    """Return 1/τ [1/s]; 0 where there is no lag."""
+    return np.divide(1.0, lags, out=np.zeros(len(lags)), where=lags > 0.0)
+
+
+def check_applied(names: tuple[str, ...], applied: ArrayLike, lags: Array) -> Array:
     """Return where controls that lag start, shape (n_controls,), or raise a ValueError."""
     array = real_array("applied", applied)
     if array.ndim == 0 and len(names) == 1:
         array = array[None]
     if array.shape != (len(names),):
         raise ValueError(f"applied must be ({', '.join(names)}), got an array of shape {array.shape}")
-    for name, value, decay in zip(names, array.tolist(), decays.tolist(), strict=True):
+    for name, value, lag in zip(names, array.tolist(), lags.tolist(), strict=True):
         if not math.isfinite(value):
             raise ValueError(f"applied must be finite, got {value} for {name}")
-        if value != 0.0 and decay == 0.0:
+        if value != 0.0 and lag == 0.0:
             raise ValueError(f"applied: {name} does not lag, so it cannot start at {value:g}; give 0")
     return array

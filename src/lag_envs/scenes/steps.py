@@ -18,6 +18,7 @@ from lag_envs.scenes.checks import (
     check_sequence,
     check_state,
     check_step,
+    inverse_lags,
 )
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -39,11 +40,11 @@ def simulate(
     """See `Scene.simulate`."""
     start, dt = check_state(scene, state), check_step(dt)
     given, n = check_sequence(scene, controls), len(start)
-    decays, reached = _lagging(scene, lag, applied, dt)
-    lagged, each = decays is not None, given
-    if decays is not None:
+    fading, reached = _lagging(scene, lag, applied, dt)
+    lagged, each = fading is not None, given
+    if fading is not None:
         start = np.concatenate([start, reached])
-        each = np.concatenate([given, np.broadcast_to(decays, given.shape)], axis=1)
+        each = np.concatenate([given, np.broadcast_to(fading, given.shape)], axis=1)
     trajectory = np.empty((len(given) + 1, len(start)))
     trajectory[0] = start
     code = scene._code(dt, lagged)
@@ -68,9 +69,9 @@ def simulate(
 def _lagging(scene: Scene, lag: Any, applied: Any, dt: float) -> tuple[Array | None, Array]:
     """Return 1/τ of the controls, or None where none lags, and where they start."""
     names = scene.control_names
-    decays = np.zeros(len(names)) if lag is None else check_lags(names, lag, dt)
-    reached = np.zeros(len(names)) if applied is None else check_applied(names, applied, decays)
-    return decays if decays.any() else None, reached
+    lags = np.zeros(len(names)) if lag is None else check_lags(names, lag, dt)
+    reached = np.zeros(len(names)) if applied is None else check_applied(names, applied, lags)
+    return inverse_lags(lags) if lags.any() else None, reached
 
 
 def _numbers(scene: Scene, code: Any, lagged: bool) -> list[float]:
@@ -92,12 +93,12 @@ def step_bound(
 
     start, dt = check_state(scene, state), check_step(dt)
     held = check_controls(scene, control, 1).reshape(-1)
-    decays, reached = _lagging(scene, lag, applied, dt)
-    lagged = decays is not None
+    fading, reached = _lagging(scene, lag, applied, dt)
+    lagged = fading is not None
     if scene._form and not lagged:
         return scene._form.step_bound(start, list(held), dt, scene._constants())
     code, order = scene._code(dt, lagged), scene._order(dt, lagged)
-    given = held.tolist() if decays is None else [*reached.tolist(), *held.tolist(), *decays.tolist()]
+    given = held.tolist() if fading is None else [*reached.tolist(), *held.tolist(), *fading.tolist()]
     status, bounds = code.bounded(start.tolist(), given, dt, order, _numbers(scene, code, lagged))
     if status < 0:
         raise refusal(scene, start, held, dt, None, "the step", lagged=lagged)

@@ -373,6 +373,17 @@ class Task:
         return TaskFormulas(self)
 
     @cached_property
+    def lagged_formulas(self) -> TaskFormulas:
+        """The same for steps behind actuators that lag, which the general series takes."""
+        return TaskFormulas(self, lagged=True)
+
+    @property
+    def stepping_formulas(self) -> TaskFormulas:
+        """What this task's environments are made of."""
+        lagged = self.imperfections and self.imperfections.lag
+        return self.lagged_formulas if lagged else self.formulas
+
+    @cached_property
     def drawn(self) -> Drawn | None:
         """The tasks among which each episode's is drawn; None where no parameter is."""
         return Drawn(self) if self.imperfections and self.imperfections.drawn else None
@@ -451,7 +462,7 @@ class Task:
         return np.broadcast_to(np.asarray(holds, np.bool_), len(array))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("formulas", "drawn")}
+        return {name: value for name, value in vars(self).items() if name not in _DERIVED}
 
     # --- the picture ---------------------------------------------------------------------------------------
 
@@ -568,8 +579,10 @@ class Lifted:
 #: Observations and chances of tasks whose formulas have been run: by class, and by `TaskFormulas.key`.
 _checked: weakref.WeakKeyDictionary[type, dict[tuple, tuple]] = weakref.WeakKeyDictionary()
 
+#: Attributes of a task that follow from the others.
+_DERIVED = ("formulas", "lagged_formulas", "drawn")
 #: Attributes of a task whose numbers reach its code as constants, if at all.
-_NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imperfections", "drawn"}
+_NUMBERS = {"scene", "dt", "duration", "fixed_target", "given", "imperfections", *_DERIVED}
 
 
 class TaskFormulas:
@@ -580,11 +593,12 @@ class TaskFormulas:
 
     trace = ElementaryTrace
 
-    def __init__(self, task: Task) -> None:
-        self._task = task
+    def __init__(self, task: Task, lagged: bool = False) -> None:
+        self._task, self.lagged = task, lagged
         self._chances: dict[float, str] = {}
         scene = task.scene
-        self._form = scene._form
+        #: What lifts states. Steps behind a lag have none, yet a formula may ask for the form's coefficients.
+        self._form = None if lagged else scene._form
         #: Whether the step takes the constant ``x``: the largest one of one series, or the series' order.
         self.bounded = self._form is None or bool(self._form.order(task.dt))
         self.state = scene.state_names
@@ -623,6 +637,7 @@ class TaskFormulas:
         """Return every number that compiled functions take, by name."""
         task, scene = self._task, self._task.scene
         found = dict(scene._constants())
+        found |= scene._constants(self.lagged)
         found |= {f"self_{name}": float(getattr(scene, name)) for name in scene._numbers()}
         for i, name in enumerate(self.state):
             found[f"centre{i}"], found[f"half{i}"] = self.starts[name]
@@ -630,7 +645,7 @@ class TaskFormulas:
             found |= {f"goal{i}": float(value) for i, value in enumerate(task.fixed_target)}
         found |= {name: task.chance(p) for p, name in self._chances.items()}
         found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
-        return found | {"x": scene._limit(task.dt)}
+        return found | {"x": scene._limit(task.dt, self.lagged)}
 
     @property
     def key(self) -> tuple:
@@ -642,15 +657,17 @@ class TaskFormulas:
         # Formulas may also name attributes of the task, which somebody may have set by hand.
         own = [(name, repr(v)) for name, v in vars(self._task).items() if name not in _NUMBERS]
         shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
-        return scene.mechanics.key, self._task.variant, formulas, *plain, *own, *shared
+        return scene.mechanics.key, self._task.variant, self.lagged, formulas, *plain, *own, *shared
 
     def refusal(self, *arguments: Any) -> StepRefused:
         """Return the error for a step that was refused."""
-        return refusal(self._task.scene, *arguments)
+        return refusal(self._task.scene, *arguments, self.lagged)
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
         scene = self._task.scene
+        if self.lagged:
+            return scene._lagged.code(absent)
         return self._form.stepper(self._task.dt, absent) if self._form else scene._stepper.code(absent)
 
     # --- formulas -------------------------------------------------------------------------------------------
@@ -658,13 +675,13 @@ class TaskFormulas:
     def _self(self, k: Any) -> Task:
         """Return a task whose numbers are those that are recorded."""
         task = copy.copy(self._task)
-        for name in ("formulas", "drawn"):
+        for name in _DERIVED:
             vars(task).pop(name, None)
-        names = self._task.scene._numbers()
-        task.scene = twin(self._task.scene, {name: getattr(k, f"self_{name}") for name in names})
+        scene = self._task.scene
+        task.scene = twin(scene, {name: getattr(k, f"self_{name}") for name in scene._numbers()})
         task.dt = k.dt
         task._recording = _Recording(
-            k, self._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
+            k, scene._form, lambda p: getattr(k, self._chances.setdefault(p, f"chance{len(self._chances)}"))
         )
         return task
 

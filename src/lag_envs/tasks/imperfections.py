@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.scenes.checks import check_number, shown
+from lag_envs.scenes.checks import check_lags, check_number, shown
 from lag_envs.scenes.declaring import complete
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ KEYWORDS = (
     "action_noise",
     "action_delay",
     "slew",
+    "lag",
     "push",
 )
 #: No normal draw is larger: √(2 · 53 log 2), since the uniform number that it is made of is at least 2^-53.
@@ -83,6 +84,8 @@ class Imperfections:
         Shortest and longest time from an action to its effect [control steps].
     slew : tuple of float
         For each control that actions set its largest change [SI unit per second]; infinity for any.
+    lag : tuple of float
+        For each control that actions set the time constant by which it follows its command [s]; 0 for none.
     push : tuple of float
         For each entry of the state the largest size of a random impulse.
     push_rate : float
@@ -96,6 +99,7 @@ class Imperfections:
     action_noise: tuple[float, ...] = ()
     action_delay: tuple[float, float] = (0.0, 0.0)
     slew: tuple[float, ...] = ()
+    lag: tuple[float, ...] = ()
     push: tuple[float, ...] = ()
     push_rate: float = 0.0
 
@@ -126,6 +130,7 @@ class Imperfections:
             self.commands,
             self.action_delay[0] < self.action_delay[1],
             tuple(map(math.isfinite, self.slew)),
+            bool(self.lag),
             tuple(x > 0.0 for x in self.push),
         )
 
@@ -264,6 +269,11 @@ def _slew(task: Task, value: Any) -> dict[str, Any]:
     return {"slew": rates if any(map(math.isfinite, rates)) else ()}
 
 
+def _lag(task: Task, value: Any) -> dict[str, Any]:
+    lags = check_lags([a.control for a in task.formulas.acting], value, task.dt)
+    return {"lag": tuple(lags.tolist()) if lags.any() else ()}
+
+
 def _push(task: Task, value: Any) -> dict[str, Any]:
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
         raise ValueError(f"push must be (pushes per second, largest size), got {shown(value)}")
@@ -335,6 +345,7 @@ _READERS: dict[str, Callable[[Task, Any], dict[str, Any]]] = {
     "action_noise": _action_noise,
     "action_delay": _action_delay,
     "slew": _slew,
+    "lag": _lag,
     "push": _push,
 }
 assert tuple(_READERS) == KEYWORDS
