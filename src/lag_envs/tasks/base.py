@@ -659,9 +659,9 @@ class TaskFormulas:
         shared = [v for c in kind.__mro__ for v in vars(c).values() if isinstance(v, int | float)]
         return scene.mechanics.key, self._task.variant, self.lagged, formulas, *plain, *own, *shared
 
-    def refusal(self, *arguments: Any) -> StepRefused:
+    def refusal(self, state: Any, control: Any, dt: float, trajectory: Any, where: str) -> StepRefused:
         """Return the error for a step that was refused."""
-        return refusal(self._task.scene, *arguments, self.lagged)
+        return refusal(self._task.scene, state, control, dt, trajectory, where, self.lagged)
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""
