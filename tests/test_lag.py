@@ -9,12 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import gymnasium as gym
 import mpmath
 import numpy as np
+import own_tasks
 import pytest
 from contract_scenes import Functions, Trolley
+from test_imperfections import played
 from test_series import advance_in_python, in_python
 
+import lag_envs
+from lag_envs.envs.program import constants_of
 from lag_envs.report.oracle import oracle_of
 from lag_envs.scenes import CartPole, Chain, Incline, PivotedBar, StepRefused, TwoLinkArm
 from lag_envs.scenes.base import Scene, parameter
@@ -459,6 +464,110 @@ def test_refusal_brings_what_went_before():
     with pytest.raises(StepRefused, match=r"step 0 of 2 .* could not be certified") as refusal:
         bar.simulate([2.0, 0.0], [1.0, 2.0], 0.02, lag=0.1)
     np.testing.assert_array_equal(refusal.value.trajectory, [[2.0, 0.0]])
+
+
+# --- environments -------------------------------------------------------------------------------------------
+
+
+def behind(u, command, lag, h):
+    """Return where a control is that follows its command for a time, and its mean."""
+    left = math.exp(-h / lag)
+    return command + (u - command) * left, command + (u - command) * lag * (1.0 - left) / h
+
+
+@pytest.mark.parametrize("late", [0.0, 0.013])
+def test_environment_against_simulate(late):
+    lag, dt = 0.03, 0.02
+    env = gym.make("PivotedBar-v0", lag=lag, action_delay=late)
+    own, scene, task = env.unwrapped, env.unwrapped.scene, env.unwrapped.task
+    env.reset(seed=3, options={"state": [0.3, 0.1, 2.0, -3.0]})
+    assert own.control == 0.0
+    state, applied, sent = own.state, 0.0, 0.0
+    numbers = constants_of(task)
+    for action in np.random.default_rng(1).uniform(-1, 1, (25, 1)).astype(np.float32):
+        _, reward, *_ = env.step(action)
+        mean = 0.0
+        for h, wanted in ((late, sent), (dt - late, 5.0 * float(action[0]))):
+            if h > 0.0:
+                k = types.SimpleNamespace(**numbers | {"dt": h})
+                (command,) = task.formulas.guarded(np, [wanted], scene._form.lift(state), k)
+                state = scene.simulate(state, [command], h, lag=lag, applied=applied)[1]
+                applied, part = behind(applied, command, lag, h)
+                mean += part * h / dt
+        sent = 5.0 * float(action[0])
+        assert own.state == pytest.approx(state, abs=1e-11)
+        assert own.control == pytest.approx(applied, abs=1e-12)
+        height = (0.5 - 0.5 * math.cos(state[2])) ** 2
+        assert reward == pytest.approx(height - 0.02 * (mean / 5) ** 2, abs=1e-11)
+
+
+def test_what_overruns_its_guard_is_clipped_in_the_observation():
+    # The guard limits the command. What follows it late may leave the track, but not the observation's space.
+    env = gym.make("PivotedBar-v0", lag=0.3)
+    env.reset(seed=0)
+    places = []
+    for _ in range(60):
+        observation, *_ = env.step(np.ones(1, np.float32))
+        assert env.observation_space.contains(observation)
+        places.append(env.unwrapped.state[0])
+    assert max(places) > 0.5
+
+
+@pytest.mark.slow
+def test_one_control_of_several_lags(monkeypatch):
+    spec = lag_envs.register(own_tasks.Deliver)
+    try:
+        _, envs = played(spec, 3, 60, lag={"pull": 0.05}, action_delay=0.013)
+        assert envs.unwrapped.order == general.usual_order(0.05)
+        env = gym.make(spec, lag={"pull": 0.05})
+        env.reset(seed=1)
+        pull = 0.0
+        for action in np.random.default_rng(2).uniform(-1, 1, (10, 2)).astype(np.float32):
+            roped = env.unwrapped.state[env.unwrapped.scene.state_names.index("rope")] < 0.3
+            env.step(action)
+            command = 0.0 if roped else 10.0 + 10.0 * float(action[1])
+            pull, _ = behind(pull, command, 0.05, 0.05)
+            assert env.unwrapped.control == pytest.approx([20.0 * float(action[0]), pull], abs=1e-9)
+    finally:
+        gym.registry.pop(spec)
+
+
+@pytest.mark.parametrize(
+    ("lag", "message"),
+    [
+        (-0.1, "lag must be 0 or at least 1e-06 of the step of 0.02 s, got -0.1 s"),
+        ({"push": 0.1}, r"lag\['push'\]: there is no such control, only s_ddot"),
+        ([0.1], r"lag must be a real number, got \[0.1\]"),
+    ],
+)
+def test_bad_lag_of_an_environment_is_named(lag, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make("PivotedBar-v0", lag=lag)
+    with pytest.raises(ValueError, match=message):
+        gym.make_vec("PivotedBar-v0", num_envs=2, lag=lag)
+
+
+def test_environment_without_actions_cannot_lag():
+    with pytest.raises(ValueError, match=r"lag=0\.1: this scene has no control that could lag"):
+        own_tasks.Drift(lag=0.1)
+
+
+def test_refused_step_leaves_the_environments_as_they_were():
+    keywords = {"lag": 0.05, "damping": 1e6, "max_episode_steps": 500}
+    env, envs = gym.make("PivotedBar-v0", **keywords), gym.make_vec("PivotedBar-v0", num_envs=2, **keywords)
+    env.reset(seed=0, options={"state": [0.0, 0.0, 2.0, 1.0]})
+    envs.reset(seed=0)
+    with pytest.raises(StepRefused, match="could not be certified"):
+        env.step(np.ones(1, np.float32))
+    np.testing.assert_array_equal(env.unwrapped.state, [0.0, 0.0, 2.0, 1.0])
+    assert env.unwrapped.control == 0.0
+    before = envs.unwrapped.state
+    with pytest.raises(StepRefused, match="could not be certified"):
+        envs.step(np.ones((2, 1), np.float32))
+    np.testing.assert_array_equal(envs.unwrapped.state, before)
+
+
+# --- documentation ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -646,7 +646,8 @@ class TaskFormulas:
 
     def refusal(self, *arguments: Any) -> StepRefused:
         """Return the error for a step that was refused."""
-        return refusal(self._task.scene, *arguments)
+        found = self._task.imperfections
+        return refusal(self._task.scene, *arguments, lagged=bool(found and found.lag))
 
     def stepper(self, absent: frozenset[str]) -> Any:
         """Return the code of a control step."""

@@ -270,8 +270,10 @@ def _slew(task: Task, value: Any) -> dict[str, Any]:
 
 
 def _lag(task: Task, value: Any) -> dict[str, Any]:
-    decays = check_lags(task.scene.control_names, value, task.dt)
-    return {"lag": tuple(decays.tolist()) if decays.any() else ()}
+    names = tuple(a.control for a in task.formulas.acting)
+    decays = dict(zip(names, check_lags(names, value, task.dt).tolist(), strict=True))
+    found = tuple(decays.get(name, 0.0) for name in task.scene.control_names)
+    return {"lag": found if any(found) else ()}
 
 
 def _push(task: Task, value: Any) -> dict[str, Any]:
