@@ -22,7 +22,7 @@ from lag_envs.controllers import (
 )  # fmt: skip
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.controllers.lookahead import LookAhead
-from lag_envs.controllers.pivoted_bar import EnergyShapingLQR
+from lag_envs.controllers.pivoted_bar import AdaptiveEnergyShapingLQR, EnergyShapingLQR
 from lag_envs.envs.model import Model
 from lag_envs.evaluation.rollout import play
 from lag_envs.scores import known_returns, score
@@ -317,3 +317,29 @@ def test_agents_count_the_steps_of_each_episode():
     _, taken = agent.predict(seen, taken, np.array([False, True]))
     assert taken.tolist() == [1.1, 0.1]
     assert agent.predict(seen[0], np.array([3.0]))[0].shape == (1,)
+
+
+@pytest.mark.slow
+def test_the_adaptive_controller_finds_the_bar():
+    task = make_task(pivoted_bar.SwingUpUnknown.id)
+    agent, memory = AdaptiveEnergyShapingLQR(task, designs=4), None
+    envs = gym.make_vec(task.id, num_envs=64)
+    observation, _ = envs.reset(seed=0)
+    total = np.zeros(64)
+    for _ in range(500):
+        action, memory = agent.predict(observation, memory)
+        observation, reward, *_ = envs.step(action)
+        total += reward
+    assert total.mean() > 380.0
+    length = envs.unwrapped.parameters["com_distance"]  # of a uniform bar, so that q = 3/(4 L)
+    q, _ = np.linalg.solve(memory.information, memory.weighed[..., None])[..., 0].T
+    assert np.median(np.abs(q * length / 0.75 - 1.0)) < 0.05
+    one, _ = agent.predict(observation[0])
+    assert one.shape == (1,)
+
+
+def test_the_adaptive_controller_needs_something_to_adapt_to():
+    with pytest.raises(ValueError, match="com_distance is drawn"):
+        AdaptiveEnergyShapingLQR(make_task("PivotedBar-v0"))
+    with pytest.raises(ValueError, match="late by whole control steps"):
+        AdaptiveEnergyShapingLQR(make_task(pivoted_bar.SwingUpUnknown.id, action_delay=0.013))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,189 @@ class EnergyShapingLQR:
         if self.task.has_track:
             u -= self.centring * x[..., 0] + 2.0 * math.sqrt(self.centring) * x[..., 1]
         return u
+
+
+class Estimate(NamedTuple):
+    """What `AdaptiveEnergyShapingLQR` remembers of n episodes.
+
+    Attributes
+    ----------
+    seen : ndarray, shape (n, 4)
+        The last state that was observed.
+    applied : ndarray, shape (n,)
+        The control [m/s²] that acts from then on.
+    under_way : ndarray, shape (n, steps of delay)
+        The controls that were asked for and do not act yet, the oldest first.
+    faded : ndarray, shape (n, 3)
+        Sums over the steps that fade: of the regressors of q and γ, and of the change of θ'.
+    information, weighed : ndarray, shapes (n, 2, 2) and (n, 2)
+        Matrix and right side of the least squares for q and γ.
+    holds : ndarray of bool, shape (n,)
+        Whether the LQR is in charge.
+    """
+
+    seen: Array
+    applied: Array
+    under_way: Array
+    faded: Array
+    information: Array
+    weighed: Array
+    holds: NDArray[np.bool_]
+
+
+class AdaptiveEnergyShapingLQR:
+    """Swing up a bar of unknown length and friction: estimate both on the way, and control by the estimate.
+
+    The bar moves by θ'' = -q (g sinθ + u cosθ) - γ θ', where q = m L/(m L² + I) follows from its length. Both
+    unknowns are linear in it, so least squares find them: θ' changes over a step by q and γ times integrals
+    of what is observed. Changes are summed with weights that fade, which is exact, and makes the noise of
+    single readings matter less. Regulators are designed beforehand for some lengths in the range that is
+    drawn, and interpolated in q. Actions that are late are no surprise: the state is predicted to where the
+    next one will act.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``, with a track and a ``com_distance`` that is drawn.
+    catch, lose : float
+        Cost to go below which the LQR takes over, and above which it gives up.
+    pump : float
+        Acceleration of the support per missing energy [(m/s²)/(rad²/s²)].
+    centring : float
+        Stiffness with which pumping draws the support to the middle of its track [1/s²].
+    fade : float
+        What is left of a step's weight in the sums after another step.
+    noise : float
+        Standard deviation of an observed θ' [rad/s], against which the prior range is weighed.
+    designs : int
+        Number of lengths that regulators are designed for.
+
+    Raises
+    ------
+    ValueError
+        Where no length is drawn, or actions are late by other than whole control steps.
+    """
+
+    #: Largest γ [1/s] that is believed, and how sure the prior is of its value, 0.
+    LARGEST_FRICTION, SPREAD = 3.0, 0.3
+
+    def __init__(
+        self,
+        task: SwingUp,
+        *,
+        catch: float = 2.0,
+        lose: float = 30.0,
+        pump: float = 2.5,
+        centring: float = 7.0,
+        fade: float = 0.9,
+        noise: float = 0.1,
+        designs: int = 13,
+    ) -> None:
+        drawn = {d.name: d for d in task.imperfections.drawn} if task.imperfections else {}
+        if "com_distance" not in drawn or not task.has_track:
+            raise ValueError("this controller is for a bar on a track whose com_distance is drawn")
+        late = task.imperfections.action_delay
+        if late[0] != late[1] or late[0] % 1.0:
+            raise ValueError(f"actions must be late by whole control steps, got {late}")
+        self.delay = int(late[0])
+        self.task, self.catch, self.lose, self.pump, self.centring = task, catch, lose, pump, centring
+        self.fade, self.weight = fade, (1.0 - fade) / noise**2
+        lengths = [drawn["com_distance"].at(share) for share in np.linspace(1.0, 0.0, designs)]
+        tasks: list[Any] = [task.varied(com_distance=length) for length in lengths]
+        rest = [0.0] * len(task.scene.state_names)
+        #: q of the designs, ascending, with gains and costs to go.
+        self.q = np.array([float(bar.coefficients(rest, [1.0], np).beta) for bar in tasks])
+        found = [lqr(bar) for bar in tasks]
+        self.gains, self.costs = np.array([k for k, _ in found]), np.array([p for _, p in found])
+        self.read, self._k = ObservationDecoder(task), SimpleNamespace(**task.formulas.constants())
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray[np.float32], Estimate]:
+        """Return the action for each observation; the state is what was estimated so far."""
+        seen = self.read(observation)[0]
+        x = seen.reshape(-1, seen.shape[-1])
+        known = self._begin(x)
+        if state is not None:
+            start = np.zeros(len(x), np.bool_) if episode_start is None else np.reshape(episode_start, -1)
+            learned = self._learn(state, x)
+            both = zip(known, learned, strict=True)
+            known = Estimate(*(np.where(start.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in both))
+        found = np.linalg.solve(known.information, known.weighed[..., None])[..., 0]
+        q = np.clip(found[:, 0], self.q[0], self.q[-1])
+        friction = np.clip(found[:, 1], 0.0, self.LARGEST_FRICTION)
+        # What is under way acts first.
+        applied = None
+        for i in range(self.delay):
+            u = self._guarded(known.under_way[:, i], x)
+            applied = u if applied is None else applied
+            x = self._step(x, u, q, friction)
+        wanted, holds = self._control(x, q, known.holds)
+        action = as_actions(self.task.formulas.action(wanted))
+        asked = self.task.wanted(action)[:, 0]
+        under_way = np.concatenate([known.under_way, asked[:, None]], axis=1)[:, 1:]
+        applied = self._guarded(asked, x) if applied is None else applied
+        memory = known._replace(applied=applied, under_way=under_way, holds=holds)
+        return action.reshape(*seen.shape[:-1], 1), memory
+
+    def _begin(self, x: Array) -> Estimate:
+        """Return what is known before anything has moved."""
+        n, middle, half = len(x), 0.5 * (self.q[0] + self.q[-1]), 0.5 * (self.q[-1] - self.q[0])
+        sure = np.array([1.0 / half**2, 1.0 / self.SPREAD**2])
+        return Estimate(
+            x,
+            np.zeros(n),
+            np.zeros((n, self.delay)),
+            np.zeros((n, 3)),
+            np.tile(np.diag(sure), (n, 1, 1)),
+            np.tile(sure * [middle, 0.0], (n, 1)),
+            np.zeros(n, np.bool_),
+        )
+
+    def _learn(self, known: Estimate, x: Array) -> Estimate:
+        """Return what is known when the states x have been observed."""
+        old, u = known.seen, known.applied
+        turned = np.remainder(x[:, 2] - old[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+        pull = -0.5 * self.task.dt * (self._pull(old, u) + self._pull(x, u))
+        faded = self.fade * known.faded + np.stack([pull, -turned, x[:, 3] - old[:, 3]], axis=-1)
+        by = faded[:, :2]
+        return known._replace(
+            seen=x,
+            faded=faded,
+            information=known.information + self.weight * by[:, :, None] * by[:, None, :],
+            weighed=known.weighed + self.weight * by * faded[:, 2:],
+        )
+
+    def _pull(self, x: Array, u: Array) -> Array:
+        return self.task.scene.gravity * np.sin(x[:, 2]) + u * np.cos(x[:, 2])
+
+    def _guarded(self, u: Array, x: Array) -> Array:
+        """Return the control that is applied where u is asked for."""
+        lifted = [*x.T, np.cos(x[:, 2]), np.sin(x[:, 2])]
+        return np.asarray(self.task.formulas.guarded(np, [u], lifted, self._k)[0])
+
+    def _step(self, x: Array, u: Array, q: Array, friction: Array) -> Array:
+        """Predict a control step by the midpoint rule: what is estimated is less exact."""
+        dt = self.task.dt
+
+        def slope(y: Array) -> Array:
+            return np.stack([y[:, 1], u, y[:, 3], -q * self._pull(y, u) - friction * y[:, 3]], axis=-1)
+
+        return x + dt * slope(x + 0.5 * dt * slope(x))
+
+    def _control(self, x: Array, q: Array, held: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the support's acceleration for states, and whether the LQR gives it."""
+        i = np.clip(np.searchsorted(self.q, q) - 1, 0, len(self.q) - 2)
+        share = (q - self.q[i]) / (self.q[i + 1] - self.q[i])
+        gain = self.gains[i] + share[:, None] * (self.gains[i + 1] - self.gains[i])
+        cost = self.costs[i] + share[:, None, None] * (self.costs[i + 1] - self.costs[i])
+        off = from_upright(x)
+        holds = np.einsum("ni,nij,nj->n", off, cost, off) < np.where(held, self.lose, self.catch)
+        field, cosine, rate = q * self.task.scene.gravity, np.cos(x[:, 2]), x[:, 3]
+        missing = field - (0.5 * rate * rate - field * cosine)
+        swing = self.pump * missing * np.where(rate * cosine < 0.0, 1.0, -1.0)
+        swing -= self.centring * x[:, 0] + 2.0 * math.sqrt(self.centring) * x[:, 1]
+        return np.where(holds, -np.einsum("ni,ni->n", off, gain), swing), holds
 
 
 def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16) -> ILQR:

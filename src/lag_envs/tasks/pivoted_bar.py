@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -137,7 +137,9 @@ class SwingUp(GuardedTrack, _Bar):
         # Random actions move the bar most where all are full.
         "dqn": {"env_wrapper": [_SHORT, {"gymnasium.wrappers.DiscretizeAction": {"bins": 3}}]},
     }
-    value_iteration = ValueIteration(relaxed="PivotedBarFree-v0", keep=(2, 3))
+    value_iteration: ClassVar[ValueIteration | None] = ValueIteration(
+        relaxed="PivotedBarFree-v0", keep=(2, 3)
+    )
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},
         refused=[{"state": state} for state in ([0.6, 0, 0, 0], [0.3, 1.5, 0, 0], [-0.3, -1.5, 0, 0])],
@@ -301,6 +303,10 @@ class SwingUpUnknown(SwingUp):
     }
     controllers = {
         "energy shaping + LQR": Controller("lag_envs.controllers.pivoted_bar:EnergyShapingLQR"),
+        "adaptive": Controller(
+            "lag_envs.controllers.pivoted_bar:AdaptiveEnergyShapingLQR",
+            tune={"catch": (0.5, 6.0), "lose": (6.0, 60.0), "pump": (0.3, 6.0), "centring": (1.0, 15.0)},
+        ),
     }
     value_iteration = None
     examples = Examples(
@@ -315,7 +321,9 @@ class SwingUpUnknown(SwingUp):
         "to be found from noisy observations while the bar moves."
     )
     note = """
-Energy shaping is designed for the nominal bar, and fails with bars that are much longer or shorter.
+Best is the adaptive controller: it estimates length and friction while the bar moves, and knows that actions
+are late. Energy shaping with the LQR is designed for the nominal bar, and fails with much longer or shorter
+ones.
 """
 
 
