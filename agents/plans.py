@@ -49,6 +49,8 @@ def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) 
     seconds = time.monotonic() - began
     print(f"{env_id}: followed, {mean:.2f} ± {error:.2f} in {EPISODES} episodes, {seconds:.0f} s", flush=True)
 
+    if not task.plans.quick:
+        return
     starts = Rollout(env_id, None, range(FIRST_SEED, FIRST_SEED + STARTS)).state
     guesses = [best, *candidates(env_id, seeds, **task.plans.quick)]
     gains = [replan(task, guesses=[agent]).plan(starts, np.zeros(STARTS))[1].mean() for agent in guesses]

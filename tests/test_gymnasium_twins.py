@@ -1,4 +1,4 @@
-"""Environments of ours that are Gymnasium's with exact motion: spaces, rewards, endings, and policies in both."""
+"""Environments that are Gymnasium's with exact motion: spaces, rewards, endings, and policies in both."""
 
 from __future__ import annotations
 

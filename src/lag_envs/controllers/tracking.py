@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -140,8 +141,16 @@ def hold(task: Task) -> Tracking:
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
     """Return the controller that follows states (steps + 1, n_state) and actions (steps,)."""
     states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
-    gains, last = time_varying(task, states, actions, plans.rest, plans.weights, plans.effort)
+    model = changed(task, plans.smooth) if plans.smooth else task
+    gains, last = time_varying(model, states, actions, plans.rest, plans.weights, plans.effort)
     return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)
+
+
+def changed(task: Task, parameters: Mapping[str, Any]) -> Task:
+    """Return the same task with other parameters."""
+    fields = (field.name for field in dataclasses.fields(task.scene) if field.init)
+    own = {name: getattr(task.scene, name) for name in fields}
+    return type(task)(dt=task.dt, duration=task.duration, **(own | dict(parameters)))
 
 
 def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
@@ -169,10 +178,12 @@ def search(task: Task, seed: int = 0, **changes: Any) -> Iterator[Tracking]:
     size = {name: changes.pop(name, getattr(plans, name)) for name in ("steps", "batch", "iterations")}
     easier, tail = resolve(plans.place)(task, **(dict(plans.numbers) | changes))
     planner = ILQR(easier, [], tail=tail, steps=size["steps"], iterations=size["iterations"])
-    guesses = waves(np.random.default_rng(seed), size["batch"], size["steps"], task.dt)
+    guesses = waves(np.random.default_rng(seed), size["batch"], size["steps"], easier.dt)
+    every = round(easier.dt / task.dt)
     starts = np.tile(np.asarray(task.centre, np.float64), (len(guesses), 1))
     found, values = planner.improve(starts, np.zeros(len(guesses)), guesses)
     shares: Any = easier.limit_control / task.limit_control
     for i in np.argsort(-values):
-        states = task.scene.simulate(starts[i], easier.wanted(found.actions[i])[:, 0], task.dt)
-        yield follow(task, states, shares * found.actions[i], plans)
+        actions = np.repeat(found.actions[i], every)
+        states = task.scene.simulate(starts[i], easier.wanted(actions)[:, 0], task.dt)
+        yield follow(task, states, shares * actions, plans)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 from lag_envs.scenes import Acrobot
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.record import Controller, Examples, Goal
+from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
 _USABLE = {
     "mass_1": (1e-2, 1e2),
@@ -271,7 +272,24 @@ class AcrobotReal(Task):
         "LQR": Controller(
             "lag_envs.controllers.energy:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
         ),
+        "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
     }
+    plans = Plans(
+        "lag_envs.controllers.swing_up:easier",
+        {
+            "end": {"theta_1": 10.0, "theta_1_dot": 0.1, "theta_2": 10.0, "theta_2_dot": 0.1},
+            "effort": 0.01,
+            "every": 5,
+        },
+        steps=130,
+        quick={},
+        batch=24,
+        iterations=80,
+        rest=(math.pi, 0.0, 0.0, 0.0),
+        weights={"theta_1": 1.0, "theta_1_dot": 0.05, "theta_2": 1.0, "theta_2_dot": 0.05},
+        effort=0.5,
+        smooth={"dry_friction": 0.0, "dry_friction_2": 0.0},
+    )
     hyperparameters = {"ppo": {"gamma": 0.999}}
     examples = Examples(
         start={"state": [2.8, -1.0, 0.3, 1.0]},
@@ -288,7 +306,9 @@ class AcrobotReal(Task):
     )
     note = (
         "The LQR is that of the project's leaderboard. It holds the links where it finds them upright; "
-        "hanging links it leaves alone."
+        "hanging links it leaves alone. The plan was found on the exact model with its friction; its "
+        "feedback is "
+        "that of a model without dry friction."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
@@ -335,9 +355,11 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of bot
         "dry_friction_2": 0.0,
     }
     action = {"shoulder_torque": 6.0}
+    plans = dataclasses.replace(AcrobotReal.plans, steps=85)
     controllers = {
         "LQR": Controller(
             "lag_envs.controllers.energy:PublishedLQR",
             {"weights": (0.00125, 0.65, 0.000688, 0.000936), "effort": 25.0},
         ),
+        "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
     }

@@ -68,7 +68,7 @@ class Plans:
     numbers : mapping
         Its keyword arguments.
     steps : int
-        Steps of a plan that is followed.
+        Steps of the easier task in a plan that is followed.
     quick : mapping
         What is different for a plan that is not followed, but that each episode's own plan begins from: other
         `numbers`, ``steps``, ``batch`` or ``iterations``.
@@ -82,6 +82,9 @@ class Plans:
         Weights of the feedback: squares of deviations, by entry of the state.
     effort : float
         Weight of the square of an action's deviation.
+    smooth : mapping
+        Parameters of the scene that differ in the model of the feedback: dry friction at rest is so steep
+        that its slope misleads.
     """
 
     place: str
@@ -93,6 +96,7 @@ class Plans:
     rest: Sequence[float]
     weights: Mapping[str, float]
     effort: float
+    smooth: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

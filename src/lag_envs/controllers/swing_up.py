@@ -1,0 +1,76 @@
+"""Plans that swing something up: a task that is easier to plan for than those with a height to the fourth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lag_envs.controllers.basic import Array
+from lag_envs.tasks.base import Task
+
+
+def easier(
+    task: Task,
+    *,
+    end: Mapping[str, float],
+    effort: float,
+    share: float = 0.9,
+    walls: Mapping[str, float] | None = None,
+    every: int = 1,
+) -> tuple[Task, Callable[[Array], Array]]:
+    """Return a task that is easier to plan for, and what its end costs.
+
+    All that counts is where a plan ends, and a little how. The control is weaker, so that feedback has
+    something left to correct the plan with.
+
+    Parameters
+    ----------
+    task : Task
+        The task; its `plans` tell the rest at which a plan should end.
+    end : mapping
+        What an entry of the state costs at the end: by the square of its distance from the rest, for angles
+        twice 1 less the cosine of it.
+    effort : float
+        Price of a step with the largest control.
+    share : float
+        Largest control, as a share of the task's.
+    walls : mapping, optional
+        For entries of the state, sizes from nine tenths of which on a step is punished.
+    every : int
+        How many of the task's steps each control is held.
+    """
+    kind: Any = type(task)
+    (name,) = kind.action
+    most = share * float(task.limit_control)
+    names, units = task.scene.state_names, task.scene.state_units
+    rest = dict(zip(names, task.plans.rest, strict=True))
+
+    class Easier(kind):  # type: ignore[misc]
+        id = ""
+        action: ClassVar = {name: most}
+        last_reward = Task.last_reward
+
+        def terminated(self, after: Any, target: Any, xp: Any) -> Any:
+            return False
+
+        def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
+            a = control[name] * (1.0 / most)
+            cost = effort * a * a
+            for entry, size in (walls or {}).items():
+                over = xp.maximum(xp.abs(after[entry]) * (1.0 / size) - 0.9, 0.0)
+                cost = cost + 300.0 * over * over
+            return -cost
+
+    def lost(states: Array) -> Array:
+        total = np.zeros(len(states))
+        for i, (entry, unit) in enumerate(zip(names, units, strict=True)):
+            off = states[:, i] - rest[entry]
+            total += end.get(entry, 0.0) * (2.0 * (1.0 - np.cos(off)) if unit == "rad" else off * off)
+        return total
+
+    fields = dataclasses.fields(task.scene)
+    parameters = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
+    return Easier(dt=every * task.dt, duration=task.duration, **parameters), lost
