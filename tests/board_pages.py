@@ -110,7 +110,7 @@ def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.i
     boards = [
         {
             "id": env_id,
-            "known": known_returns(env_id)._asdict(),
+            "known": (known := known_returns(env_id)) and known._asdict(),
             "value": value() if issubclass(TASKS[env_id], pivoted_bar.SwingUp) else None,
             "rows": [row(env_id, i, *agent) for i, agent in enumerate(agents)],
             "other": [

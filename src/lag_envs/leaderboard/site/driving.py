@@ -221,7 +221,10 @@ def agent(policy: Policy) -> dict[str, Any] | None:
             "wrapped": agent.read.wrapped,
             "interval": made.task.interval,
         }
-    return about | {"arrays": {name: _array(x) for name, x in policy.arrays.items()}}
+    return about | {
+        "largest": made.head.largest,
+        "arrays": {name: _array(x) for name, x in policy.arrays.items()},
+    }
 
 
 def _array(array: Any) -> dict[str, Any]:
