@@ -23,6 +23,19 @@ AGENTS = (
 )  # fmt: skip
 
 
+COMBINED = {
+    "name": "PPO",
+    "authors": ["A. Author"],
+    "kind": "learned",
+    "score": 0.7,
+    "interval": [0.65, 0.75],
+    "boards": 2,
+    "of": 3,
+    "there": 0.9,
+    "profile": [[0.5, 2 / 3], [0.9, 1 / 3], [0.99, 0.0]],
+}
+
+
 @cache
 def replay(env_id, seed):
     """Return an episode of a policy that is random, but slowly so, in the form of the page's data."""
@@ -97,7 +110,7 @@ def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.i
     boards = [
         {
             "id": env_id,
-            "known": known_returns(env_id)._asdict(),
+            "known": (known := known_returns(env_id)) and known._asdict(),
             "value": value() if issubclass(TASKS[env_id], pivoted_bar.SwingUp) else None,
             "rows": [row(env_id, i, *agent) for i, agent in enumerate(agents)],
             "other": [
@@ -112,7 +125,7 @@ def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.i
         }
         for env_id in env_ids
     ]
-    return {"protocol": 1, "made": "2026-11-21", "environments": boards}
+    return {"protocol": 1, "made": "2026-11-21", "environments": boards, "combined": [COMBINED]}
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def slow(*values):
 # --- what they reach: mean returns over 1,000 episodes, as the agents' results have them ---
 
 KEPT = json.loads((Path(__file__).parents[1] / "agents" / "results" / "summary.json").read_text())["envs"]
-ALL = [(env_id, name, found) for env_id, task in TASKS.items() for name, found in task.controllers.items()]
+ALL = [(env_id, name, found) for env_id in KEPT for name, found in TASKS[env_id].controllers.items()]
 PLANS = [(env_id, name) for env_id, name, found in ALL if found.plans]
 
 

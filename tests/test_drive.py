@@ -17,7 +17,7 @@ from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.policies import Policy, architecture
 from lag_envs.leaderboard.site.build import build
 from lag_envs.leaderboard.site.driving import agent, script_of, sliders
-from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum, pivoted_bar
 from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
@@ -28,6 +28,7 @@ BARE = (
     pivoted_bar.Balance.id,
     incline.Tilt.id,
     cylinder_in_cylinder.Tilt.id,
+    pendulum.PendulumExact.id,
 )
 #: Plays actions in the page and returns the bits of all that comes out.
 ROLLOUT = """async ([program, code, episodes]) => {
@@ -423,6 +424,7 @@ def policies():
     """Return a policy of every kind that runs in the page, by name, with its environment."""
     rng = np.random.default_rng(0)
     bar, tilt = pivoted_bar.SwingUpFree.id, cylinder_in_cylinder.Tilt.id
+    wide = pendulum.PendulumExact.id
 
     def policy(id, table, arrays):
         made = architecture(id, table)
@@ -437,6 +439,8 @@ def policies():
     for activation in ("tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"):
         table = {"architecture": "mlp", "hidden": [5, 4], "activation": activation, "squash": "tanh"}
         yield activation, *policy(bar, table, layers(3, 5, 4, 1))
+    table = {"architecture": "mlp", "hidden": [], "squash": "tanh"}
+    yield "actions up to two", *policy(wide, table, layers(3, 1))
     normal = {"obs_mean": rng.normal(size=3), "obs_var": rng.random(3)}
     table = {
         "architecture": "mlp",

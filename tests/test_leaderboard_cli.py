@@ -236,6 +236,28 @@ def test_top_of_each_board(run):
     assert {len(row) for row in cells} == {3}
 
 
+def test_agents_over_all_boards(run):
+    """Who is on both boards comes before who is better on one; the best learner is shown wherever it is."""
+    for number in range(docs.BEST):
+        write(f"c{number}", f"C{number}", score=0.9 + 0.01 * number, kind="controller")
+    write("low", "Learner", score=0.4)
+    write("both", "Both | *", score=0.6, kind="controller")
+    write("again", "Both | *", score=0.7, env=incline.Tilt.id, kind="controller")
+    run("add", *(f"c{number}" for number in range(docs.BEST)), "low", "both", "again", "--nonce", "n")
+    data = board_data(Board("leaderboard"))
+    found = {row["name"]: row for row in data["combined"]}
+    assert found["Both | *"]["boards"] == 2 and found["Both | *"]["of"] == 2
+    assert found["C4"]["score"] == pytest.approx(0.5 * 0.94, abs=0.01)
+    assert found["C4"]["there"] == pytest.approx(0.94, abs=0.01)
+    lines = docs.together(data).splitlines()
+    cells = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    assert [row[:2] for row in cells[2:]] == [
+        ["1", r"Both \| \*"], ["2", "C4"], ["3", "C3"], ["4", "C2"], ["5", "C1"], ["7", "Learner"]
+    ]  # fmt: skip
+    assert [row[3] for row in cells[2:4]] == ["2 of 2", "1 of 2"]
+    assert docs.together({"combined": []}) == "Nothing has been submitted yet."
+
+
 def page():
     return (ROOT / "docs" / "leaderboard.md").read_text(encoding="utf-8")
 

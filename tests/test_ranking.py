@@ -9,6 +9,7 @@ from covering import covering
 from lag_envs.controllers import make_controller
 from lag_envs.evaluation.rollout import play
 from lag_envs.evaluation.statistics import RESAMPLES, THRESHOLDS, ends, iqm
+from lag_envs.leaderboard.combined import Agent, Result, combined
 from lag_envs.leaderboard.protocol import Reference, reference
 from lag_envs.leaderboard.ranking import (
     Scores,
@@ -275,6 +276,33 @@ def test_references_are_controllers_that_are_known_and_help(env_id):
     assert error == pytest.approx(few.std() / episodes**0.5, rel=0.25)
     if known.policy == name:
         assert known.best == pytest.approx(mean, abs=5.0 * error)
+
+
+# --- all boards together ---
+
+
+def test_combined_scores_by_hand():
+    """Clipped to [0, 1], missing boards are 0, boards without anybody do not count."""
+    alice, bob = Agent("A", ("Alice",)), Agent("A", ("Bob",))
+    steady = np.linspace(0.0, 1.0, 1001)
+    boards = {
+        "one": {alice: Result(1.2, np.full(1001, 1.2), "learned"), bob: Result(0.5, steady, "controller")},
+        "two": {alice: Result(-3.0, np.full(1001, -3.0), "learned")},
+        "three": {bob: Result(0.9, np.full(1001, 0.9), "learned")},
+        "none": {},
+        "four": {alice: Result(0.95, np.full(1001, 0.95), "learned")},
+    }
+    first, second = combined(boards)
+    assert (first["name"], first["authors"], first["kind"]) == ("A", ["Alice"], "learned")
+    assert first["score"] == pytest.approx((1.0 + 0.0 + 0.95) / 4) and first["interval"] == pytest.approx(
+        [1.95 / 4, 1.95 / 4]
+    )
+    assert (first["boards"], first["of"], first["there"]) == (3, 4, pytest.approx(0.65))
+    assert first["profile"] == [[0.5, 0.5], [0.9, 0.5], [0.99, 0.25]]
+    assert second["score"] == pytest.approx(1.4 / 4) and second["kind"] == "several"
+    assert second["interval"] == pytest.approx([0.925 / 4, 1.875 / 4], abs=1e-3)
+    assert second["profile"] == [[0.5, 0.5], [0.9, 0.25], [0.99, 0.0]]
+    assert combined({"one": {}}) == []
 
 
 def test_a_full_board_is_ranked_in_seconds():

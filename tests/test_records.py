@@ -13,6 +13,7 @@ from lag_envs.hyperparams import DEFAULTS, learners
 from lag_envs.tasks import TASKS, find
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
+from tools.missing import COMMANDS, have, missing
 
 ROOT = Path(__file__).parents[1]
 #: The example of help texts, and of tests of what has nothing to do with an environment.
@@ -88,7 +89,29 @@ def test_records_are_whole(env_id):
         assert all(low < high for low, high in found.tune.values())
 
 
+@pytest.mark.slow
 @each_task
+def test_nothing_lacks(env_id):
+    """The quick tests take what has been generated so far; before an issue is closed all of it is there."""
+    assert missing(env_id) == {}
+
+
+def test_what_lacks_is_told_with_its_command(monkeypatch):
+    assert missing(EXAMPLE) == {}
+
+    class New(TASKS[EXAMPLE]):
+        id = "New-v0"
+
+    monkeypatch.setitem(TASKS.data, "New-v0", New)
+    found = missing("New-v0")
+    assert set(found) == set(COMMANDS) - {"plan"}
+    assert found["rollouts"] == "python tests/golden_rollouts.py New-v0"
+    assert "New-v0" not in have("returns") and EXAMPLE in have("returns")
+    with pytest.raises(ValueError, match="there is no 'films', only returns, rollouts, plan"):
+        have("films")
+
+
+@pytest.mark.parametrize("env_id", have("returns"))
 def test_what_was_measured_is_there(env_id):
     found = measured(env_id)
     assert {"random", "zero", found["scale"]["policy"]} <= set(found["measured"])

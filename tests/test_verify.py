@@ -253,9 +253,9 @@ def test_progress_reaches_its_end(submission):
     assert all(b >= a for a, b in pairwise(done))
 
 
-def test_every_environment_has_a_goal():
-    assert protocol.boards() == list(TASKS)
-    for env in TASKS:
+def test_every_board_has_a_goal():
+    assert protocol.boards() == [env for env, task in TASKS.items() if task.goal]
+    for env in protocol.boards():
         task = TASKS[env]()
         states = np.array([task.centre, np.array(task.centre) + 0.9 * np.array(task.half_widths)])
         inside = task.goal_holds(states)

@@ -14,7 +14,7 @@ from pathlib import Path
 from lag_envs.generated import replaced
 from lag_envs.store import write
 from lag_envs.tasks import TASKS
-from tools.docs.environments import ROOT, overview
+from tools.docs.environments import ROOT, by_scene
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def generated(root: Path) -> dict[Path, str]:
     """Return the generated files, as they ought to be."""
     readme = root / "README.md"
-    text = replaced(readme.read_text(encoding="utf-8"), "environments", overview(source))
+    text = replaced(readme.read_text(encoding="utf-8"), "environments", by_scene(source))
     return {readme: text}
 
 

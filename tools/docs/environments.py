@@ -126,6 +126,19 @@ def overview(link: Callable[[str], str]) -> str:
     return table(["environment", "what to do", "control", "random", "best known"], rows)
 
 
+def by_scene(source: Callable[[str], str]) -> str:
+    """Return a short table: scenes and the ids of their tasks; `source` tells where an id's file is."""
+    files: dict[str, list[str]] = {}
+    for env_id in TASKS:
+        files.setdefault(source(env_id), []).append(env_id)
+    rows = []
+    for file, ids in files.items():
+        scenes = dict.fromkeys(TASKS[env_id].scene for env_id in ids)
+        named = ", ".join(f"`{kind.__name__}`" for kind in scenes)
+        rows.append([f"[{named}]({file})", "; ".join(map(_first, scenes)), ", ".join(f"`{i}`" for i in ids)])
+    return table(["scene", "", "environments"], rows)
+
+
 def _first(kind: type) -> str:
     return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
 

@@ -1,8 +1,8 @@
 """The leaderboard in README and docs: ``python -m lag_envs.leaderboard.docs PROJECT``.
 
-From a checkout's folder ``leaderboard`` it writes the best agents of each board into README.md, and what
-counts as success into ``docs/leaderboard.md``. The texts follow from the files alone, so a test makes them
-again and compares.
+From a checkout's folder ``leaderboard`` it writes the agents with the best combined scores into README.md,
+and the best of each board and what counts as success into ``docs/leaderboard.md``. The texts follow from the
+files alone, so a test makes them again and compares.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ from lag_envs.store import write
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
+#: Agents in README's table.
+BEST = 5
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of a checkout."""
@@ -34,10 +37,30 @@ def generated(project: Path) -> dict[Path, str]:
     """Return the generated files, as they ought to be."""
     readme, page = project / "README.md", project / "docs" / "leaderboard.md"
     data = board_data(Board(project / "leaderboard"))
+    text = replaced(page.read_text(encoding="utf-8"), "goals", goals())
     return {
-        readme: replaced(readme.read_text(encoding="utf-8"), "leaderboard", top(data)),
-        page: replaced(page.read_text(encoding="utf-8"), "goals", goals()),
+        readme: replaced(readme.read_text(encoding="utf-8"), "leaderboard", together(data)),
+        page: replaced(text, "boards", top(data)),
     }
+
+
+def together(data: dict[str, Any]) -> str:
+    """Return a table of the best agents over all boards, and the best learned one if it is none of them."""
+    every = list(enumerate(data["combined"], 1))
+    shown = every[:BEST] + [one for one in every[BEST:] if one[1]["kind"] == "learned"][:1]
+    if not shown:
+        return "Nothing has been submitted yet."
+    rows = [
+        [
+            str(number),
+            plain(row["name"]),
+            _scored(row, 3),
+            f"{row['boards']} of {row['of']}",
+            f"{row['there']:.3f}",
+        ]
+        for number, row in shown
+    ]
+    return markdown_table(("", "agent", "mean score (95 % interval)", "boards", "mean on those"), rows)
 
 
 def top(data: dict[str, Any]) -> str:
@@ -50,15 +73,22 @@ def top(data: dict[str, Any]) -> str:
         first = [row for row in best if row["rank"] == best[0]["rank"]]
         learned = [row for row in best if row["kind"] == "learned"][:1]
         if first:
-            rows.append([environment["id"], ", ".join(map(_scored, first)), ", ".join(map(_scored, learned))])
+            names = [
+                ", ".join(f"{plain(row['name'])} {_scored(row)}" for row in some) for some in (first, learned)
+            ]
+            rows.append([environment["id"], *names])
     if not rows:
         return "Nothing has been submitted yet."
     return markdown_table(("environment", "best (95 % interval)", "best learned"), rows)
 
 
-def _scored(row: dict[str, Any]) -> str:
-    low, high = row["interval"]
-    return f"{plain(row['name'])} {row['score']:.4f} ({low:.4f} to {high:.4f})"
+def _listed(rows: Sequence[dict[str, Any]]) -> str:
+    return ", ".join(f"{plain(row['name'])} {_scored(row)}" for row in rows)
+
+
+def _scored(row: dict[str, Any], digits: int = 4) -> str:
+    score, low, high = (f"{x:.{digits}f}" for x in (row["score"], *row["interval"]))
+    return f"{score} ({low} to {high})"
 
 
 def goals() -> str:

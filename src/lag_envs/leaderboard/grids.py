@@ -12,7 +12,7 @@ from pydantic import model_validator
 
 from lag_envs.controllers.basic import ObservationDecoder
 from lag_envs.controllers.lookahead import Clocked, LookAhead
-from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, PolicyTable
+from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, Head, PolicyTable
 from lag_envs.leaderboard.fields import between, line, many, shown
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.tasks import TASKS
@@ -69,6 +69,7 @@ class Table(Architecture):
                 raise Refused(
                     f'{POLICY}: where actions are listed, kind must be "value", without actions and mirror'
                 )
+        self.head = Head(self.task)
         names = list(self.task.scene.state_names)
         has_target = self.task.target_range is not None
         known = [*names, "time"]
@@ -101,7 +102,7 @@ class Table(Architecture):
         grid = _Grid(self, axes, arrays["table"])
         if self.kind == "action":
             return _LookUp(self.task, grid)
-        listed, largest = self.task.formulas.choices, self.task.formulas.largest
+        listed, largest = self.head.choices, self.head.largest
         tried = np.arange(float(listed[0])) if listed else np.linspace(-largest, largest, self.actions)
         return LookAhead(self.task, grid.value, tried)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lag_envs.leaderboard.board import Board, closed
 from lag_envs.leaderboard.files import read_plain
@@ -14,6 +14,9 @@ from lag_envs.leaderboard.pending import shown_episodes
 from lag_envs.leaderboard.results import PACKED, checked_value
 from lag_envs.scores import KnownReturns, known_returns, normalised
 from lag_envs.tasks import TASKS
+
+if TYPE_CHECKING:
+    from lag_envs.leaderboard.combined import Agent, Result
 
 
 def page_data(board: Board) -> dict[str, Any]:
@@ -48,31 +51,45 @@ def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
     -------
     dict
         JSON types. ``environments`` has every environment, with its ``rows`` in order, and after them the
-        frozen boards.
+        frozen boards; ``combined`` has what `combined.combined` makes of the open ones.
 
     Raises
     ------
     BoardError
         Where something on the board is not as it was noted, see `audit.sound`.
     """
+    from lag_envs.evaluation.statistics import rounded
     from lag_envs.leaderboard.audit import sound
+    from lag_envs.leaderboard.combined import combined
 
     state, results = sound(board)
     current = state.number or 1
     keys = {(env_id, current): None for env_id in TASKS if not closed(env_id, current, current)}
     frozen = sorted({(e.env, e.protocol) for e in state.all} - set(keys))
+    found: dict[str, dict[Agent, Result]] = {}
     return {
         "protocol": current,
         "made": made or datetime.now(UTC).date().isoformat(),
-        "environments": [_environment(board, state, results, *key) for key in (*keys, *frozen)],
+        "environments": [
+            *(_environment(board, state, results, *key, found.setdefault(key[0], {})) for key in keys),
+            *(_environment(board, state, results, *key, {}) for key in frozen),
+        ],
+        "combined": rounded(combined(found)),
     }
 
 
 def _environment(
-    board: Board, state: State, results: Mapping[tuple[int, str], dict[str, Any]], env_id: str, number: int
+    board: Board,
+    state: State,
+    results: Mapping[tuple[int, str], dict[str, Any]],
+    env_id: str,
+    number: int,
+    reached: dict[Agent, Result],
 ) -> dict[str, Any]:
+    """Return a board, and note what the ranked agents reached on it."""
     from lag_envs.evaluation.statistics import ends, iqm, rounded
     from lag_envs.leaderboard import ranking
+    from lag_envs.leaderboard.combined import Agent, Result
     from lag_envs.leaderboard.site.scenery import describe
 
     entries = {e.id: e for e in state.boards.get(number, {}).values() if e.env == env_id}
@@ -113,7 +130,11 @@ def _environment(
                 for c in result["claimed"]["curves"]
             ]  # fmt: skip
             row |= ranking.columns(env_id, result, told.rules.disturbed_episodes, scale, scores[id])
-            row["interval"] = list(ends(iqm(drawn[id])))
+            samples = iqm(drawn[id])
+            row["interval"] = list(ends(samples))
+            if place is not None:
+                agent = Agent(entry.name, tuple(entry.authors))
+                reached[agent] = Result(row["score"], samples, entry.kind)
             middle, chosen = shown_episodes(result)
             verified = {label: result["policies"][middle]["returns"][i] for label, i in chosen.items()}
             row["replays"] = [

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from lag_envs.errors import hint
 from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.architecture import Architecture
 from lag_envs.leaderboard.fields import Strict, accepted, between, line, many, plain, shown
@@ -109,7 +110,7 @@ def _named(name: str) -> str:
 
 def _on_a_board(env: str) -> str:
     if env not in (known := protocol.boards()):
-        raise ValueError(f"must be one of {', '.join(known)}")
+        raise ValueError(f"there is no such board; {hint(env, known, 'lag-envs list names them')}")
     return env
 
 

@@ -245,10 +245,10 @@ def markdown(accuracy: dict[str, Any]) -> str:
 INTRODUCTION = """\
 One control step, with its control held, is accurate to 1e-12: |error of θ| ≤ 1e-12 max(1, |θ|, |θ̇| dt) and
 |error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. For lengths it is alike
-([numerics](numerics.md)). This holds for all eight environments, over the ordinary ranges of their
-parameters, with damping γ dt up to 1e6. At extremes the system itself amplifies a rounding of its state or
-parameters; there the error stays within ten times that amplification. A step that would need more than a
-million substeps, or has no finite result, raises `StepRefused` and leaves the state as it was.
+([numerics](numerics.md)). This holds for all environments with an exact flow, over the ordinary ranges of
+their parameters, with damping γ dt up to 1e6. At extremes the system itself amplifies a rounding of its
+state or parameters; there the error stays within ten times that amplification. A step that would need more
+than a million substeps, or has no finite result, raises `StepRefused` and leaves the state as it was.
 
 Over many steps errors grow as the system makes them grow. The default bar, upright and without control,
 doubles an error every 0.14 s, whatever the method.

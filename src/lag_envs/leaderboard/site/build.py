@@ -163,7 +163,8 @@ def render(
     filters = {"number": number, "steps": steps, "duration": duration, "percent": percent}
     templates.filters |= filters | {"about": _about}
     templates.globals |= {
-        "columns": COLUMNS, "kinds": KINDS, "boards": boards, "made": data["made"], "style": style,
+        "columns": COLUMNS, "kinds": KINDS, "boards": boards, "combined": _clean(data.get("combined") or []),
+        "made": data["made"], "style": style,
         "script": script, "drive": drive, "protocol": data["protocol"], "value_of": value_of,
         "embed": _embedded, "url": url and url.rstrip("/") + "/",
         "site": site, "preview": next((b["preview"] for b in boards), None),

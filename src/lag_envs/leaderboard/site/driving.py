@@ -194,7 +194,7 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     """
     made = policy.architecture
     about: dict[str, Any]
-    if made.schema > 1:
+    if not isinstance(made, MLP | Linear | Table) or made.schema > 1:
         return None
     if isinstance(made, MLP):
         about = {
@@ -209,7 +209,7 @@ def agent(policy: Policy) -> dict[str, Any] | None:
         }
     elif isinstance(made, Linear):
         about = {"kind": "linear"}
-    elif isinstance(made, Table):
+    else:
         agent: Any = policy.agent()
         about = {
             "kind": f"{made.kind} table",
@@ -221,9 +221,10 @@ def agent(policy: Policy) -> dict[str, Any] | None:
             "wrapped": agent.read.wrapped,
             "interval": made.task.interval,
         }
-    else:
-        return None
-    return about | {"arrays": {name: _array(x) for name, x in policy.arrays.items()}}
+    return about | {
+        "largest": made.head.largest,
+        "arrays": {name: _array(x) for name, x in policy.arrays.items()},
+    }
 
 
 def _array(array: Any) -> dict[str, Any]:

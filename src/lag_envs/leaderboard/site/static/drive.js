@@ -209,13 +209,13 @@
     sigmoid,
   };
 
-  /** A function from an episode to its next action, as lag_envs/leaderboard/policies.py acts. */
+  /** A function from an episode to its next action, as the architectures of lag_envs/leaderboard act. */
   function agentOf(about) {
     const arrays = Object.fromEntries(
       Object.entries(about.arrays).map(([name, array]) => [name, { n: numbersOf(array), shape: array.shape }]),
     );
     const found = { mlp: network, linear: feedback, "action table": table, "value table": table }[about.kind](about, arrays);
-    return (episode) => found(episode).map((x) => Math.fround(clamp(x, -1, 1)));
+    return (episode) => found(episode).map((x) => Math.fround(clamp(x, -about.largest, about.largest)));
   }
 
   /** What an agent sees, in float32. */
@@ -240,11 +240,11 @@
       if (about.bins) {
         return Array.from({ length: about.controls }, (_, i) => {
           const worth = x.subarray(i * about.bins, (i + 1) * about.bins);
-          return (2 * worth.indexOf(Math.max(...worth)) + 1) / about.bins - 1;
+          return about.largest * ((2 * worth.indexOf(Math.max(...worth)) + 1) / about.bins - 1);
         });
       }
       if (about.mean_limit) x = x.map((v) => clamp(v, -about.mean_limit, about.mean_limit));
-      return [...(about.squash === "tanh" ? x.map(Math.tanh) : x)];
+      return [...(about.squash === "tanh" ? x.map((v) => about.largest * Math.tanh(v)) : x)];
     };
   }
 
@@ -312,11 +312,12 @@
       return chosen;
     }
 
+    const { largest } = about;
     const spaced = (n) => Array.from({ length: n }, (_, i) => -1 + (2 * i) / (n - 1));
     return (episode) => {
-      const coarse = best(episode, spaced(about.actions));
-      const width = 2 / (about.actions - 1);
-      return [best(episode, spaced(17).map((x) => clamp(coarse + width * x, -1, 1)))];
+      const coarse = best(episode, spaced(about.actions).map((x) => largest * x));
+      const width = (2 * largest) / (about.actions - 1);
+      return [best(episode, spaced(17).map((x) => clamp(coarse + width * x, -largest, largest)))];
     };
   }
 

@@ -1,0 +1,76 @@
+"""One number for an agent on all boards: the mean of its scores, where it did not take part 0.
+
+A score counts from 0, what random actions get, to 1, the best policy known: a record on one board, or ruin on
+another, weighs no more than a board. A board on which an agent is missing counts 0, as if it had acted at
+random there, so nobody gains by leaving out what is hard. How many boards it is on is shown beside it, and
+its profile: on what share of the boards its score is at least so much.
+
+Boards count once somebody is ranked on them. An agent is known by name and authors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.evaluation.statistics import ends
+
+Array = NDArray[np.float64]
+#: Scores of the profile.
+LEVELS = (0.5, 0.9, 0.99)
+
+
+class Agent(NamedTuple):
+    """Who it is that acts."""
+
+    name: str
+    authors: tuple[str, ...]
+
+
+class Result(NamedTuple):
+    """What an agent reached on a board: the score, bootstrap samples of it, and the row's kind."""
+
+    score: float
+    drawn: Array
+    kind: str
+
+
+def combined(boards: Mapping[str, Mapping[Agent, Result]]) -> list[dict[str, Any]]:
+    """Return the agents in the order of their combined scores, in JSON types.
+
+    Parameters
+    ----------
+    boards : mapping of str to mapping of Agent to Result
+        For each board the ranked agents.
+
+    Returns
+    -------
+    list of dict
+        ``name``, ``authors``, ``kind``; ``score`` and its bootstrap ``interval`` of 95 %; ``boards``, on how
+        many it is, ``of`` how many; ``there``, its mean score on those; ``profile``, pairs of a score and the
+        share of all boards on which it has at least that.
+    """
+    counted = {env_id: found for env_id, found in boards.items() if found}
+    rows = []
+    for agent in dict.fromkeys(agent for found in counted.values() for agent in found):
+        results = [found[agent] for found in counted.values() if agent in found]
+        scores = np.clip([result.score for result in results], 0.0, 1.0)
+        drawn = np.sum([np.clip(result.drawn, 0.0, 1.0) for result in results], axis=0) / len(counted)
+        kinds = dict.fromkeys(result.kind for result in results)
+        rows.append(
+            {
+                "name": agent.name,
+                "authors": list(agent.authors),
+                "kind": next(iter(kinds)) if len(kinds) == 1 else "several",
+                "score": float(scores.sum() / len(counted)),
+                "interval": list(ends(drawn)),
+                "boards": len(results),
+                "of": len(counted),
+                "there": float(scores.mean()),
+                "profile": [[level, float((scores >= level).sum() / len(counted))] for level in LEVELS],
+            }
+        )
+    return sorted(rows, key=lambda row: -row["score"])

@@ -1,0 +1,114 @@
+"""What has been measured and drawn of each environment, and what has not yet: ``python -m tools.missing``.
+
+A new environment works before anything is generated for it: pages say "not measured yet", and the tests that
+compare with what is kept take the environments that have it. With what lacks come the commands that make it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lag_envs.tables import columns
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.measured import known
+
+ROOT = Path(__file__).parents[1]
+#: What there is to generate, with the command; ID stands for the environment.
+COMMANDS = {
+    "returns": "python -m agents.scale ID --output src/lag_envs/tasks/measured.json",
+    "rollouts": "python tests/golden_rollouts.py ID",
+    "plan": "python -m agents.optimum ID",
+    "value iteration": "python -m agents.optimum ID",
+    "agents": "python -m agents.results --envs ID",
+    "behaviour": "python -m agents.behaviour",
+    "board": "lag-envs leaderboard open",
+    "speed": "make bench-docs",
+    "accuracy": "make report ARGS='--docs .'",
+    "picture": "python -m tools.docs --pictures",
+}
+
+
+def have(what: str) -> list[str]:
+    """Return the ids of which something is there; `COMMANDS` has what that may be."""
+    there = _there(what)
+    return [env_id for env_id in TASKS if env_id in there]
+
+
+def missing(env_id: str) -> dict[str, str]:
+    """Return what lacks of an environment, and the command that makes it."""
+    task = TASKS[env_id]
+    for_all = [what for what in COMMANDS if what not in ("plan", "value iteration", "board", "accuracy")]
+    if task.value_iteration:
+        for_all.append("value iteration")
+    if task.plans is not None:
+        for_all.append("plan")
+    if task.goal:
+        for_all.append("board")
+    if not task.imperfections:
+        for_all.append("accuracy")
+    return {what: COMMANDS[what].replace("ID", env_id) for what in for_all if env_id not in _there(what)}
+
+
+@cache
+def _there(what: str) -> frozenset[str]:
+    results, images = ROOT / "agents" / "results", ROOT / "docs" / "images"
+    found: Iterable[str]
+    match what:
+        case "returns":
+            found = known()
+        case "rollouts":
+            found = (name.partition("/")[0] for name in _json(ROOT / "tests" / "golden" / "runs.json"))
+        case "plan":
+            files = (ROOT / "src/lag_envs/controllers/plans").glob("*.npz")
+            found = (name[0] for file in files if (name := re.match(r".+?-v\d+", file.stem)))
+        case "value iteration":
+            found = (file.stem for file in (results / "optimum").glob("*.json"))
+        case "agents":
+            found = _json(results / "summary.json")["envs"]
+        case "behaviour":
+            found = _json(results / "behaviour.json")["envs"]
+        case "board":
+            found = _scales()
+        case "speed":
+            found = (row["id"] for row in _json(ROOT / "docs" / "speed.json")["rows"])
+        case "accuracy":
+            found = _measured_errors()
+        case "picture":
+            found = (file.stem for file in (images / "moving").glob("*.webp"))
+        case _:
+            raise ValueError(f"there is no {what!r}, only {', '.join(COMMANDS)}")
+    return frozenset(found)
+
+
+def _json(file: Path) -> Any:
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _scales() -> Iterable[str]:
+    from lag_envs.leaderboard.board import Board
+
+    state = Board(ROOT / "leaderboard").read()
+    return state.protocols[state.number].scales if state.number else ()
+
+
+def _measured_errors() -> Iterable[str]:
+    (part,) = (s for s in _json(ROOT / "docs" / "accuracy.json")["sections"] if s["name"] == "environments")
+    where = part["summary"]["columns"].index("environment")
+    return (row[where] for row in part["summary"]["rows"])
+
+
+def main() -> int:
+    """Print what lacks; return 1 where something does."""
+    rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
+    print("\n".join(columns([["environment", "what lacks", "command"], *rows])) if rows else "Nothing lacks.")
+    return 1 if rows else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
