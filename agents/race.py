@@ -41,7 +41,7 @@ training is started again, and tests decide nothing.
 examples:
   python -m agents.race                                            our PPO and Stable-Baselines3's, five seeds
   python -m agents.race --learners fast_ppo --seeds 20 --first-seed 100
-  python -m agents.race PivotedBarFree-v0 --output race.jsonl --picture race.png
+  python -m agents.race PivotedBar-v0 --output race.jsonl --picture race.png
 """
 
 
