@@ -47,7 +47,7 @@ def cost(task: Task, state: Sequence[float], control: float = 0.0, target: float
 
 def regulator(
     task: Task,
-    state: Sequence[float],
+    state: Sequence[float] | Array,
     control: float = 0.0,
     target: float = 0.0,
     extra: Mapping[str, float] | None = None,
@@ -118,7 +118,7 @@ def time_varying(
     p = solve_discrete_are(a, b, q, r)
 
     def gain(a: Array, b: Array, p: Array) -> Array:
-        return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+        return np.asarray(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a), np.float64)
 
     hold = gain(a, b, p)[0]
     gains = np.empty((len(actions), len(rest)))

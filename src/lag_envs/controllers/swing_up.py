@@ -48,7 +48,7 @@ def easier(
     names, units = task.scene.state_names, task.scene.state_units
     rest = dict(zip(names, task.plans.rest, strict=True))
 
-    class Easier(kind):  # type: ignore[misc]
+    class Easier(kind):
         id = ""
         action: ClassVar = {name: most}
         last_reward = Task.last_reward
