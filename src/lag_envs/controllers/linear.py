@@ -21,7 +21,7 @@ from lag_envs.tasks.base import Task
 Array = NDArray[np.float64]
 
 
-def cost(task: Task, state: Sequence[float], control: float = 0.0, target: float = 0.0) -> Array:
+def cost(task: Task, state: Sequence[float] | Array, control: float = 0.0, target: float = 0.0) -> Array:
     """Return the matrix C of a step's loss (x, u)' C (x, u), the reward's to second order.
 
     Parameters
