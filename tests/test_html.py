@@ -96,7 +96,7 @@ def test_environments_show_picture_and_spaces(env_id):
     state = env.state
     shown = Checked(env._repr_html_())
     assert np.array_equal(env.state, state) and env._viewer is None and env._repr_html_() != before
-    assert "img" in shown.tags and env_id in shown.text and "Box(-1.0, 1.0, (1,), float32)" in shown.text
+    assert "img" in shown.tags and env_id in shown.text and str(env.action_space) in shown.text
     for name in (*env.task.observation, *env.scene.control_names, *env.scene._numbers()):
         assert name in shown.text
 

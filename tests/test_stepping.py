@@ -720,6 +720,13 @@ def test_against_dop853(kind):
 # --- one source, several backends -----------------------------------------------------------------
 
 
+def random_action(env, rng, size=1.0):
+    """Return an action of an environment, as a share of the largest where it is one of a range."""
+    if env.task.formulas.choices:
+        return rng.integers(env.action_space.n)
+    return env.action_space.high * rng.uniform(-size, size, env.action_space.shape)
+
+
 @pytest.mark.parametrize("name", covering(PERFECT))
 def test_simulate_is_the_environments_step(name):
     """From a given state, with the control that was applied: the same bits, but for the kicked speed."""
@@ -731,7 +738,7 @@ def test_simulate_is_the_environments_step(name):
         env.reset()
         start = env.state
         env.reset(options={"state": start})
-        env.step(rng.uniform(-1, 1, env.action_space.shape))
+        env.step(random_action(env, rng))
         end, expected = env.state, env.scene.simulate(start, [env.control], env.task.dt)[1]
         kicks += not np.array_equal(end, expected)
         if kicks and not np.array_equal(end, expected):
@@ -741,7 +748,7 @@ def test_simulate_is_the_environments_step(name):
         env.reset(options={"state": start})
         controls, states = [], [start]
         for _ in range(100):
-            _, _, terminated, _, _ = env.step(rng.uniform(-0.2, 0.2, env.action_space.shape))
+            _, _, terminated, _, _ = env.step(random_action(env, rng, 0.2))
             controls.append(env.control)
             states.append(env.state)
             if terminated:

@@ -21,10 +21,11 @@ J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2 to T.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape, torque
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -127,8 +128,16 @@ class Acrobot(Scene):
         return {"first": (0.0, 0.0, q.theta_1), "second": (*elbow, q.theta_1 + q.theta_2)}
 
     def bodies(self) -> Bodies:
-        """Return the links as they hang down."""
-        return {"first": link(self.length_1), "second": link(self.length_2)}
+        """Return the links as they hang down, and arrows for the torques."""
+        size = 0.2 * (self.length_1 + self.length_2)
+        arrows = {name: torque(size) for name in self.control_names}
+        return {"first": link(self.length_1), "second": link(self.length_2), **arrows}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the arrows are."""
+        places = {"shoulder_torque": "first", "elbow_torque": "second"}
+        joints, down = self.poses(now.q, xp), -0.5 * math.pi
+        return {name: (*joints[places[name]][:2], down, now.share[name]) for name in self.control_names}
 
 
 def link(length: float) -> list[Shape]:

@@ -17,10 +17,11 @@ This is the model of Gymnasium's `Pendulum-v1`.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Bodies, Circle, Polygon
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, torque
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,11 +78,16 @@ class Pendulum(Scene):
         return {"rod": (0.0, 0.0, q.theta)}
 
     def bodies(self) -> Bodies:
-        """Return the rod as it stands upright."""
+        """Return the rod as it stands upright, and an arrow for the torque."""
         half, long = 0.06 * self.length, self.length
         return {
             "rod": [
                 Polygon([(-half, -half), (half, -half), (half, long + half), (-half, long + half)]),
                 Circle((0.0, 0.0), 0.5 * half, "hole"),
-            ]
+            ],
+            "push": torque(0.3 * long),
         }
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the arrow is."""
+        return {"push": (0.0, 0.0, -0.5 * math.pi, now.share.torque)}

@@ -19,10 +19,11 @@ through its centre of mass G::
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Bodies, Circle, Polygon
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, torque
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,7 @@ class RotaryPendulum(Scene):
         return {"arm": (0.0, 0.0, q.phi), "pendulum": (1.5 * self.arm_length, 0.0, q.theta)}
 
     def bodies(self) -> Bodies:
-        """Return the arm, and the pendulum as it hangs down."""
+        """Return the arm, the pendulum as it hangs down, and an arrow for the torque."""
         wide = 0.05 * self.arm_length
         r, long = self.arm_length, 2.0 * self.com_distance
         return {
@@ -101,4 +102,9 @@ class RotaryPendulum(Scene):
                 Polygon([(-wide, wide), (-wide, -long), (wide, -long), (wide, wide)]),
                 Circle((0.0, 0.0), 0.5 * wide, "hole"),
             ],
+            "push": torque(0.5 * r),
         }
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the arrow is."""
+        return {"push": (0.0, 0.0, -0.5 * math.pi, now.share.torque)}

@@ -147,6 +147,16 @@ def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> l
     return [polar(centre, radius, start + (end - start) * i / n) for i in range(n + 1)]
 
 
+def torque(radius: float) -> list[Shape]:
+    """Return an arrow around a joint [m], from the x axis on."""
+    return [Arrow(arc((0.0, 0.0), radius, 0.0, 2.0 * math.pi / 3.0))]
+
+
+def outlines(shapes: Sequence[Shape]) -> list[Shape]:
+    """Return the areas among shapes, as where something should get."""
+    return [shape._replace(role="target") for shape in shapes if isinstance(shape, Polygon)]
+
+
 def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
     """Return a shape of a frame in the plane, as somebody sees it who looks at a window."""
     x, y, angle, part = pose

@@ -22,7 +22,7 @@ import dataclasses
 from typing import Any
 
 from lag_envs.scenes.base import Scene, parameter
-from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape
+from lag_envs.scenes.shapes import Bodies, Circle, Polygon, Shape, torque
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,12 +99,19 @@ class TwoLinkArm(Scene):
         return {"upper_arm": (0.0, 0.0, q.theta_1), "forearm": (*elbow, q.theta_1 + q.theta_2)}
 
     def bodies(self) -> Bodies:
-        """Return the links along the horizontal, the forearm with its hand."""
+        """Return the links along the horizontal, the forearm with its hand, and arrows for the torques."""
         upper, fore = (self._link(length) for length in (self.length_1, self.length_2))
         return {
             "upper_arm": upper,
             "forearm": [*fore, Circle((self.length_2, 0.0), 0.07 * self.length_2, "mark")],
+            "shoulder": torque(0.3 * self.length_1),
+            "elbow": torque(0.3 * self.length_2),
         }
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Return where the arrows are."""
+        x, y, _ = self.poses(now.q, xp)["forearm"]
+        return {"shoulder": (0.0, 0.0, 0.0, now.share.shoulder), "elbow": (x, y, 0.0, now.share.elbow)}
 
     @staticmethod
     def _link(length: float) -> list[Shape]:

@@ -8,19 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from lag_envs.scenes import Acrobot
+from lag_envs.scenes.shapes import Bodies, Line, outlines
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
-
-_USABLE = {
-    "mass_1": (1e-2, 1e2),
-    "mass_2": (1e-2, 1e2),
-    "length_1": (0.05, 1e1),
-    "length_2": (0.05, 1e1),
-    "damping": (0.0, 1e1),
-    "dry_friction": (0.0, 1.0),
-    "gravity": (0.0, 1e2),
-}
 
 
 def _angles(after: Any, xp: Any) -> dict[str, Any]:
@@ -114,7 +105,6 @@ class AcrobotExact(Task):
     }
     scene: Any = Acrobot
     defaults = {"inertia_1": 1.0, "inertia_2": 1.0, "gravity": 9.8}
-    usable = _USABLE
     interval, steps = 0.2, 500
     action = {"elbow_torque": [-1.0, 0.0, 1.0]}
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.1)
@@ -162,6 +152,15 @@ class AcrobotExact(Task):
         """Tell whether the tip is a link's length above the pivot."""
         return -xp.cos(after.theta_1) - xp.cos(after.theta_1 + after.theta_2) > 1.0
 
+    def bodies(self) -> Bodies:
+        """Add the line that the tip is to pass."""
+        wide = 1.1 * (self.scene.length_1 + self.scene.length_2)
+        return {"line": [Line([(-wide, 0.0), (wide, 0.0)], "target")], **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the line is."""
+        return {**super().indicators(now, xp), "line": (0.0, self.scene.length_1, 0.0)}
+
 
 class AcrobotReal(Task):
     """Swing two links of a real machine up by a motor at the elbow, and hold them upright.
@@ -205,7 +204,6 @@ class AcrobotReal(Task):
 
     ## Arguments
 
-    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
     Inertias are about the centres of mass, those of the project's files about the joints. The shoulder's
     identified friction is `damping=0.001` and `dry_friction=0.16`, the elbow's `damping_2=0.001` and
     `dry_friction_2=0.12`; with `rotor_inertia=0` and without any friction it is the project's simulation.
@@ -257,7 +255,6 @@ class AcrobotReal(Task):
         "gear_ratio": 6.0,
         "gravity": 9.81,
     }
-    usable = _USABLE
     interval, steps = 0.002, 5000
     action = {"elbow_torque": 6.0}
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.05)
@@ -337,6 +334,17 @@ class AcrobotReal(Task):
     def reached(self, after: Any, target: Any, xp: Any) -> Any:
         """Tell whether the tip is up."""
         return self.tip(after, xp) > self.high
+
+    def bodies(self) -> Bodies:
+        """Add the upright links."""
+        shapes = self.scene.bodies()
+        upright = {f"upright {name}": outlines(shapes[name]) for name in ("first", "second")}
+        return {**upright, **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the upright links are."""
+        added = {"upright first": (0.0, 0.0, math.pi), "upright second": (0.0, self.scene.length_1, math.pi)}
+        return {**super().indicators(now, xp), **added}
 
 
 class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of both)

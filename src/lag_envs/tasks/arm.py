@@ -45,7 +45,8 @@ class Reach(Task):
 
     ## Arguments
 
-    Any combination of values in these ranges is allowed. Anything else is an error that names the value.
+    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that names
+    them; the state is kept then.
 
     ## Equations
 
@@ -82,15 +83,6 @@ class Reach(Task):
     }
     scene: Any = TwoLinkArm
     defaults = {"damping": 0.05}
-    usable = {
-        "mass_1": (0.1, 1e1),
-        "mass_2": (0.1, 1e1),
-        "length_1": (0.1, 2.0),
-        "length_2": (0.1, 2.0),
-        "load": (0.0, 1e1),
-        "damping": (0.0, 1e1),
-        "gravity": (0.0, 1e2),
-    }
     interval, steps = 0.02, 200
     action = {"shoulder": 8.0, "elbow": 3.0}
     start = {"theta_1": (-0.5 * math.pi, 0.3), "theta_1_dot": 0.1, "theta_2": 0.3, "theta_2_dot": 0.1}

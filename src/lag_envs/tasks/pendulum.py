@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lag_envs.scenes import Pendulum
+from lag_envs.scenes.shapes import Bodies, outlines
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Optimum
@@ -20,7 +21,21 @@ def wrapped(cosine: Any, sine: Any, xp: Any) -> Any:
     return xp.where(steep, quarter - slope, slope + xp.where(cosine < 0.0, 2.0 * quarter, 0.0))
 
 
-class PendulumExact(Task):
+class _Rod(Task):
+    """What the tasks have in common: the rod is to stand."""
+
+    scene: Any = Pendulum
+
+    def bodies(self) -> Bodies:
+        """Add the upright rod."""
+        return {"upright": outlines(self.scene.bodies()["rod"]), **super().bodies()}
+
+    def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
+        """Add where the upright rod is."""
+        return {**super().indicators(now, xp), "upright": (0.0, 0.0, 0.0)}
+
+
+class PendulumExact(_Rod):
     """Swing a rod up by a weak torque and hold it: Gymnasium's Pendulum-v1, stepped exactly.
 
     ## Description
@@ -145,7 +160,7 @@ class PendulumExact(Task):
         return 2.0 * math.sqrt(pull)
 
 
-class PendulumRegret(Task):
+class PendulumRegret(_Rod):
     """Swing a rod up by a weak torque in a task whose optimal policy and value are known exactly.
 
     ## Description
