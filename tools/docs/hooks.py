@@ -80,7 +80,11 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links that leave the folder docs, and those of the root's files, to the site or to the source."""
+    """Fill in the names of scenes, and point links that leave the folder docs to the site or to the source."""
+    from lag_envs.scenes import SCENES
+
+    names = ", ".join(sorted(kind.__name__ for kind in SCENES))
+    markdown = markdown.replace("members: SCENES\n", f"members: [{names}]\n")
     at_root = {place: name for name, place in ROOT_FILES.items()}
     here = at_root.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
