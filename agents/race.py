@@ -153,8 +153,9 @@ def told(row: dict[str, Any]) -> str:
 
 def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the cells of the table: for each learner and level how many reached it, and when."""
-    cells = [("", "level", "reached", "steps", "s", "s on the processor", "relative")]
     names = list(dict.fromkeys(row["algo"] for row in rows))
+    last = f"of {label(names[-1])}'s"
+    cells = [("", "level", "reached", "steps", "s", "s on the processor", last)]
     for level in LEVELS:
         slowest = _median([row for row in rows if row["algo"] == names[-1]], level, 2)
         for name in names:

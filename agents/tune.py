@@ -223,7 +223,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\nStopped. What was tried is kept; re-run the command to resume.", file=sys.stderr)
             return 130
         print("\n" + "\n".join(columns(ranked(data))))
-        print(f"{pace(data):,.0f} steps per second of the processor. Written to {file}")
+        hours = 5 * 5e6 / pace(data) / 3600.0
+        print(
+            f"{pace(data):,.0f} steps in a second of the processor, {hours:.2f} h for five seeds of 5M steps"
+        )
+        print(f"Written to {file}")
         return 0
     if args.only not in (None, *known):
         there = hint(args.only, known, "" if known else "there is nothing to tune")

@@ -19,10 +19,12 @@ from agents import learners, ppo, race, submit, train, tune
 from agents.learners import hyperparameters, load_policy
 from agents.run import CHECKPOINT, MODEL, RESULT, Run, UserError, fresh_seeds
 from lag_envs.evaluation.rollout import play
+from lag_envs.leaderboard.export import ExportError, arrays_of, export, find
+from lag_envs.leaderboard.policies import architecture
 from lag_envs.leaderboard.submission import load
 from lag_envs.scenes import Scene
 from lag_envs.scores import score
-from lag_envs.tasks import Task, pivoted_bar
+from lag_envs.tasks import Task, arm, cart_pole, pendulum, pivoted_bar
 
 ROOT = Path(__file__).parents[1]
 ENV = pivoted_bar.SwingUpFree.id
@@ -362,6 +364,25 @@ def test_five_seeds_are_a_submission(tmp_path):
     ours = load_policy(tmp_path / "runs" / ENV / ppo.NAME / "seed2")
     theirs = dict(load(tmp_path / "out").policies)[2].agent()
     np.testing.assert_allclose(ours.predict(seen)[0], theirs.predict(seen)[0], atol=1e-6)
+    # A file alone does not tell how long it was trained.
+    file = tmp_path / "runs" / ENV / ppo.NAME / "seed2" / MODEL
+    with pytest.raises(ExportError, match="not known how long it was trained; --env-steps tells"):
+        export(find([file]), tmp_path / "other", authors=["A"], license="MIT", env=ENV, seconds=1.0)
+
+
+@pytest.mark.parametrize("task", [pendulum.PendulumExact, cart_pole.CartPoleExact, arm.Reach])
+def test_networks_of_any_actions_act_alike_on_the_leaderboard(task, tmp_path):
+    """Actions beyond 1, actions from a list, two actions."""
+    rng, formulas, wide = np.random.default_rng(0), task().formulas, len(task().observation)
+    outputs, file = sum(formulas.choices) or formulas.actions, tmp_path / MODEL
+    draw = lambda *size: rng.normal(size=size).astype(np.float32)  # noqa: E731
+    layers = [(draw(8, wide), draw(8)), (draw(outputs, 8), draw(outputs))]
+    ppo.Policy(layers, formulas.choices, formulas.largest).save(file)
+    table, arrays = arrays_of(file)
+    theirs, seen = architecture(task.id, table).agent(arrays), draw(200, wide)
+    ours = ppo.Policy.load(file).predict(seen)[0]
+    np.testing.assert_allclose(ours, theirs.predict(seen)[0], atol=1e-5)
+    assert np.ptp(ours) >= formulas.largest
 
 
 def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
@@ -383,7 +404,7 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     assert [[r["seed"] for r in s["runs"]] for s in second] == [[0, 1]] * 3
     assert [s["runs"][0] for s in second[:2]] == [s["runs"][0] for s in first]
     best = max(second, key=lambda s: sum(r["return"] for r in s["runs"]))
-    assert output.splitlines()[-4].split()[0] == str(best["number"])  # below the head, above the last line
+    assert output.splitlines()[-5].split()[0] == str(best["number"])  # the row below the head
     given[6] = "512"
     assert (
         tune.main(given) == 2 and "is of a search with steps 256; choose another" in capsys.readouterr().err

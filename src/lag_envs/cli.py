@@ -791,7 +791,8 @@ examples:
         "export",
         "turn a trained model into a submission",
         """Turn models of Stable-Baselines3 into a submission to the leaderboard, which is data only, and
-prove that both act alike. Loading a model runs code, so export your own only.
+prove that both act alike. Loading a model runs code, so export your own only. Networks that
+`python -m agents.ppo` left are data already, and are taken as they are.
 
 examples:
   lag-envs export runs/PivotedBar-v0/ppo --author "A. Author" --license MIT    all seeds of a training here
