@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array
+from lag_envs.controllers.basic import Array, ObservationDecoder
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import regulator
+from lag_envs.controllers.mpc import MPC
 from lag_envs.controllers.tracking import Tracking, hold, recorded
+from lag_envs.tasks.base import Task
 from lag_envs.tasks.chain import SwingUp
 
 
@@ -39,6 +41,7 @@ def easier(
 
     class Easier(kind):  # type: ignore[misc]
         id = ""
+        draws, kick = 0, Task.kick
         largest = share * task.largest
 
         def guard(self, wanted: Any, before: Any, dt: Any, xp: Any) -> Any:
@@ -62,24 +65,27 @@ def easier(
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:
-    """Return an iLQR that plans each episode anew.
-
-    It begins from what two recorded plans and their mirror images would do: the one that is followed from any
-    start, and a quick one that leaves nothing for corrections.
+    """Return an iLQR that plans each episode anew, from what a recorded plan and its mirror image would do.
 
     Parameters
     ----------
     task : SwingUp
         The task, ``env.unwrapped.task``.
     guesses : sequence of Tracking, optional
-        What to begin from in place of that.
+        What to begin from; by default a plan that was recorded with the full control.
     beyond : float
         How far to plan, in lengths of the longest of them.
     """
     if not guesses:
-        own = [recorded(task), recorded(task, "quick")]
-        guesses = [one for plan in own for one in (plan, plan.mirrored())]
-    read, rest = guesses[0].read, np.array(task.plans.rest)
+        quick = recorded(task, "quick")
+        guesses = [quick, quick.mirrored()]
+    ahead = round(beyond * max(len(plan.actions) for plan in guesses))
+    return ILQR(task, guesses, after=hold(task), tail=loss(task), steps=ahead)
+
+
+def loss(task: SwingUp) -> Callable[[Array], Array]:
+    """Return what the best regulator loses of the reward from states on, near upright."""
+    read, rest = ObservationDecoder(task), np.array(task.plans.rest)
     # The reward does not mind where on the track the bars stand; something has to call the support back.
     _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
 
@@ -87,5 +93,35 @@ def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1
         off = read.difference(states, rest)
         return np.einsum("...i,ij,...j->...", off, cost, off)
 
-    ahead = round(beyond * max(len(plan.actions) for plan in guesses))
-    return ILQR(task, guesses, after=hold(task), tail=lost, steps=ahead)
+    return lost
+
+
+def anywhere(
+    task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 4.0, **numbers: Any
+) -> MPC:
+    """Return an MPC that plans at the start and after each kick, and leaves the hold to a regulator.
+
+    Parameters
+    ----------
+    task : SwingUp
+        The task, ``env.unwrapped.task``.
+    horizon : int
+        Steps to plan ahead.
+    good : float
+        Loss after its end below which a plan counts as good.
+    near : float
+        Loss below which the regulator is in charge.
+    **numbers
+        Others of `MPC`.
+    """
+    lost = loss(task)
+    return MPC(
+        task,
+        lost,
+        horizon=horizon,
+        good=good,
+        easier=easier(task, effort=0.05, share=1.0, edge=0.95),
+        hold=hold(task),
+        holds=lambda states: lost(states) < near,
+        **({"every": horizon, "iterations": 6} | numbers),
+    )

@@ -112,7 +112,7 @@ class Tracking(Clocked):
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
         """Return the actions."""
         steps = len(self.actions)
-        step = np.minimum((taken + 1e-6).astype(np.int64), steps)  # the margin: see `Clocked.pace`
+        step = np.minimum(taken + 1e-6, steps).astype(np.int64)  # the margin: see `Clocked.pace`
         share = np.clip(taken - step, 0.0, 1.0)[:, None]
         following = np.minimum(step + 1, steps)
         planned = self.states[step] + share * (self.states[following] - self.states[step])

@@ -17,37 +17,37 @@ class _Chain(Support):
     """What the tasks with chains have in common."""
 
     scene: Any
+    #: Chance of a kick per interval, and its largest size [rad/s].
+    kick_chance, largest_kick = 0.01, 0.0
 
     @property
     def angles(self) -> list[str]:
         """Names of the angles, from the support on."""
         return list(self.scene.coordinates)
 
-    def fastest_turn(self, start: float = FASTEST_START, kick: float = 0.0) -> float:
+    def fastest_turn(self) -> float:
         r"""Return a bound on the rates of the angles [rad/s].
 
         Let W be kinetic plus potential energy in the support's frame, at least 0, and M the mass of all bars.
         The frame's acceleration u adds the power -u Σ m x' ≤ U √(2 M W), and damping takes some, so √W
         grows by U √(M/2) a second at most. A kick of the last bar's rate by k adds at most k √(J/2) to it, J
         being the bar's moment of inertia about its joint. Each bar's turning is a part of W, I θ'²/2 ≤ W.
-
-        Parameters
-        ----------
-        start : float
-            Largest rate at the start [rad/s].
-        kick : float
-            Largest change of the last bar's rate between two steps [rad/s].
         """
         scene = self.scene
         if scene.inertia == 0.0:
             return math.inf
         arms = [i * scene.length + scene.com_distance for i in range(scene.bars)]
-        turning = 0.5 * start**2 * sum(scene.mass * arm**2 + scene.inertia for arm in arms)
+        turning = 0.5 * FASTEST_START**2 * sum(scene.mass * arm**2 + scene.inertia for arm in arms)
         fall = 2.0 * scene.mass * scene.gravity * sum(arms)
         pushed = self.largest * math.sqrt(0.5 * scene.bars * scene.mass) * self.duration
         about_joint = scene.inertia + scene.mass * scene.com_distance**2
-        kicked = kick * math.sqrt(0.5 * about_joint) * self.limit
+        kicked = self.largest_kick * math.sqrt(0.5 * about_joint) * self.limit
         return (math.sqrt(turning + fall) + pushed + kicked) * math.sqrt(2.0 / scene.inertia)
+
+    def push(self, draws: Any, xp: Any) -> dict[str, Any]:
+        """Return a kick of the last bar's rate to either side, which comes now and then."""
+        size = self.largest_kick * (2.0 * draws[1] - 1.0)
+        return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(self.kick_chance), size, 0.0)}
 
     def bodies(self) -> Bodies:
         """Add the upright chain."""
@@ -264,6 +264,100 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
 
 
+class SwingUpAnywhere(SwingUp):
+    """Swing a double pendulum up from anywhere, and keep it up against kicks.
+
+    ## Description
+
+    Two uniform bars, one hinged to the end of the other, start at any angles, moving. Bring them upright by
+    moving their support, and back again whenever a kick has thrown them over. No recorded plan fits more than
+    a few of the starts.
+
+    ## Action Space
+
+    `Box(-1, 1, (1,), float32)`. Values outside are clipped. The control is held for one step.
+
+    The support must be able to stop inside the track, braking at U, the largest acceleration. Where the
+    wanted acceleration would make that impossible, the nearest one that does not is applied.
+    `env.unwrapped.control` tells which.
+
+    ## Observation Space
+
+    The bounds are proved for every start that is accepted, even with a kick in every step.
+
+    ## Rewards
+
+    Each step pays h⁴ - 0.02 (u/U)², taken at the step's end and before a kick. The height h of the chain's
+    end is 0 hanging and 1 upright; u is the acceleration that was applied. With another `dt` rewards are
+    scaled by dt/0.02, so a second is always worth the same.
+
+    ## Starting State
+
+    The angles are anything, and the bars move. Starts from which the support cannot stop inside the track are
+    refused. The half width of s is a tenth of the track's.
+
+    After each step, with probability 0.005 (1 - 0.995^(dt/0.02) for another `dt`), a kick changes the last
+    bar's rate by a uniform amount within ±1 rad/s.
+
+    ## Episode End
+
+    Termination: never. The ends of the track are guarded, as described above.
+
+    ## Arguments
+
+    `track=math.inf` is a track without an end; the observation then divides s by 0.5 m. `bars` changes the
+    state and the spaces.
+
+    ## Equations
+
+    The drive is strong enough to move the support as commanded: the bars do not act back on it.
+
+    ## Signs and Units
+
+    SI units. Angles are against straight down, not against the bar above: θ = 0 hangs and θ = π stands. They
+    grow counter-clockwise and are not wrapped. s is positive to the right and 0 in the middle of the track.
+
+    ## Numerical Accuracy
+
+    s and s' are exact to rounding. The last bar whips: a step is divided where one series would not converge.
+
+    ## Known Returns
+
+    The optimum is not known. It depends on the kicks.
+
+    ## Version History
+
+    - v0: first version (lag_envs 0.2.0).
+    """
+
+    id = "DoubleBarAnywhere-v0"
+    draws = 2
+    kick_chance, largest_kick = 0.005, 1.0
+
+    controllers = {
+        "LQR": Controller("lag_envs.controllers.tracking:hold"),
+        "MPC": Controller("lag_envs.controllers.chain:anywhere", plans=True),
+    }
+    difficulty = (
+        "No two episodes need the same swing-up, so one has to be found each time, by planning or by a "
+        "policy that knows all of them; and kicks throw the bars over when they stand."
+    )
+    note = """
+Best known is planning on the exact model, anew at the start and whenever a kick has spoilt the plan. Holding
+alone works only once the bars happen to come by upright slowly.
+"""
+
+    @property
+    def start(self) -> Mapping[str, float]:
+        """At any angles, moving, near the middle of the track."""
+        rates = {f"{name}_dot": 3.0 for name in self.angles}
+        return {**self.start_of_support(), **dict.fromkeys(self.angles, math.pi), **rates}
+
+    def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
+        """Change the last bar's rate, now and then."""
+        return self.push(draws, xp)
+
+
 class Balance(_Chain):
     """Keep a double pendulum upright against kicks by moving its support.
 
@@ -430,9 +524,8 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
         return {"episodes that last 10 s [%]": 100.0 * float((played.steps == self.limit).mean())}
 
     def kick(self, after: Any, draws: Any, xp: Any) -> Mapping[str, Any]:
-        """Change the last bar's rate by up to 1 rad/s to either side, now and then."""
-        size = self.largest_kick * (2.0 * draws[1] - 1.0)
-        return {f"{self.angles[-1]}_dot": xp.where(draws[0] < self.chance(0.01), size, 0.0)}
+        """Change the last bar's rate, now and then."""
+        return self.push(draws, xp)
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return s, s', the angles from upright, and their rates."""
@@ -442,7 +535,7 @@ The LQR is tuned for small deviations; feedback whose gains were searched for di
     def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation; each step may have a kick."""
         slide = FASTEST_START + self.largest * self.duration
-        turn = self.fastest_turn(kick=self.largest_kick)
+        turn = self.fastest_turn()
         found = {"s": self.scene.track + slide * self.dt, "s_dot": slide}
         for i, name in enumerate(self.angles):
             found |= {f"e_{i + 1}": self.largest_angle + turn * self.dt, f"{name}_dot": turn}

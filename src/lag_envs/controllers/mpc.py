@@ -1,0 +1,195 @@
+"""Model-predictive control: plan on the exact model, and anew whenever something else has happened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
+from lag_envs.controllers.ilqr import ILQR, SHARES
+from lag_envs.controllers.tracking import waves
+from lag_envs.envs.model import Model
+from lag_envs.tasks.base import Task
+
+Tail = Callable[[Array], Array]
+
+
+class Ahead(NamedTuple):
+    """What is planned: for each episode its step, and for each of its steps state, action and gain."""
+
+    step: NDArray[np.intp]  # (n,)
+    wait: NDArray[np.intp]  # (n,), steps until it may search again
+    states: Array  # (n, horizon, n_state)
+    actions: Array  # (n, horizon)
+    gains: Array  # (n, horizon, n_state)
+
+
+class MPC:
+    """Plan ahead on the exact model, follow the plan, and plan anew every few steps or after a surprise.
+
+    A new plan begins from the rest of the old one, which is followed with its feedback and improved by a few
+    iterations of iLQR. If it still ends badly, as one does at first and after hard kicks, plans are searched
+    for from random guesses. That kicks come at random is left aside.
+
+    Parameters
+    ----------
+    task : Task
+        The task that is controlled, with one control.
+    tail : callable, optional
+        What the end of a plan costs, from states (n, n_state) to numbers (n,).
+    horizon : int
+        Steps to plan ahead.
+    every : int
+        Steps after which a plan is renewed.
+    iterations : int
+        Iterations of iLQR that this may take.
+    budget : int
+        Steps of the model that a search may take.
+    guesses : int
+        How many guesses a search improves.
+    good : float
+        Cost of the end below which a plan counts as good. By default there is one search, at the start.
+    pause : int
+        Steps from one search to the next, at least.
+    surprise : float
+        Deviation of an entry of the state from the plan that counts as a surprise.
+    easier : (Task, callable), optional
+        A task that searches are made on, and what the end costs there: see `Plans.place`.
+    hold : Tracking, optional
+        Feedback with which a plan is continued beyond its end, and who acts where `holds`.
+    holds : callable, optional
+        Where no plan is needed, from states (n, n_state) to booleans (n,).
+    seed : int
+        Seed of the guesses.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        tail: Tail | None = None,
+        *,
+        horizon: int = 50,
+        every: int = 1,
+        iterations: int = 2,
+        budget: int = 200_000,
+        guesses: int = 16,
+        good: float = np.inf,
+        pause: int = 10,
+        surprise: float = 1e-3,
+        easier: tuple[Task, Tail | None] | None = None,
+        hold: Any = None,
+        holds: Callable[[Array], NDArray[np.bool_]] | None = None,
+        seed: int = 0,
+    ) -> None:
+        for name, number in (
+            ("horizon", horizon),
+            ("every", every),
+            ("guesses", guesses),
+            ("budget", budget),
+        ):
+            if number < 1:
+                raise ValueError(f"{name} must be at least 1, got {number}")
+        self.task, self.horizon, self.every = task, horizon, min(every, horizon)
+        self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
+        self.hold, self.holds, self.tail = hold, holds, tail
+        self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
+        calm = without_kicks(task)
+        self.model = Model(calm)
+        self.planner = ILQR(calm, [], tail=tail, steps=horizon, iterations=iterations)
+        self.polisher = ILQR(calm, [], tail=tail, steps=horizon, iterations=5 * iterations)
+        searched, end = easier or (calm, tail)
+        rounds = max(budget // (guesses * horizon * len(SHARES)), 1)
+        self.searcher = ILQR(searched, [], tail=end, steps=horizon, iterations=rounds, tolerance=1e-2)
+        self.share = float(searched.limit_control / task.limit_control)
+
+    def predict(
+        self,
+        observation: NDArray,
+        state: Ahead | None = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[np.float32], Ahead]:
+        """Return the action for each observation; the state holds the plans."""
+        values = np.asarray(observation)
+        x, targets = self.read(values.reshape(-1, values.shape[-1]))
+        n, width = x.shape
+        fresh = np.ones(n, np.bool_) if state is None else np.zeros(n, np.bool_)
+        if episode_start is not None:
+            fresh |= np.asarray(episode_start, np.bool_).reshape(n)
+        if state is None:
+            shape = n, self.horizon, width
+            blank = np.zeros(n, np.intp)
+            state = Ahead(blank, blank, np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape))
+        plan = Ahead(*(array.copy() for array in state))
+        plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
+        plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = 0.0, 0.0, x[fresh, None]
+        rows, held = np.arange(n), np.zeros(n, np.bool_) if self.holds is None else self.holds(x)
+        now = np.minimum(plan.step, self.horizon - 1)
+        off = np.abs(self.read.difference(x, plan.states[rows, now])).max(axis=1)
+        renewed = ~held & (fresh | (plan.step >= self.every) | (off > self.surprise))
+        if renewed.any():
+            self._renew(plan, np.flatnonzero(renewed), x, targets, fresh)
+        now = np.minimum(plan.step, self.horizon - 1)
+        off = self.read.difference(x, plan.states[rows, now])
+        action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
+        if held.any():
+            action = np.where(held, self.hold.act(x, targets, np.full(n, np.inf)), action)
+        plan.step[:] = np.where(held, self.horizon, plan.step + 1)
+        return as_actions(action.reshape(values.shape[:-1])), plan
+
+    def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
+        """Plan anew for some of the episodes."""
+        guess = self._continued(plan, rows, x[rows], targets[rows])
+        found, value = self.planner.improve(x[rows], targets[rows], guess)
+        bad = (fresh[rows] | self._ends_badly(found.states, found.actions, targets[rows])) & (
+            plan.wait[rows] == 0
+        )
+        if bad.any():
+            those = rows[bad]
+            plan.wait[those] = self.pause
+            other, gain = self._search(x[those], targets[those])
+            better = np.flatnonzero(bad)[gain > value[bad]]
+            for name in ("states", "actions", "gains"):
+                getattr(found, name)[better] = getattr(other, name)[gain > value[bad]]
+        for name in ("states", "actions", "gains"):
+            getattr(plan, name)[rows] = getattr(found, name)
+        plan.step[rows] = 0
+
+    def _continued(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array) -> Array:
+        """Return the actions (n, horizon) when plans are followed to their ends, and held there."""
+        actions = np.zeros((len(rows), self.horizon))
+        for t in range(self.horizon):
+            step = plan.step[rows] + t
+            now = np.minimum(step, self.horizon - 1)
+            off = self.read.difference(x, plan.states[rows, now])
+            action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
+            after = 0.0 if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
+            actions[:, t] = np.clip(np.where(step < self.horizon, action, after), -1.0, 1.0)
+            x, _, _ = self.model(x, actions[:, t], self.planner._goals(targets, (len(x),)))
+        return actions
+
+    def _ends_badly(self, states: Array, actions: Array, targets: Array) -> NDArray[np.bool_]:
+        """Return which plans end badly."""
+        if self.tail is None:
+            return np.zeros(len(states), np.bool_)
+        return self.tail(self.planner._step(states[:, -1], actions[:, -1], targets)[0]) > self.good
+
+    def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
+        """Return the best of plans from random guesses, and what it is worth."""
+        n, m = len(x), self.guesses
+        guesses = waves(self.rng, n * m, self.horizon, self.task.dt)
+        found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m), guesses)
+        best = values.reshape(n, m).argmax(axis=1) + m * np.arange(n)
+        return self.polisher.improve(x, targets, self.share * found.actions[best])
+
+
+def without_kicks(task: Task) -> Task:
+    """Return the same task without random kicks."""
+    if not task.draws:
+        return task
+    calm = object.__new__(type(type(task).__name__, (type(task),), {"id": "", "draws": 0, "kick": Task.kick}))
+    vars(calm).update({name: value for name, value in vars(task).items() if name != "formulas"})
+    return calm
