@@ -487,3 +487,22 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
 def test_scripts_refuse_them():
     with pytest.raises(FormulaError, match=r"SwingUp has hidden parameters or imperfect .*None"):
         Unfused(make_task(ID, **ALL))
+
+
+@slow
+def test_pictures_show_the_drawn_parameters():
+    keywords = {"randomize": {"com_distance": (0.5, 2.0)}, "duration": 0.5}
+    drawn = gym.make(ID, render_mode="rgb_array", **keywords)
+    drawn.reset(seed=1)
+    shown = []
+    for _ in range(2):
+        start = {"state": [0.0, 0.0, 0.5, 0.0]}
+        drawn.reset(options=start)
+        made = gym.make(ID, render_mode="rgb_array", duration=0.5, **drawn.unwrapped.parameters)
+        made.reset(options=start)
+        shown.append(drawn.render())
+        assert np.array_equal(shown[-1], made.render())
+    assert not np.array_equal(*shown)
+    envs = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", **keywords)
+    envs.reset(seed=1, options={"state": np.tile([0.0, 0.0, 0.5, 0.0], (2, 1))})
+    assert not np.array_equal(*envs.render())

@@ -147,13 +147,8 @@ class Viewer:
         look: tuple[bool, float, bool] = Look(),
         size: tuple[int, int] = (WIDTH, HEIGHT),
     ) -> None:
-        self._task, self._look, self._size = task, Look(*look), size
-        self._picture = Picture(task)
-        self._pen = Pen(self._picture, size, STRIP if self._look.readout else 0)
-        self._forces = Forces(task, self._picture) if self._look.arrows else None
-        self._scale = _scale(task) if self._look.readout else None
-        #: Points of each body whose way is shown, and where they were.
-        self._tips = tips(self._picture) if self._look.trail else {}
+        self._look, self._size = Look(*look), size
+        self.use(task)
         self._trail: deque[list[Point]] = deque(maxlen=max(2, round(self._look.trail / task.dt) + 1))
         self._turned: Any = 0.0
         self._before: tuple[list[float], NDArray[np.float64]] | None = None
@@ -164,6 +159,15 @@ class Viewer:
             _pygame()
         if self._human:
             _desk.add(self)
+
+    def use(self, task: Task) -> None:
+        """Show another task from now on: one of the same class with other parameters."""
+        self._task, self._picture = task, Picture(task)
+        self._pen = Pen(self._picture, self._size, STRIP if self._look.readout else 0)
+        self._forces = Forces(task, self._picture) if self._look.arrows else None
+        self._scale = _scale(task) if self._look.readout else None
+        #: Points of each body whose way is shown; `_trail` has where they were.
+        self._tips = tips(self._picture) if self._look.trail else {}
 
     def draw(
         self,

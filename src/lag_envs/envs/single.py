@@ -222,7 +222,11 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         if self._viewer is None:
             from lag_envs.envs.rendering import Viewer
 
-            self._viewer = Viewer(self.task, self.render_mode, self._look)
+            self._viewer = Viewer(self.drawn_task, self.render_mode, self._look)
+            self._viewed = self.drawn_task
+        if self._viewed is not self.drawn_task:
+            self._viewed = self.drawn_task
+            self._viewer.use(self._viewed)
         steps = int(self._rows[self._row["n"]])
         episode = int(self._ids[2])
         return self._viewer.draw(self.state, self.control, self.target, steps, self._total, episode)
@@ -368,7 +372,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and windows."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_program")}
+        return {
+            k: v for k, v in self.__dict__.items() if k not in ("_step", "_viewer", "_viewed", "_program")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""

@@ -85,6 +85,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     (3, 5)
     """
 
+    #: Drawn parameters that viewers show, by environment.
+    _viewed: dict[int, dict[str, float]]
     _viewers: tuple[Any, ...] = ()  # there even where __init__ fails and Gymnasium closes what it made
 
     def __init__(
@@ -300,7 +302,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._started:
             raise ResetNeeded("call reset() before render(): no episode has begun")
         if not self._viewers:
-            self._viewers = self._make_viewers()
+            self._viewers, self._viewed = self._make_viewers(), {}
+        self._use_drawn()
         targets = self.target if self.target is not None else [None] * self.num_envs
         of_each = (self.state, self.control, targets, self._steps.tolist(), self._totals.tolist())
         episodes = self._ids[2 * self.num_envs :].tolist()
@@ -451,6 +454,16 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             for task in self._tasks[: self._tiles or self.num_envs]
         )
 
+    def _use_drawn(self) -> None:
+        """Let the viewers show the parameters that were drawn."""
+        drawn = self.parameters
+        if drawn:
+            for i, viewer in enumerate(self._viewers):
+                values = {name: float(column[i]) for name, column in drawn.items()}
+                if self._viewed.get(i) != values:
+                    self._viewed[i] = values
+                    viewer.use(self._tasks[i].varied(**values))
+
     def _count(self, rewards: NDArray[np.float64]) -> None:
         """Note how far the episodes have come."""
         begun = self._read("n") == 0.0
@@ -553,7 +566,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out compiled functions and pictures."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_row")}
+        return {
+            k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_viewed", "_row")
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
