@@ -118,10 +118,11 @@ def test_another_process_goes_on_with_the_same_bits(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("keywords", [{}, {"randomize": {"gravity": (0.5, 1.0)}}], ids=str)
 @pytest.mark.parametrize("env_id", covering())
-def test_every_environment(env_id):
-    for make in (gym.make, lambda id: gym.make_vec(id, num_envs=3)):
-        env = make(env_id)
+def test_every_environment(env_id, keywords):
+    for make in (gym.make, lambda id, **given: gym.make_vec(id, num_envs=3, **given)):
+        env = make(env_id, **keywords)
         env.reset(seed=2)
         try:
             go_on(env, 50)

@@ -1,7 +1,8 @@
 """Programs of environments with hidden parameters, imperfect sensors or actuators.
 
-What the keywords mean is told in docs/usage.md; `lag_envs.tasks.imperfections` checks them. A control step is
-taken by one function on the rows of one environment. The single environment calls it on its own rows, a batch
+What the keywords mean is told in docs/usage.md; `lag_envs.tasks.imperfections` checks them. Parameters that
+are drawn are rows of a batch as those that differ in any batch are (`DrawnProgram`). With everything else
+(`ImperfectProgram`) a control step is taken by one function on the rows of one environment. The single environment calls it on its own rows, a batch
 on those of each environment in turn, so both have the same bits. Within the step the command in force may
 change, and what a late sensor shows may lie in its midst: it is divided there, and nowhere else.
 
@@ -37,7 +38,7 @@ from lag_envs.stepping.flows import split
 from lag_envs.stepping.tracing import Number
 from lag_envs.stepping.twofold import two_product, two_sum
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.imperfections import seen_box
+from lag_envs.tasks.imperfections import Imperfections, seen_box
 
 #: What has draws of its own, by the number that its key is made with.
 PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
@@ -85,51 +86,100 @@ def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
     if task.drawn:
         key = (*key, task.drawn.inner.formulas.key, *task.drawn.made)
     if key not in _programs:
-        _programs[key] = ImperfectProgram(task, absent, varying)
+        only_drawn = Imperfections(drawn=task.imperfections.drawn) == task.imperfections
+        _programs[key] = (DrawnProgram if only_drawn else ImperfectProgram)(task, absent, varying)
     return _programs[key]
 
 
-_programs: dict[tuple, ImperfectProgram] = {}
+_programs: dict[tuple, DrawnProgram] = {}
 
 
-class ImperfectProgram(Program):
-    """The compiled functions of a task with imperfections; parameters as those of `Program`.
+class DrawnProgram(Program):
+    """The compiled functions of a task whose parameters are drawn; parameters as those of `Program`.
 
-    Rows that are kept besides: drawn parameters ``p_``, the commands that the actuator's slew has reached
-    ``c``, those under way ``sent`` with the time ``at`` which each takes, observations that are still to be
-    seen ``seen``, and what was shown last ``h``.
+    The drawn parameters ``p_`` are rows, and so are the constants that follow from them. Beside that, and for
+    observations within their bounds, steps are those of any batch whose environments differ.
     """
 
     def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
         assert task.imperfections is not None
-        self.options = found = task.imperfections
-        self._absent, self._drawn = absent, task.drawn
-        source = task.drawn.inner if task.drawn else task
+        self.options = task.imperfections
         self._made = _Constants(task, absent) if task.drawn else None
+        changed = self._made.changed if self._made else []
+        self.p = [f"p_{d.name}" for d in self.options.drawn]
+        self.own = [*self.p, *self.own]
+        source = task.drawn.inner if task.drawn else task
+        super().__init__(source, absent, varying | frozenset(changed), list(numbers_of(task)))
+        self.drawn = [*self.p, *(f"k_{name}" for name in self.varying if name in changed)]
+
+    @property
+    def _printed(self) -> list[str]:
+        return [*super()._printed, *self.begin]
+
+    def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
+        super()._record(formulas, constants)
+        self._numbers = constants
+        self.begin = self._made.lines(constants) if self._made else []
+        self._bounded = [self._between(o, f"seen_low{i}", f"seen_high{i}") for i, o in enumerate(self.o)]
+        self._bound_observations()
+
+    def _bound_observations(self) -> None:
+        self.observe = [*self.observe, *self._bounded]
+
+    def _constant(self, name: str) -> str:
+        return str(self._numbers[name])
+
+    def _between(self, value: str, low: str, high: str) -> str:
+        low, high = self._constant(low), self._constant(high)
+        return f"{value} = select({value} < {low}, {low}, select({value} > {high}, {high}, {value}))"
+
+    @staticmethod
+    def _key(purpose: str) -> str:
+        return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
+
+    @property
+    def _start(self) -> list[str]:
+        draws = (f"uniform(key_parameters, np.uint64(0), np.uint64({j}))" for j in range(len(self.p)))
+        return [
+            *([f"key_parameters = {self._key('parameters')}"] if self.p else []),
+            *(f"share{j} = {draw}" for j, draw in enumerate(draws)),
+            *self.begin,
+            *super()._start,
+        ]
+
+
+class ImperfectProgram(DrawnProgram):
+    """The compiled functions of a task with imperfections; parameters as those of `Program`.
+
+    Rows that are kept besides: the commands that the actuator's slew has reached ``c``, those under way
+    ``sent`` with the time ``at`` which each takes, observations that are still to be seen ``seen``, and what
+    was shown last ``h``.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
+        found: Any = task.imperfections
+        source = task.drawn.inner if task.drawn else task
         self._lagged: Any = None
         if found.lag:
             gone = frozenset(n.removeprefix("lagged_") for n in absent if n.startswith("lagged_"))
             self._lagged = source.scene._lagged.code(gone)
-        drawn = frozenset(self._made.changed) if self._made else frozenset()
-        formulas = source.formulas
-        self.a = [f"a{i}" for i in range(formulas.actions)]
-        seen = range(len(formulas.observation))
-        self.c = [f"c{i}" for i in range(formulas.actions)] if any(found.slew) else []
-        self.p = [f"p_{d.name}" for d in found.drawn]
+        self.a = [f"a{i}" for i in range(source.formulas.actions)]
+        seen = range(len(source.formulas.observation))
+        self.c = list(map("c{}".format, range(len(self.a)))) if found.slew else []
         ring = range(found.commands if found.commands > 1 else 0)
         self.own = [
-            *self.p, *self.c, *(f"h{i}" for i in seen),
+            *self.c, *(f"h{i}" for i in seen),
             *(f"{row}_{slot}" for slot in ring for row in [*(f"sent{i}" for i in range(len(self.a))), "at"]),
             *(f"seen{i}_{slot}" for slot in range(found.readings) for i in seen),
         ]  # fmt: skip
-        super().__init__(source, absent, varying | drawn, list(numbers_of(task)))
+        super().__init__(task, absent, varying)
         self.scratch = [*self.a, *self.o, *self.held]
 
     # --- lines ----------------------------------------------------------------------------------------------
 
     @property
     def _printed(self) -> list[str]:
-        more = (self.perturb, self.sense, self.push, self.at_rest, self.begin, self.command, self.respond)
+        more = (self.perturb, self.sense, self.push, self.at_rest, self.command, self.respond)
         return [*super()._printed, *(line for part in more for line in part)]
 
     def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
@@ -137,7 +187,6 @@ class ImperfectProgram(Program):
         found = self.options
         actions, width = len(self.a), len(self.y)
         given = constants | {"dt": "h"}  # within a piece of a step, its length
-        self._numbers = constants
 
         def asked(xp: Any, *values: Any) -> Sequence:
             return formulas.wanted(xp, list(values))
@@ -176,9 +225,8 @@ class ImperfectProgram(Program):
         self._lift_end = formulas.lift("z")
         self.perturb = self._perturb(formulas)
         self.sense = self._noisy(self.o, "observation", found.observation_noise, "sigma", formulas)
-        self.sense += [self._between(f"o{i}", f"seen_low{i}", f"seen_high{i}") for i in range(len(self.o))]
+        self.sense += self._bounded
         self.push = self._pushes()
-        self.begin = self._made.lines(constants) if self._made else []
         self.respond = [f"k_{name}" for name in ("late_low", "late_high", "shown_at", "every", "push_chance")]
         if self._lagged:
             self.respond += [*self._decays, "k_lagged_order", *self._lagged_constants]
@@ -191,12 +239,8 @@ class ImperfectProgram(Program):
     def _lagged_constants(self) -> list[str]:
         return [name.replace("k_", "k_lagged_", 1) for name in self._lagged.constants]
 
-    def _constant(self, name: str) -> str:
-        return str(self._numbers[name])
-
-    def _between(self, value: str, low: str, high: str) -> str:
-        low, high = self._constant(low), self._constant(high)
-        return f"{value} = select({value} < {low}, {low}, select({value} > {high}, {high}, {value}))"
+    def _bound_observations(self) -> None:
+        """Leave what is observed as it is: what is shown follows later."""
 
     def _noisy(
         self, values: Sequence[str], purpose: str, sigma: Sequence[float], name: str, formulas: Any
@@ -241,10 +285,6 @@ class ImperfectProgram(Program):
                 for i, draw in zip(found, draws, strict=True)
             ),
         ]
-
-    @staticmethod
-    def _key(purpose: str) -> str:
-        return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
 
     # --- one environment, alone or in a batch: row r lies at f[base + r * stride] --------------------------
 
@@ -422,17 +462,17 @@ class ImperfectProgram(Program):
         """``launch(f, base, stride, par, key, state_given, target_given)``: begin an episode."""
         found, n = self.options, len(self.o)
         sent = {f"sent{i}": a for i, a in enumerate(self.a)}
+        undrawn = [row for row in self._rows_of_constants if row not in self.drawn]
         body = [
             *self._parameters,
-            *self._load_row([*self._undrawn, *self.y[: self.n_state], *self.g]),
-            *self._draw_parameters,
+            *self._load_row([*undrawn, *self.y[: self.n_state], *self.g]),
             *self._start, *self.at_rest,
             *self._fill(found.commands if found.commands > 1 else 0, {**sent, "at": "0.0"}),
             *self.observe,
             *self._fill(found.readings, {f"seen{i}": o for i, o in enumerate(self.o)}),
             *self.sense,
             *(f"{self._at(f'h{i}')} = o{i}" for i in range(n)),
-            *self._store_row([*self.y, *self.g, *self.u, *self.c, "n", *self.p, *self._drawn_rows]),
+            *self._store_row([*self.y, *self.g, *self.u, *self.c, "n", *self.drawn]),
         ]  # fmt: skip
         return _compiled("launch", "f, base, stride, par, key, state_given, target_given", body)
 
@@ -442,24 +482,6 @@ class ImperfectProgram(Program):
             return []
         lines = (f"    {self._at(row, 'slot')} = {value}" for row, value in values.items())
         return [f"for slot in range({slots}):", *lines]
-
-    @property
-    def _drawn_rows(self) -> list[str]:
-        return [f"k_{name}" for name in self.varying if self._made and name in self._made.changed]
-
-    @property
-    def _undrawn(self) -> list[str]:
-        return [row for row in self._rows_of_constants if row not in self._drawn_rows]
-
-    @property
-    def _draw_parameters(self) -> list[str]:
-        if not self._made:
-            return []
-        keys = f"key_parameters = {self._key('parameters')}"
-        draws = [
-            f"share{j} = uniform(key_parameters, np.uint64(0), np.uint64({j}))" for j in range(len(self.p))
-        ]
-        return [keys, *draws, *self.begin]
 
     # --- the functions of `Program` ------------------------------------------------------------------------
 

@@ -62,8 +62,9 @@ class Program:
         All constants; by default those of the task.
     """
 
-    #: Rows that are kept besides.
+    #: Rows that are kept besides, and those of them and of the constants that are set when an episode begins.
     own: Sequence[str] = ()
+    drawn: Sequence[str] = ()
 
     def __init__(
         self,
@@ -218,7 +219,7 @@ class Program:
         body = [
             *self._constants_one(), *_load(self._at_one, rows),
             *_next_episode("0", "1", "2"), *self._start, *self.observe,
-            *_store(self._at_one, [*self.y, *self.g, *self.u, "n"]),
+            *_store(self._at_one, [*self.y, *self.g, *self.u, "n", *self.drawn]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
         return _function("start_one", "f, obs, ids, state_given, target_given", body)
@@ -280,7 +281,8 @@ class Program:
 
     def _constants_one(self) -> list[str]:
         first = len(self.kept + self.scratch)
-        return [f"k_{name} = f[{first + j}]" for j, name in enumerate(self.uniform)]
+        uniform = [f"k_{name} = f[{first + j}]" for j, name in enumerate(self.uniform)]
+        return uniform + _load(self._at_one, [f"k_{name}" for name in self.varying])
 
     def _finish_one(self) -> list[str]:
         return [
@@ -376,7 +378,7 @@ class Program:
                 *_next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
                 *self.observe,
-                *_store(_at, [*y, *self.g, *self.u, "n", "over", "r", *self.o]),
+                *_store(_at, [*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
@@ -442,12 +444,13 @@ class Program:
         start = [
             "if mask[first + i] or whole:",
             *_indent([
-                *_load(_at, [*varying, *self.y, *self.g, *self.u, "n"]),
+                *_load(_at, [*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
                 "if mask[first + i]:",
                 *_indent([
                     *_next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
                 ]),
-                *self.observe, *_store(_at, [*self.y, *self.g, *self.u, "n"]), *_observations(self.o, "{}"),
+                *self.observe, *_store(_at, [*self.y, *self.g, *self.u, "n", *self.drawn]),
+                *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip
         body = [

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect import numbers_of, program_of
-from lag_envs.envs.program import SLOW, constants_of
-from lag_envs.scenes.checks import check_number, shown
+from lag_envs.envs.imperfect import ImperfectProgram, numbers_of, program_of
+from lag_envs.envs.program import SLOW
+from lag_envs.scenes.checks import StepRefused, check_number, shown
 from lag_envs.tasks import load_task
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import seen_box
@@ -350,20 +350,24 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
         program, rows = self._program, self._rows
         held = self._read(program.held)
-        if self.task.imperfections:
-            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
-        constants = constants_of(self.task)
+        if isinstance(program, ImperfectProgram):  # it has tried everything
+            raise self._refusal(held)
+        constants = numbers_of(self.task)
+        constants |= {name: rows[self._row[f"k_{name}"]] for name in program.varying}
         start = [*([np.zeros(program.room)] if program.general else []), *self._read(program.y), *held]
         *end, status = program.advance(
             *start, self.task.dt, constants["x"], *(constants[n] for n in program.advance_constants)
         )
         if status < 0:
-            raise self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
+            raise self._refusal(held)
         for name, value in zip(program.u, held, strict=True):
             rows[self._row[name]] = value
         for name, value in zip(program.z, end, strict=True):
             rows[self._row[name]] = value
         return program.finish_one(rows, observation, self._ids)
+
+    def _refusal(self, held: NDArray[np.float64]) -> StepRefused:
+        return self.task.formulas.refusal(self.state, single_number(held), self.task.dt, None, "the step")
 
     def _info(self) -> dict[str, Any]:
         if not self.diagnostics:
