@@ -412,6 +412,8 @@ def plain(value: Any) -> Any:
         return value.tolist()
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {name: plain(v) for name, v in value.items()}
     return value.value if isinstance(value, enum.Enum) else value
 
 
