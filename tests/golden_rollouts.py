@@ -102,10 +102,18 @@ class Roll:
         return self._seen(observations, zeros, zeros.astype(bool), zeros.astype(bool), infos)
 
     def step(self, actions: np.ndarray) -> dict[str, Any]:
-        """Take a step with actions of shape (n,), and return what can be seen then."""
-        if self._mode:
-            return self._seen(*self.envs.step(actions[:, None]))
-        return self._seen(*self.envs.step(actions))
+        """Take a step with shares of the largest action, shape (n,), and return what can be seen then.
+
+        Where there are choices the share is one's place among them, and of several controls every other has
+        half of it, the other way.
+        """
+        space: Any = self.envs.single_action_space if self._mode else self.envs.action_space
+        if isinstance(space, gym.spaces.Discrete):
+            places = np.floor((0.5 + 0.5 * np.clip(actions, -1.0, 1.0)) * space.n).astype(np.int64)
+            given = np.minimum(places, space.n - 1)
+        else:
+            given = actions[:, None] * np.resize(np.float32([1.0, -0.5]), space.shape) * space.high
+        return self._seen(*self.envs.step(given if self._mode else given[0]))
 
     def _seen(self, observations, rewards, terminated, truncated, infos) -> dict[str, Any]:  # type: ignore
         n = self._n
@@ -117,7 +125,7 @@ class Roll:
             "over": over.astype(np.uint8),
         }
         if self._env.target is not None:
-            seen["target"] = np.reshape(self._env.target, n)
+            seen["target"] = np.reshape(self._env.target, np.shape(self._env.target) or n)
         if "final_obs" in infos:
             last = seen["observation"].copy()
             for i in np.flatnonzero(infos["_final_obs"]):

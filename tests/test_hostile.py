@@ -22,7 +22,7 @@ from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
 #: Those that promise to work wherever in their ranges all parameters lie.
-PROMISED = [env_id for env_id in IDS if TASKS[env_id]().usable_ranges()]
+PROMISED = [i for i in IDS if any(math.isfinite(low) for low, _ in TASKS[i]().usable_ranges().values())]
 each_id = pytest.mark.parametrize("env_id", covering(PROMISED))
 
 MASKED = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])

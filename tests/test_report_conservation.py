@@ -15,6 +15,10 @@ def claims(content):
     return {claim.text: claim.holds for claim in content.claims}
 
 
+#: Those whose scene has a flow of its own.
+FORMS = [id for id in TASKS if TASKS[id]().scene._form is not None]
+
+
 def task(id, **keywords):
     return TASKS[id](**keywords)
 
@@ -74,7 +78,7 @@ def test_a_broken_balance_is_seen(runs):
     assert False in claims(content).values()
 
 
-@pytest.mark.parametrize("id", covering())
+@pytest.mark.parametrize("id", covering(FORMS))
 def test_nothing_is_carried_for_nothing(id):
     row = leave_out.carried(task(id))
     assert (row["unused"], row["idle"]) == ([], [])
@@ -92,7 +96,7 @@ def test_what_is_left_out_saves_operations():
     assert all(ns > 0 for row in rows for ns in row["ns"])
     content = leave_out.content([*rows, *leave_out.terms()], [])
     assert set(claims(content).values()) == {True}
-    assert len(content.summary.rows) == len(TASKS)
+    assert len(content.summary.rows) == len(FORMS)
     assert content.pictures[0].draw().axes
 
 
@@ -113,7 +117,7 @@ def test_cosine_and_sine_stay_a_pair(name):
 MOVED = {"chance0": 1.0, "limit": 0.5, "x": 0.01, "self_radius": 0.5, "self_shell_radius": 0.5}
 
 
-@pytest.mark.parametrize("id", covering(PERFECT))
+@pytest.mark.parametrize("id", covering(i for i in FORMS if i in PERFECT))
 def test_every_constant_changes_something(id):
     """Move each constant, 1e-3 where not said otherwise: a compiled start or step comes out differently."""
     env = gym.make(id).unwrapped

@@ -92,9 +92,10 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def terms() -> Iterator[Row]:
-    """Yield what the compiled step of every environment carries."""
+    """Yield what the compiled step of every environment with a flow of its own carries."""
     for id, task in TASKS.items():
-        yield {"kind": "terms", "id": id} | carried(task())
+        if task().scene._form is not None:
+            yield {"kind": "terms", "id": id} | carried(task())
 
 
 def carried(task: Task) -> Row:

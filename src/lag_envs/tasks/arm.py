@@ -45,8 +45,8 @@ class Reach(Task):
 
     ## Arguments
 
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that names
-    them; the state is kept then.
+    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
+    names them; the state is kept then.
 
     ## Equations
 

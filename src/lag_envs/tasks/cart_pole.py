@@ -210,8 +210,8 @@ class CartPoleContinuous(_OnTrack):
 
     ## Arguments
 
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that names
-    them; the state is kept then.
+    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
+    names them; the state is kept then.
 
     ## Equations
 
@@ -332,8 +332,8 @@ class CartPoleSwingUp(_OnTrack):
 
     ## Arguments
 
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that names
-    them; the state is kept then.
+    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
+    names them; the state is kept then.
 
     ## Equations
 

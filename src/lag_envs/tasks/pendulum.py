@@ -107,7 +107,6 @@ class PendulumExact(_Rod):
     }
     scene: Any = Pendulum
     defaults = {"gravity": 10.0}
-    usable = {"mass": (1e-2, 1e2), "length": (1e-1, 1e1), "damping": (0.0, 1e2), "gravity": (0.0, 1e2)}
     interval, steps = 0.05, 200
     action = {"torque": 2.0}
     largest_action = 2.0
@@ -151,13 +150,6 @@ class PendulumExact(_Rod):
         """Return -(θ² + 0.1 θ'² + 0.001 u²) with the state before the step."""
         angle = wrapped(xp.cos(before.theta), xp.sin(before.theta), xp)
         return -(angle * angle + 0.1 * before.theta_dot**2 + 0.001 * control.torque**2)
-
-    @property
-    def fastest(self) -> float:
-        """Speed that field and torque can add in a second [rad/s]; a bound on what a step may turn."""
-        rod = self.scene
-        pull = (0.5 * rod.mass * rod.gravity * rod.length + 2.0) / (rod.mass * rod.length**2 / 3.0)
-        return 2.0 * math.sqrt(pull)
 
 
 class PendulumRegret(_Rod):
@@ -237,7 +229,6 @@ class PendulumRegret(_Rod):
         "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
     }
     scene: Any = Pendulum
-    usable = {"mass": (1e-2, 1e2), "length": (1e-1, 1e1), "damping": (0.0, 1e2), "gravity": (1e-1, 1e2)}
     interval, steps = 0.05, 200
     scaled = False
     action = {"torque": 2.0}
