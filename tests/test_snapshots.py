@@ -15,6 +15,7 @@ from test_imperfections import ALL, ID
 
 from lag_envs.envs import snapshots
 from lag_envs.scenes import StepRefused
+from lag_envs.tasks.pivoted_bar import SwingUpFree
 
 #: The cases share a program with the tests of imperfections.
 CASES = [
@@ -141,7 +142,7 @@ OTHERS = [
     (ID, {"dt": 0.01}, "dt is 0.01 there, and 0.02 here"),
     (ID, {"duration": 3.0}, "duration is 3.0 there, and 10.0 here"),
     (ID, ALL, r"observation_noise is \(0.01, 0.0, .*\) there, and \(\) here"),
-    ("PivotedBarFree-v0", {}, "task is .*SwingUpFree' there, and .*SwingUp' here"),
+    (SwingUpFree.id, {}, "task is .*SwingUpFree' there, and .*SwingUp' here"),
     ("CylinderInCylinderPump-v0", {}, "task is .*Pump' there"),
 ]
 

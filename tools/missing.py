@@ -7,7 +7,6 @@ compare with what is kept take the environments that have it. With what lacks co
 from __future__ import annotations
 
 import json
-import re
 import sys
 from collections.abc import Iterable
 from functools import cache
@@ -16,6 +15,7 @@ from typing import Any
 
 from lag_envs.tables import columns
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import known
 
 ROOT = Path(__file__).parents[1]
@@ -65,8 +65,7 @@ def _there(what: str) -> frozenset[str]:
         case "rollouts":
             found = (name.partition("/")[0] for name in _json(ROOT / "tests" / "golden" / "runs.json"))
         case "plan":
-            files = (ROOT / "src/lag_envs/controllers/plans").glob("*.npz")
-            found = (name[0] for file in files if (name := re.match(r".+?-v\d+", file.stem)))
+            found = (env_id for env_id, task in TASKS.items() if task.plans is not None and _planned(task))
         case "value iteration":
             found = (file.stem for file in (results / "optimum").glob("*.json"))
         case "agents":
@@ -88,6 +87,15 @@ def _there(what: str) -> frozenset[str]:
 
 def _json(file: Path) -> Any:
     return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _planned(task: type[Task]) -> bool:
+    from lag_envs.controllers import build
+
+    try:
+        return all(build(task(), name) is not None for name in task.controllers)
+    except ValueError:
+        return False
 
 
 def _scales() -> Iterable[str]:

@@ -42,14 +42,11 @@ class Acrobot(Scene):
         Distances c from a link's upper joint to its centre of mass; by default half its length.
     inertia_1, inertia_2 : float [kg m²], optional
         Moments of inertia I about the centres of mass; by default those of uniform bars, ml²/12.
-    damping : float [N m s]
-        Coefficient b of the viscous friction in the shoulder.
-    damping_2 : float [N m s], optional
-        That in the elbow; by default the same.
-    dry_friction : float [N m]
-        Coefficient c of the friction c atan(100 v) in the shoulder; it reaches cπ/2.
-    dry_friction_2 : float [N m], optional
-        That in the elbow; by default the same.
+    damping, damping_2 : float [N m s]
+        Coefficients b of the viscous friction in shoulder and elbow; the second is by default the first.
+    dry_friction, dry_friction_2 : float [N m]
+        Coefficients c of the friction c atan(100 v) in shoulder and elbow, which reaches cπ/2; the second is
+        by default the first.
     rotor_inertia : float [kg m²]
         Inertia J of each motor's rotor.
     gear_ratio : float
