@@ -182,7 +182,7 @@ def test_it_learns_with_any_actions(env_id, space, own, tmp_path):
     """A second of training does more than half of what there is between idling and the best."""
     assert gym.make_vec(env_id, 2).single_action_space == space
     settings = {"n_envs": 16, "n_steps": 32, "batch_size": 128, "n_epochs": 5, "episode_share": 1.0}
-    run = make_run(tmp_path, env_id, steps=10_000, **settings)
+    run = make_run(tmp_path, env_id, steps=6_000, **settings)
     learner = ppo.Learner(env_id, ppo.Settings.of(run.hyperparameters), 0, run.steps)
     before = play(env_id, learner.policy, fresh_seeds(100)).mean()
     while learner.trained < run.steps:
@@ -419,26 +419,30 @@ def test_every_setting_that_may_be_drawn_is_one():
     assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
 
 
-def test_race_tells_when_levels_are_reached(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("names", [("fast_ppo",), pytest.param(("fast_ppo", "ppo"), marks=pytest.mark.slow)])
+def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys):
     file, picture = tmp_path / "race.jsonl", tmp_path / "race.png"
     short = lambda name, env: hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})  # noqa: E731
     monkeypatch.setattr(race, "hyperparameters", short)
     monkeypatch.setattr(race, "EPISODES", 2)
     monkeypatch.setattr(race, "LEVELS", (-9.0, 9.0))
     monkeypatch.setattr(race.workers, "processes", here)
-    given = [ENV, "--seeds", "1", "--steps", "256", "--output", str(file), "--picture", str(picture)]
-    assert race.main(given) == 0
+    given = [ENV, "--seeds", "1", "--steps", "256", "--output", str(file), "--learners", *names]
+    drawn = ["--picture", str(picture)] if len(names) > 1 else []
+    assert race.main([*given, *drawn]) == 0
     output = capsys.readouterr().out
-    assert "fast PPO, seed 0: -9 in 0.0 s, 9 never" in output and "PPO, seed 0: " in output
+    assert output.count("PPO, seed 0: -9 in 0.0 s, 9 never") == len(names)
     rows = [json.loads(line) for line in file.read_text().splitlines()]
-    assert [row["algo"] for row in rows] == ["fast_ppo", "ppo"]
+    assert [row["algo"] for row in rows] == list(names)
     for row in rows:
         steps, seconds, processor, _ = zip(*row["curve"], strict=True)
         assert steps[0] == 0 and steps[-1] >= 256
         assert sorted(seconds) == list(seconds) and sorted(processor) == list(processor)
         assert seconds[-1] == pytest.approx(row["seconds"], abs=1e-3) and seconds[-1] < row["process_seconds"]
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert race.main(given) == 0 and len(file.read_text().splitlines()) == 2  # nothing is trained again
+    assert not drawn or picture.read_bytes().startswith(b"\x89PNG")
+    assert race.main(given) == 0 and file.read_text().splitlines() == [
+        json.dumps(row) for row in rows
+    ]  # kept
     assert race.main(["PivotedBra-v0"]) == 2 and race.main([ENV, "--seeds", "0"]) == 2
 
 
