@@ -577,7 +577,19 @@ def work(env_id: str, args: argparse.Namespace) -> None:
 
         plans.find(env_id, args.folder if args.quick else None, [0] if args.quick else plans.SEEDS)
         if not args.quick:
-            scale.main([env_id, "--batches", "1", "--output", str(FILE)])
+            scale.main(
+                [
+                    env_id,
+                    "--batches",
+                    "1",
+                    "--size",
+                    "8192",
+                    "--planned",
+                    str(plans.EPISODES),
+                    "--output",
+                    str(FILE),
+                ]
+            )
         return
     results, images = (args.folder, args.folder) if args.quick else (RESULTS, IMAGES)
     result = compute(env_id, args.folder, quick=args.quick, new=args.new)

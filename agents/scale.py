@@ -50,23 +50,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument(
         "--size", type=int, default=BATCH, metavar="N", help="episodes of a batch (default %(default)s)"
     )
+    p.add_argument(
+        "--planned",
+        type=int,
+        default=PLANNED,
+        metavar="N",
+        help="episodes of a policy that plans (default %(default)s)",
+    )
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
     p.add_argument(
         "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
     )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or list(TASKS)
-    if args.batches < 1:
-        raise UserError(f"--batches must be at least 1, got {args.batches}")
+    for name in ("batches", "planned"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name} must be at least 1, got {getattr(args, name)}")
     if not 1 <= args.size <= BATCH:
         raise UserError(f"--size must lie between 1 and {BATCH}, got {args.size}")
     kept: dict[str, Any] = {}
     if args.output and args.output.exists():
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
-        kept[env_id] = measured(
-            env_id, args.batches, args.quick, kept.get(env_id, of_package(env_id)), args.size
-        )
+        before = kept.get(env_id, of_package(env_id))
+        kept[env_id] = measured(env_id, args.batches, args.quick, before, args.size, args.planned)
         if args.output:
             about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
             about["machine"] = machine()
@@ -77,7 +84,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measured(
-    env_id: str, batches: int, quick: bool, kept: dict[str, Any] | None = None, size: int = BATCH
+    env_id: str,
+    batches: int,
+    quick: bool,
+    kept: dict[str, Any] | None = None,
+    size: int = BATCH,
+    planned: int = PLANNED,
 ) -> dict[str, Any]:
     """Measure an environment's policies, and print a line for each.
 
@@ -93,6 +105,8 @@ def measured(
         What `lag_envs.tasks.measured` has of it.
     size : int
         Episodes of a batch, `BATCH` at most.
+    planned : int
+        Episodes of a policy that plans.
 
     Returns
     -------
@@ -104,7 +118,7 @@ def measured(
     kept, task = dict(kept or {}), TASKS[env_id]()
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
     known = controllers(task)
-    slow = {name: PLANNED for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
+    slow = {name: planned for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
     names = ["random", "zero", *([scale["policy"]] if scale else [*task.controllers])]
     if not scale and env_id in played():
         names.append("optimal")

@@ -65,39 +65,41 @@ def easier(
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:
-    """Return an iLQR that plans each episode anew, from what a recorded plan and its mirror image would do.
+    """Return an iLQR that plans each episode anew, from what recorded plans would do.
 
     Parameters
     ----------
     task : SwingUp
         The task, ``env.unwrapped.task``.
     guesses : sequence of Tracking, optional
-        What to begin from; by default a plan that was recorded with the full control.
+        What to begin from; by default a plan that was recorded with the full control, its mirror image, and
+        the plan that is followed from any start.
     beyond : float
         How far to plan, in lengths of the longest of them.
     """
     if not guesses:
         quick = recorded(task, "quick")
-        guesses = [quick, quick.mirrored()]
+        guesses = [quick, quick.mirrored(), recorded(task)]
     ahead = round(beyond * max(len(plan.actions) for plan in guesses))
     return ILQR(task, guesses, after=hold(task), tail=loss(task), steps=ahead)
 
 
 def loss(task: SwingUp) -> Callable[[Array], Array]:
-    """Return what the best regulator loses of the reward from states on, near upright."""
+    """Return what the best regulator loses of the reward from states on, near upright; farther off, more."""
     read, rest = ObservationDecoder(task), np.array(task.plans.rest)
     # The reward does not mind where on the track the bars stand; something has to call the support back.
     _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
 
     def lost(states: Array) -> Array:
         off = read.difference(states, rest)
-        return np.einsum("...i,ij,...j->...", off, cost, off)
+        loss = np.einsum("...i,ij,...j->...", off, cost, off)
+        return loss + loss**2  # the control is limited: where much is to be lost, all is
 
     return lost
 
 
 def anywhere(
-    task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 4.0, **numbers: Any
+    task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 0.5, **numbers: Any
 ) -> MPC:
     """Return an MPC that plans at the start and after each kick, and leaves the hold to a regulator.
 

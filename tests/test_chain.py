@@ -1,0 +1,212 @@
+"""Chains of bars: rewards that cannot be exploited, bars that whip, plans, and planning from anywhere."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from lag_envs.controllers import build, make_controller
+from lag_envs.controllers.basic import Constant, feedback
+from lag_envs.controllers.chain import loss, replan
+from lag_envs.controllers.linear import time_varying
+from lag_envs.controllers.mpc import MPC, without_kicks
+from lag_envs.controllers.tracking import Tracking, follow, recorded, search
+from lag_envs.evaluation.rollout import Rollout, play, record
+from lag_envs.tasks import chain, pivoted_bar
+
+SWING_UPS = (chain.SwingUp, chain.SwingUpWeak, chain.SwingUpTriple)
+each_swing_up = pytest.mark.parametrize("kind", SWING_UPS, ids=lambda kind: kind.id)
+SEEDS = range(3_600_000_000, 3_600_000_050)
+
+
+def returns_from(kind, state, agent):
+    """Return an agent's return from a start, with no step of the episode left out."""
+    env, memory, total, over = gym.make(kind.id), None, 0.0, False
+    observation, _ = env.reset(seed=0, options={"state": state})
+    while not over:
+        action, memory = agent.predict(observation, memory)
+        observation, reward, terminated, over, _ = env.step(action)
+        total += reward
+        assert not terminated
+    return total
+
+
+# --- rewards ---
+
+
+@each_swing_up
+def test_spinning_does_not_pay(kind):
+    """A chain that spins stretched out earns 35/128 a step, the mean of h⁴; it must not be worth learning."""
+    bars = kind().scene.bars
+    total = returns_from(kind, [0.0, 0.0, *[0.0, 30.0] * bars], Constant(0.0))
+    assert total < 150.0 < 0.4 * play(kind.id, make_controller(kind.id, "plan + TVLQR"), SEEDS).mean()
+
+
+def test_one_bar_up_and_one_down_does_not_pay():
+    """Feedback holds the upper bar up with the other hanging, for whoever wants a sixteenth of a step."""
+    task = chain.SwingUp()
+    rest = [0.0, 0.0, math.pi, 0.0, 0.0, 0.0]
+    _, gain = time_varying(task, np.array([rest]), np.empty(0), rest, task.plans.weights, task.plans.effort)
+    agent = Tracking(task, states=[rest], actions=[], gains=np.empty((0, 6)), rest=rest, hold=gain)
+    total = returns_from(chain.SwingUp, np.array(rest) + 0.01, agent)
+    assert 30.0 < total < 35.0
+
+
+@each_swing_up
+def test_doing_nothing_earns_nothing(kind):
+    assert 0.0 <= play(kind.id, make_controller(kind.id, "zero"), SEEDS).mean() < 1e-6
+
+
+# --- whipping ---
+
+
+@pytest.mark.parametrize(("kind", "fastest"), [(chain.SwingUp, 45.0), (chain.SwingUpTriple, 70.0)])
+def test_bars_whip_and_steps_are_divided(kind, fastest):
+    """Random actions turn bars so fast that one series diverges; divided, a step equals its four quarters."""
+    played = record(Rollout(kind.id, make_controller(kind.id, "random"), range(300)))
+    states, task = played.states.reshape(-1, played.states.shape[-1]), kind()
+    rates = np.abs(states[:, 3::2]).max(axis=1)
+    state = states[rates.argmax()]
+    assert fastest < rates.max() < task.fastest_turn()
+    bound = task.scene.step_bound(state, 0.0, task.dt)
+    assert bound.substeps > 1 and bound.kind == "proved with the step"
+    whole, parts = (task.scene.simulate(state, np.zeros(n), task.dt / n)[-1] for n in (1, 4))
+    np.testing.assert_allclose(whole, parts, rtol=1e-11, atol=1e-11)
+
+
+# --- balancing ---
+
+
+def test_feedback_by_entry():
+    task = chain.Balance()
+    agent = feedback(task, e_1=-2.0, s_dot=0.5)
+    observation = np.array([9.0, 0.4, 0.1, 9.0, 9.0, 9.0], np.float32)
+    assert agent.predict(observation)[0] == pytest.approx([0.0], abs=1e-7)
+    with pytest.raises(ValueError, match="there is no observation 'e_3', only s, s_dot, e_1, e_2"):
+        feedback(task, e_3=1.0)
+
+
+def test_balancing_needs_a_track_and_an_upright_start():
+    with pytest.raises(ValueError, match="a track of finite length, got track=inf"):
+        chain.Balance(track=math.inf)
+    env = gym.make(chain.Balance.id)
+    with pytest.raises(ValueError, match=r"over at s=0 m, theta_1=3.14159 rad, theta_2=0 rad"):
+        env.reset(options={"state": [0.0, 0.0, math.pi, 0.0, 0.0, 0.0]})
+
+
+def test_feedback_balances():
+    # The means over many more episodes are 344 and 376, those of doing nothing 14.
+    means = {name: play(chain.Balance.id, make_controller(chain.Balance.id, name), SEEDS).mean()
+             for name in ("LQR", "linear feedback", "zero")}  # fmt: skip
+    assert means["LQR"] > 250.0 and means["linear feedback"] > 280.0 and means["zero"] < 30.0
+
+
+# --- plans ---
+
+
+@pytest.mark.parametrize(
+    ("kind", "least"),
+    zip(SWING_UPS, (446.0, 400.0, 398.0), strict=True),
+    ids=lambda one: getattr(one, "id", ""),
+)
+def test_recorded_plans_are_followed(kind, least):
+    agent = make_controller(kind.id, "plan + TVLQR")
+    returns = play(kind.id, agent, SEEDS)
+    assert returns.mean() > least
+    # Asked twice as often, it follows the same plan.
+    fine = make_controller(kind.id, "plan + TVLQR", dt=0.01)
+    assert play(kind.id, fine, SEEDS[:8], dt=0.01).mean() > least - 20.0
+
+
+def test_mirror_images():
+    task = chain.SwingUp()
+    agent, states = recorded(task), np.random.default_rng(0).uniform(-0.2, 0.2, (5, 6))
+    for taken in (0.0, 30.0, 400.0):
+        near = states + agent.states[min(int(taken), len(agent.actions))]
+        times = np.full(5, taken)
+        np.testing.assert_allclose(
+            agent.mirrored().act(-near, None, times), -agent.act(near, None, times), atol=1e-9
+        )
+
+
+def test_feedback_along_a_plan_ends_as_feedback_at_rest():
+    """Along a plan that stands still, the feedback is the regulator's; and it is stable."""
+    task = chain.SwingUp()
+    plans, n = task.plans, 40
+    agent = follow(task, np.tile(plans.rest, (n + 1, 1)), np.zeros(n), plans)
+    np.testing.assert_allclose(agent.gains, np.tile(agent.hold, (n, 1)), rtol=1e-6)
+    a, b = task.scene.jacobian(plans.rest, [0.0], task.dt)
+    assert np.abs(np.linalg.eigvals(a - task.largest * b @ agent.hold[None])).max() < 1.0
+    # A prototype's gains, by the same weights on an integrator of its own: for s, s' and for each bar.
+    gains = dict(zip(task.scene.state_names, task.largest * agent.hold, strict=True))
+    assert [gains["theta_1"], gains["theta_2"]] == pytest.approx([182.3, -293.6], rel=0.01)
+
+
+def test_plans_that_cannot_be_read(tmp_path):
+    task = chain.SwingUp()
+    with pytest.raises(ValueError, match=r"no plan .*nothing\.npz; python -m agents\.optimum DoubleBar"):
+        Tracking.load(task, tmp_path / "nothing.npz")
+    recorded(task).save(tmp_path / "plan.npz")
+    with pytest.raises(ValueError, match=r"states must have shape \(66, 8\), got \(66, 6\)"):
+        Tracking.load(chain.SwingUpTriple(), tmp_path / "plan.npz")
+    again = Tracking.load(task, tmp_path / "plan.npz")
+    assert again.gains.dtype == np.float64 and (again.gains == recorded(task).gains).all()
+
+
+@pytest.mark.slow
+def test_search_finds_plans():
+    task = chain.SwingUp()
+    best = next(search(task, 0))
+    assert play(chain.SwingUp.id, best, SEEDS).mean() > 440.0
+
+
+@pytest.mark.slow
+def test_planning_anew_is_better_than_following():
+    returns = play(chain.SwingUp.id, make_controller(chain.SwingUp.id, "iLQR"), SEEDS[:8])
+    assert returns.mean() > 455.0
+
+
+def test_replanning_begins_from_what_it_is_given():
+    task = chain.SwingUp()
+    agent = replan(task, guesses=[recorded(task)], beyond=1.2)
+    assert agent.steps == 78 and len(agent.guesses) == 1
+    assert loss(task)(np.array([task.plans.rest]))[0] == 0.0
+
+
+# --- from anywhere, with kicks ---
+
+
+def test_a_recorded_plan_does_not_win_from_anywhere():
+    task = chain.SwingUpAnywhere()
+    agent = Tracking(task, **{name: getattr(recorded(chain.SwingUp()), name) for name in Tracking.DATA})
+    assert play(task.id, agent, SEEDS).mean() < 120.0
+
+
+@pytest.mark.slow
+def test_planning_wins_from_anywhere():
+    assert (
+        play(chain.SwingUpAnywhere.id, make_controller(chain.SwingUpAnywhere.id, "MPC"), SEEDS[:4]).mean()
+        > 250.0
+    )
+
+
+def test_tasks_without_kicks():
+    task = chain.SwingUpAnywhere()
+    calm = without_kicks(task)
+    assert task.draws == 2 and calm.draws == 0 and calm.kick(None, [], np) == {}
+    assert without_kicks(calm) is calm and calm.dt == task.dt and calm.scene == task.scene
+
+
+def test_mpc_for_any_task():
+    """It balances a bar, planning in every step, without a word on how."""
+    task = pivoted_bar.Balance(duration=2.0)
+    agent = MPC(task, horizon=25, iterations=2, guesses=4, budget=2_000)
+    rollout = Rollout(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=2.0)
+    assert rollout.run().mean() > 80.0  # of 100; doing nothing gets 20
+    for name in ("horizon", "every", "guesses", "budget"):
+        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+            MPC(task, **{name: 0})
+    assert build(task, "zero") is not None
