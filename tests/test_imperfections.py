@@ -312,7 +312,7 @@ def test_lag_against_simulate():
 
 
 def test_first_commands_under_way_are_zero_control():
-    env = gym.make(ID, action_delay=0.05, observation_delay=0.027)
+    env = gym.make(ID, action_delay=(0.0499, 0.05), observation_delay=0.027)
     env.reset(seed=0)
     for t in range(4):
         env.step(np.ones(1, np.float32))

@@ -272,8 +272,11 @@ def arguments(task: Task) -> str:
         rows.append(["`target`", "None", unit, "", "A fixed target for every episode; None: a random one."])
     also = (
         'Also `render_mode` ("human" or "rgb_array"), and `diagnostics=True`, which puts controls, forces '
-        "and energy into `info`."
+        "and energy into `info`; and those of [imperfect sensors and actuators and hidden parameters]"
+        "(../usage.md#imperfect-sensors-and-actuators)"
     )
+    own = ", ".join(f"`{name}={value!r}`" for name, value in type(task).imperfections.items())
+    also += f", of which {own} are on here." if own else "."
     return f"{table(['Keyword', 'Default', 'Unit', 'Range', 'Meaning'], rows)}\n\n{also}"
 
 
