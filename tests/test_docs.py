@@ -177,9 +177,9 @@ def as_python(latex):
     """Return a formula of the page as Python: with stars in products, theta_1 for theta_{1}, _dot for dot."""
     for pattern, text in (
         (r"\\(d+)ot\{\\?(\w+)\}(?:_\{(\d)\})?", lambda m: "_".join(filter(None, (m[2], m[3], f"{m[1]}ot")))),
-        (r"\\mathrm\{(\w+)\}", r"\1"),
-        (r"_\{(\d)\}", r"_\1"),
-        (r"\\(?=theta|phi|psi|sin|cos)", ""),
+        (r"\\mathrm\{([^}]*)\}", lambda m: m[1].replace("\\ ", "_")),
+        (r"_\{(\w+)\}", r"_\1"),
+        (r"\\(?=theta|phi|psi|sin|cos|arctan)", ""),
         (r"(sin|cos)\^\{2\} ?\{(.*?)\}", r"\1(\2)**2"),
         (r"\^\{2\}", "**2"),
         (r"(sin|cos) ?\{(.*?)\}", r"\1(\2)"),
@@ -204,7 +204,7 @@ def test_equations(env_id, page):
     values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
     if "w" in values:  # the momentum's speed stands for the place's rate
         values["x_dot"] = values["w"] - scene.radius * values["phi_dot"]
-    values |= {"sin": math.sin, "cos": math.cos, "phi_ddot": 0.0}
+    values |= {"sin": math.sin, "cos": math.cos, "arctan": math.atan, "phi_ddot": 0.0}
     if len(free) == 1:
         assert len(latex) == 2
         stated = eval(as_python(latex[1].partition("=")[2]), values)

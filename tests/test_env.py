@@ -699,8 +699,7 @@ def test_diagnostics(env_id):
         assert info["energy"] == env.scene.energy(env.state, env.control)["total"]
         for name, value in env.scene.forces(env.state, env.control).items():
             assert info[name] == value
-    if "support_vertical" not in names:
-        assert {"normal", "friction", "needed_friction"} <= names
+    assert {*env.scene.reactions, *env.scene.ratios} <= names
 
 
 # --- steps that cannot be taken ---

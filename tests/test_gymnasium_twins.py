@@ -100,14 +100,14 @@ def test_a_policy_trained_there_runs_here(capsys):
     ppo = pytest.importorskip("stable_baselines3").PPO
     peer_id, env_id = CartPoleExact.peer, CartPoleExact.id
     model = ppo(
-        "MlpPolicy", gym.make(peer_id), n_steps=1024, batch_size=256, gae_lambda=0.8, gamma=0.98,
+        "MlpPolicy", gym.make(peer_id), n_steps=512, batch_size=256, gae_lambda=0.8, gamma=0.98,
         n_epochs=20, learning_rate=1e-3, seed=0, device="cpu",
     )  # fmt: skip
-    model.learn(40_960)
+    model.learn(25_600)
     found = {name: energy.returns(name, model, 20) for name in (peer_id, env_id)}
     with capsys.disabled():
         print({name: returns.mean() for name, returns in found.items()})
-    assert min(returns.mean() for returns in found.values()) > 400.0
+    assert min(returns.mean() for returns in found.values()) > 300.0
 
 
 @each_pair

@@ -7,10 +7,9 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering
 from rollouts import actions, make
 
-from lag_envs.controllers import build, make_controller
+from lag_envs.controllers import ILQR, build, make_controller
 from lag_envs.controllers.basic import Constant
 from lag_envs.controllers.lookahead import LookAhead
 from lag_envs.evaluation.rollout import play
@@ -296,9 +295,18 @@ def test_a_largest_action_must_be_a_size(top):
         kind()
 
 
-@pytest.mark.parametrize("env_id", covering([PendulumExact.id]))
-def test_an_action_is_the_torque_itself(env_id):
-    env = make(env_id)
+def test_plans_use_actions_beyond_1():
+    task = make_task(PendulumExact.id, duration=1.0)
+    guess = build(task, "energy shaping + LQR")
+    agent = ILQR(task, [guess], iterations=5)
+    starts = np.array([[1.0, 0.0], [math.pi, 1.0]])
+    assert np.abs(agent.plan(starts, np.zeros(2))[0].actions).max() == 2.0
+    follow = play(PendulumExact.id, guess, range(8), duration=1.0)
+    assert play(PendulumExact.id, agent, range(8), duration=1.0).mean() > follow.mean()
+
+
+def test_an_action_is_the_torque_itself():
+    env = make(PendulumExact.id)
     env.reset(seed=0)
     for given, applied in ((0.5, 0.5), (2.0, 2.0), (-7.0, -2.0)):
         env.step(np.array([given], np.float32))

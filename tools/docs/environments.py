@@ -99,9 +99,9 @@ def index() -> str:
 Mean return ± standard error of random actions and of the best policy known, as `python -m agents.scale`
 measured them.
 
-Every episode lasts 10 s at most. Actions lie in [-1, 1] and are scaled to the control. Observations are
-float32, the state behind them float64. [Usage](../usage.md#keywords-of-every-environment) has the keywords
-that all of them take.
+Actions lie in [-1, 1] and are scaled to the control, or are choices; environments that are Gymnasium's with
+exact motion have Gymnasium's spaces. Observations are float32, the state behind them float64.
+[Usage](../usage.md#keywords-of-every-environment) has the keywords that all of them take.
 """
 
 

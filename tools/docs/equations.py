@@ -110,6 +110,10 @@ def _latex(scene: Scene, expression: Any) -> str:
             take(3, known, f"a{order[known.name]:02}", symbol(type(scene), known.name))
     for step in steps:  # derivatives before what they are of
         expression = expression.xreplace(step)
+    for i, angle in enumerate(sorted(expression.atoms(sympy.atan), key=str)):  # SymPy leaves brackets out
+        within = sympy.latex(angle.args[0], symbol_names=shown)
+        shown[known := sympy.Symbol(f"y{i}")] = rf"\arctan({within})"
+        expression = expression.xreplace({angle: known})
     latex = sympy.latex(expression, symbol_names=shown, fold_func_brackets=True)
     return latex.replace(r"\left", "").replace(r"\right", "")
 
@@ -129,7 +133,7 @@ def mathml(latex: str, block: bool = True) -> str:
         body,
     )
     space = '<mspace width="0.17em"></mspace>'
-    body = re.sub(r"<mi>(sin|cos|tan|atan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
+    body = re.sub(r"<mi>(sin|cos|tan|arctan)</mi>", rf"<mrow>{space}\g<0>{space}</mrow>", body)
     source = f'<annotation encoding="application/x-tex">{escape(latex, quote=False)}</annotation>'
     whole = f"{head}<semantics><mrow>{body}</mrow>{source}</semantics></math>"
     return f'<div class="equation" tabindex="0">{whole}</div>' if block else whole

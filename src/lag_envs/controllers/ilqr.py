@@ -79,6 +79,7 @@ class ILQR:
         self.steps = int(min(task.limit, 1000 if steps is None else steps))
         self.iterations, self.tolerance = iterations, tolerance
         self.flat = FLAT * task.dt / task.interval
+        self.largest = task.formulas.largest
         self.model, self.read = Model(task), ObservationDecoder(task)
         self._k = SimpleNamespace(**task.formulas.constants())
 
@@ -113,7 +114,7 @@ class ILQR:
             beyond, memory = self.after.predict(values.reshape(n, -1), memory, plan.step <= self.steps)
             action = np.where(plan.step >= self.steps, beyond[:, 0], action)
         plan = plan._replace(step=plan.step + 1, memory=memory)
-        return as_actions(action.reshape(values.shape[:-1])), plan
+        return as_actions(action.reshape(values.shape[:-1]), self.largest), plan
 
     def _blank(self, n: int) -> Plan:
         shape = n, self.steps, len(self.task.scene.state_names)
@@ -207,7 +208,9 @@ class ILQR:
         total, alive = np.zeros((n, lines)), np.ones((n, lines), np.bool_)
         for t in range(self.steps):
             feedback = np.einsum("ij,ikj->ik", gains[:, t], x - states[:, None, t])
-            u = np.clip(actions[:, t, None] + shares * change[:, t, None] + feedback, -1.0, 1.0)
+            u = np.clip(
+                actions[:, t, None] + shares * change[:, t, None] + feedback, -self.largest, self.largest
+            )
             xs[:, :, t], us[:, :, t] = x, u
             x, reward, ended = self._step(x, u, goals)
             total += np.where(alive, reward, 0.0)
@@ -228,7 +231,7 @@ class ILQR:
         slopes = np.empty((n, steps, m, width))
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
         # The action is moved inward from its bounds, beyond which it has no effect.
-        inner = np.clip(actions, -1.0 + REACH, 1.0 - REACH)
+        inner = np.clip(actions, REACH - self.largest, self.largest - REACH)
         size = max(1, 4_000 // steps)  # what finds room in memory nearby
         for first in range(0, n, size):
             part = slice(first, first + size)
@@ -279,8 +282,8 @@ class ILQR:
             q_x, q_u, h_xx, h_ux, h_uu = q[:, :-1], q[:, -1], h[:, :-1, :-1], h[:, -1, :-1], h[:, -1, -1]
             bend = np.maximum(-h_uu, self.flat) + damping
             wanted = actions[:, t] + q_u / bend
-            step = np.clip(wanted, -1.0, 1.0) - actions[:, t]
-            free = (np.abs(wanted) < 1.0)[:, None]
+            step = np.clip(wanted, -self.largest, self.largest) - actions[:, t]
+            free = (np.abs(wanted) < self.largest)[:, None]
             gain = np.where(free, h_ux / bend[:, None], 0.0)
             change[:, t], gains[:, t] = step, gain
             value_x = q_x + gain * (q_u + h_uu * step)[:, None] + h_ux * step[:, None]

@@ -13,7 +13,7 @@ With l₁ from shoulder to elbow, centres of mass at c₁ and c₂ along the lin
     T = (m₁ c₁² + I₁ + m₂ l₁²) theta_1'²/2 + (m₂ c₂² + I₂) w²/2 + m₂ l₁ c₂ theta_1' w cos(theta_2)
     V = -(m₁ c₁ + m₂ l₁) g cos(theta_1) - m₂ c₂ g cos(theta_1 + theta_2)
 
-Friction in each joint is b v + c atan(100 v): viscous, and a rounded step that stands for dry friction.
+Friction in each joint is b v + f atan(100 v): viscous, and a rounded step that stands for dry friction.
 Motors with rotors of inertia J behind gears of ratio n, the elbow's being carried by the first link, add
 J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2 to T.
 """
@@ -45,7 +45,7 @@ class Acrobot(Scene):
     damping, damping_2 : float [N m s]
         Coefficients b of the viscous friction in shoulder and elbow; the second is by default the first.
     dry_friction, dry_friction_2 : float [N m]
-        Coefficients c of the friction c atan(100 v) in shoulder and elbow, which reaches cπ/2; the second is
+        Coefficients f of the friction f atan(100 v) in shoulder and elbow, which reaches fπ/2; the second is
         by default the first.
     rotor_inertia : float [kg m²]
         Inertia J of each motor's rotor.
@@ -106,7 +106,7 @@ class Acrobot(Scene):
         return self.gravity * (self.mass_1 * first + self.mass_2 * second)
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return Rayleigh's function of the friction [W], whose derivative is b v + c atan(100 v)."""
+        """Return Rayleigh's function of the friction [W], whose derivative is b v + f atan(100 v)."""
 
         def joint(w: Any, damping: Any, dry_friction: Any) -> Any:
             rounded = w * xp.atan(100 * w) - xp.log(1 + (100 * w) ** 2) / 200

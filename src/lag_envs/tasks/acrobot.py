@@ -210,7 +210,7 @@ class AcrobotReal(Task):
 
     ## Equations
 
-    Dry friction c atan(100 v) is the project's too.
+    Dry friction f atan(100 v) is the project's too.
 
     ## Signs and Units
 
