@@ -118,7 +118,7 @@ def overview(link: Callable[[str], str]) -> str:
                 _first(type(task)),
                 "; ".join(_range(task, acting) for acting in task.formulas.acting),
                 *(
-                    plus_minus(row["mean"], row["error"]) if row else ""
+                    plus_minus(row["mean"], row["error"]) if row else "not measured yet"
                     for row in map(found.get, ("random", best))
                 ),
             ]
@@ -347,7 +347,7 @@ def _summary_rows(accuracy: Mapping[str, Any] | None, section: str) -> list[dict
 def _returns(env_id: str) -> str:
     found = measured(env_id)
     if not found:
-        return ""
+        return "Not measured yet."
     best = found["scale"]["policy"]
     names = {"random": "random actions", "zero": "zero control", best: f"{best}, the best policy known"}
     names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
@@ -375,6 +375,8 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
             f"[Watch them, and see the whole ranking](../board/{env_id}.html). [Agents](../agents.md#"
             f"{env_id.lower()}) has their robustness and learning curves.",
         ]
+    elif task.goal:
+        texts.append(f"Nobody is on [its board](../board/{env_id}.html) yet.")
     return "\n\n".join(texts)
 
 

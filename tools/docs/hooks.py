@@ -80,7 +80,7 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill in the names of scenes, and point links that leave the folder docs to the site or to the source."""
+    """Fill in the scenes' names, and point links that leave the folder docs to the site or to the source."""
     from lag_envs.scenes import SCENES
 
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))

@@ -265,6 +265,16 @@ def rate_factor(centrifugal: Any, xp: Any) -> Any:
     return 1.0 + 2.0 * xp.sqrt(xp.maximum(xp.abs(centrifugal), 1.0))
 
 
+def _halved(growth, dt):  # type: ignore[no-untyped-def]
+    """Return how often a step is halved until one series does, and its length; -1 where that is too often."""
+    for halvings in range(61):
+        if growth <= SMALL_TURN:
+            return halvings, dt
+        growth *= 0.5
+        dt *= 0.5
+    return -1, dt
+
+
 def _turn_any(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt, _):  # type: ignore[no-untyped-def]
     """Advance by dt for any coefficients; return x, x', cosφ, sinφ, and 1, or -1 or -2 if refused."""
     growth = dt * (2.0 * damping_rate + (1.0 + 2.0 * math.sqrt(max(abs(centrifugal), 1.0))) * abs(rate))
@@ -285,14 +295,9 @@ def _turn_any(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt, _):  # t
             v = w / h
             v += (fma(-v, h, w) + (w_low - v * h_low)) / h
         return x, v, c, s, 1 if abs(x) < math.inf and abs(v) < math.inf else -2
-    doublings = 0
-    h = dt
-    while growth > SMALL_TURN:
-        growth *= 0.5
-        h *= 0.5
-        doublings += 1
-        if doublings > 60:
-            return x, v, c, s, -1
+    doublings, h = halved(growth, dt)
+    if doublings < 0:
+        return x, v, c, s, -1
     # Rows (x, x'), columns (x, x', cos, sin): what a short step adds, from its effect on unit vectors. The
     # unit matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose
     # a bit with each squaring.
@@ -351,6 +356,7 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
         series,
         change,
         pair,
+        compile_python("halved", _halved, SMALL_TURN=SMALL_TURN),
         compile_traced("start", "v, h, h_low", lambda xp, v, *h: twofold_parts(Twofold(*h) * v)),
         compile_traced(
             "substep", f"{names}, centrifugal, gravity, damping_rate, rate, h, h_low", substep, absent
@@ -371,14 +377,9 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
     x, v, c, s, centrifugal, gravity, damping_rate, rate = values
     m, by_rate = scratch[:2], scratch[2:]
     growth = dt * (2.0 * damping_rate + (1.0 + 2.0 * math.sqrt(max(abs(centrifugal), 1.0))) * abs(rate))
-    doublings = 0
-    h = dt
-    while growth > SMALL_TURN:
-        growth *= 0.5
-        h *= 0.5
-        doublings += 1
-        if doublings > 60:
-            return -1
+    doublings, h = halved(growth, dt)
+    if doublings < 0:
+        return -1
     for j in range(4):
         one = 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0, 1.0 if j == 3 else 0.0
         m[0, j], m[1, j], by_rate[0, j], by_rate[1, j] = change(
@@ -422,5 +423,8 @@ def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Call
         return dx.value, dv.value, *dx.slopes, *dv.slopes
 
     return compile_python(
-        "tangent", _turn_tangent, compile_traced("change", ", ".join(names), change), SMALL_TURN=SMALL_TURN
+        "tangent",
+        _turn_tangent,
+        compile_traced("change", ", ".join(names), change),
+        compile_python("halved", _halved, SMALL_TURN=SMALL_TURN),
     )
