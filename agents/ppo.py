@@ -128,7 +128,7 @@ class Policy:
         weight, bias = self.layers[-1]
         return hidden, hidden @ weight.T + bias
 
-    def chosen(self, preferences: Array) -> NDArray[np.int64]:
+    def chosen(self, preferences: NDArray) -> NDArray[np.int64]:
         """Return which value of each action is preferred, (n, actions), or (n,) for a single one."""
         parts = np.split(preferences, np.cumsum(self.choices)[:-1], axis=-1)
         values = [part.argmax(axis=-1) for part in parts]

@@ -155,7 +155,7 @@ def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the cells of the table: for each learner and level how many reached it, and when."""
     names = list(dict.fromkeys(row["algo"] for row in rows))
     last = f"of {label(names[-1])}'s"
-    cells = [("", "level", "reached", "steps", "s", "s on the processor", last)]
+    cells: list[tuple[str, ...]] = [("", "level", "reached", "steps", "s", "s on the processor", last)]
     for level in LEVELS:
         slowest = _median([row for row in rows if row["algo"] == names[-1]], level, 2)
         for name in names:

@@ -120,7 +120,7 @@ def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episod
 
 def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path) -> Any:
     """Try settings that have not been tried, side by side; return all that was tried."""
-    about = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
+    about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
     data = read(file, about) or about | {"machine": machine(), "settings": []}
     own = hyperparameters(LEARNER, env_id)
     for number in range(len(data["settings"]), count):
@@ -168,7 +168,7 @@ def ranked(data: Mapping[str, Any]) -> list[tuple[str, ...]]:
         returns = [run["return"] for run in setting["runs"] if "return" in run]
         if returns:
             rows.append((float(np.mean(returns)), min(returns), setting))
-    cells = [("setting", "mean return", "lowest", "score", "changed")]
+    cells: list[tuple[str, ...]] = [("setting", "mean return", "lowest", "score", "changed")]
     for mean, lowest, setting in sorted(rows, key=lambda row: -row[0]):
         value = score(data["env"], mean)
         changed = ", ".join(f"{name} {value}" for name, value in setting["changed"].items())
