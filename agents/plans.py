@@ -53,7 +53,11 @@ def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) 
         return
     starts = Rollout(env_id, None, range(FIRST_SEED, FIRST_SEED + STARTS)).state
     guesses = [best, *candidates(env_id, seeds, **task.plans.quick)]
-    gains = [replan(task, guesses=[agent]).plan(starts, np.zeros(STARTS))[1].mean() for agent in guesses]
+    gains = []
+    for agent in guesses:
+        planner = replan(task, guesses=[agent])
+        # Of the steps beyond the plan's end, each is worth 1 but for what its tail counts.
+        gains.append(planner.plan(starts, np.zeros(STARTS))[1].mean() + task.limit - planner.steps)
     guesses[int(np.argmax(gains))].save(file_of(task, "quick", folder))
     seconds = time.monotonic() - began
     print(f"{env_id}: best of {len(guesses)} plans to begin planning from, {seconds:.0f} s", flush=True)

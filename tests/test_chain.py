@@ -109,7 +109,7 @@ def test_feedback_balances():
 
 @pytest.mark.parametrize(
     ("kind", "least"),
-    zip(SWING_UPS, (446.0, 400.0, 398.0), strict=True),
+    [(chain.SwingUp, 446.0), (chain.SwingUpWeak, 400.0), (chain.SwingUpTriple, 398.0)],
     ids=lambda one: getattr(one, "id", ""),
 )
 def test_recorded_plans_are_followed(kind, least):
@@ -202,10 +202,10 @@ def test_tasks_without_kicks():
 
 def test_mpc_for_any_task():
     """It balances a bar, planning in every step, without a word on how."""
-    task = pivoted_bar.Balance(duration=2.0)
-    agent = MPC(task, horizon=25, iterations=2, guesses=4, budget=2_000)
-    rollout = Rollout(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=2.0)
-    assert rollout.run().mean() > 80.0  # of 100; doing nothing gets 20
+    task = pivoted_bar.Balance(duration=1.0)
+    agent = MPC(task, horizon=25, iterations=1, guesses=4, budget=2_000)
+    returns = play(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=1.0)
+    assert returns.mean() > 40.0  # of 50; doing nothing gets half of that
     for name in ("horizon", "every", "guesses", "budget"):
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
             MPC(task, **{name: 0})

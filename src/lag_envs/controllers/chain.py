@@ -39,7 +39,7 @@ def easier(
     """
     kind: Any = type(task)
 
-    class Easier(kind):  # type: ignore[misc]
+    class Easier(kind):
         id = ""
         draws, kick = 0, Task.kick
         largest = share * task.largest

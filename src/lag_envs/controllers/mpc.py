@@ -123,7 +123,7 @@ class MPC:
             shape = n, self.horizon, width
             blank = np.zeros(n, np.intp)
             state = Ahead(blank, blank, np.zeros(shape), np.zeros(shape[:2]), np.zeros(shape))
-        plan = Ahead(*(array.copy() for array in state))
+        plan = state._replace(**{name: getattr(state, name).copy() for name in state._fields})
         plan.wait[:] = np.where(fresh, 0, np.maximum(plan.wait - 1, 0))
         plan.actions[fresh], plan.gains[fresh], plan.states[fresh] = 0.0, 0.0, x[fresh, None]
         rows, held = np.arange(n), np.zeros(n, np.bool_) if self.holds is None else self.holds(x)
@@ -190,6 +190,7 @@ def without_kicks(task: Task) -> Task:
     """Return the same task without random kicks."""
     if not task.draws:
         return task
-    calm = object.__new__(type(type(task).__name__, (type(task),), {"id": "", "draws": 0, "kick": Task.kick}))
+    kind: Any = type(type(task).__name__, (type(task),), {"id": "", "draws": 0, "kick": Task.kick})
+    calm: Task = object.__new__(kind)
     vars(calm).update({name: value for name, value in vars(task).items() if name != "formulas"})
     return calm
