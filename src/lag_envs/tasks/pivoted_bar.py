@@ -279,8 +279,8 @@ class SwingUpUnknown(SwingUp):
     ## Arguments
 
     Those of `PivotedBar-v0`. `randomize=None`, `observation_noise=None` and `action_delay=None` switch off
-    what makes the bar unknown. Factors refer to the parameters that are given; all bars that may be drawn must
-    lie in the ranges.
+    what makes the bar unknown. Factors refer to the parameters that are given; every bar that may be drawn
+    must lie in the ranges.
 
     ## Signs and Units
 
