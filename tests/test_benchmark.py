@@ -418,3 +418,13 @@ def test_episodes_are_spread_out():
     ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
     assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
     assert max(map(sum, ended)) == 1
+
+
+def test_keywords_are_measured_beside_the_defaults():
+    rows = benchmark.contestants((ID,), (1, 64), ("action_delay=0.013",))
+    varied = [row for row in rows if row.library == benchmark.VARIED]
+    assert {row.id for row in varied} == {f"{ID}, action_delay=0.013"}
+    assert [(row.kind, row.num_envs) for row in varied] == [("unwrapped", 1), ("vector", 1), ("vector", 64)]
+    for text in ("0.013", "action_delay=", "**{}", "action_delay=open('x')"):
+        with pytest.raises(ValueError, match="keywords must be as in a call"):
+            benchmark.keywords_of(text)

@@ -12,13 +12,15 @@ import own_tasks
 import pytest
 
 import lag_envs
+from lag_envs import replay
 from lag_envs.envs.imperfect import PURPOSES, numbers_of, program_of
 from lag_envs.envs.program import Program, constants_of
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.leaderboard.site import driving
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.stepping.primitives import episode_key, uniform
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, pivoted_bar
 from lag_envs.tasks.imperfections import KEYWORDS, LARGEST_NORMAL, MARGIN
 from lag_envs.tasks.registration import make_task
 
@@ -482,6 +484,14 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
 
     with pytest.raises(ValueError, match="an attribute that it computes from parameters"):
         LagrangianVectorEnv(Stale, 1, randomize={"mass": (0.5, 2.0)})
+
+
+def test_pages_and_drives_leave_them_out():
+    env_id = pivoted_bar.SwingUpUnknown.id
+    assert driving.script(env_id) is None
+    drive = replay.Drive(env_id, 1, "", 0.0, "")
+    with pytest.raises(replay.LinkError, match=f"{env_id} has hidden parameters"):
+        replay.replay(drive)
 
 
 def test_scripts_refuse_them():

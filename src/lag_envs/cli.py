@@ -681,7 +681,7 @@ examples:
   lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
-  lag-envs bench --quick --with 'action_delay=0.013'  what keywords cost
+  lag-envs bench --quick --with action_delay=0.013   what keywords cost
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
         declare_bench,
