@@ -32,6 +32,8 @@ COMMANDS = {
     "accuracy": "make report ARGS='--docs .'",
     "picture": "python -m tools.docs --pictures",
 }
+#: What only some environments have.
+SOME = ("plan", "value iteration", "board", "accuracy", "picture")
 
 
 def have(what: str) -> list[str]:
@@ -43,13 +45,13 @@ def have(what: str) -> list[str]:
 def missing(env_id: str) -> dict[str, str]:
     """Return what lacks of an environment, and the command that makes it."""
     task = TASKS[env_id]
-    for_all = [what for what in COMMANDS if what not in ("plan", "value iteration", "board", "accuracy")]
+    for_all = [what for what in COMMANDS if what not in SOME]
     if task.value_iteration:
         for_all.append("value iteration")
     if task.plans is not None:
         for_all.append("plan")
     if task.goal:
-        for_all.append("board")
+        for_all += ["board", "picture"]  # pictures are those of the board's best
     if not task.imperfections:
         for_all.append("accuracy")
     return {what: COMMANDS[what].replace("ID", env_id) for what in for_all if env_id not in _there(what)}

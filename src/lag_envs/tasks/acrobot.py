@@ -42,9 +42,9 @@ class AcrobotExact(Task):
     `Acrobot-v1`, so a policy that was trained there runs here as it is, and the other way round.
 
     Two things differ. Gymnasium takes one Runge-Kutta step of 0.2 s at a time, by which the energy of the
-    undriven links drifts by several joules. Here the motion under the held torque is exact. And Gymnasium
-    clips the speeds at 4π and 9π rad/s, which takes energy away without a cause. Here they are free, and only
-    what is *observed* of them is clipped.
+    undriven links drifts by joules within an episode. Here the motion under the held torque is exact. And
+    Gymnasium clips the speeds at 4π and 9π rad/s, which takes energy away without a cause. Here they are
+    free, and only what is *observed* of them is clipped.
 
     What is kept, though no links of 1 kg and 1 m can have it, is the inertia of 1 kg m² about each centre of
     mass: no mass distribution within a link gives more than a quarter of that.
@@ -256,6 +256,7 @@ class AcrobotReal(Task):
         "gravity": 9.81,
     }
     interval, steps = 0.002, 5000
+    order = 12  # friction divides the steps: 16 takes a little longer
     action = {"elbow_torque": 6.0}
     start = dict.fromkeys(("theta_1", "theta_1_dot", "theta_2", "theta_2_dot"), 0.05)
     high = 0.9  # share of both lengths above which the tip is up, as in the project
