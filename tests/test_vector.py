@@ -35,18 +35,26 @@ def pair(env_id, n, mode="NextStep", **options):
     )
 
 
+def lanes(env_id):
+    """Return how many environments the record's batch of mixed parameters has."""
+    (number,) = {len(values) for values in TASKS[env_id].examples.batch.values()}
+    return number
+
+
 def mixed_pair(env_id, mode="NextStep", **options):
-    """Return the native environment with different parameters, and Gymnasium's of seven single ones."""
+    """Return the native environment with different parameters, and Gymnasium's of as many single ones."""
 
     def one(i):
         own = {name: values[i] for name, values in TASKS[env_id].examples.batch.items()}
         return lambda: gym.make(env_id, disable_env_checker=True, **own, **options)
 
     sync = SyncVectorEnv(
-        [one(i) for i in range(7)], autoreset_mode=AutoresetMode(mode), observation_mode="different"
+        [one(i) for i in range(lanes(env_id))],
+        autoreset_mode=AutoresetMode(mode),
+        observation_mode="different",
     )
     return gym.make_vec(
-        env_id, num_envs=7, autoreset_mode=mode, **TASKS[env_id].examples.batch, **options
+        env_id, num_envs=lanes(env_id), autoreset_mode=mode, **TASKS[env_id].examples.batch, **options
     ), sync
 
 
@@ -377,7 +385,7 @@ def test_observations_stay_in_the_space(env_id):
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
 def test_copies_go_on_alike(env_id, clone):
-    envs = gym.make_vec(env_id, num_envs=7, duration=1.0, **TASKS[env_id].examples.batch)
+    envs = gym.make_vec(env_id, num_envs=lanes(env_id), duration=1.0, **TASKS[env_id].examples.batch)
     envs.reset(seed=2)
     for action in actions(37, envs.action_space):
         envs.step(action)
@@ -394,12 +402,12 @@ def test_copies_go_on_alike(env_id, clone):
 @each_id
 def test_spec_survives_json(env_id):
     envs = gym.make_vec(
-        env_id, num_envs=7, autoreset_mode="SameStep", max_episode_steps=30, **TASKS[env_id].examples.batch
+        env_id, lanes(env_id), autoreset_mode="SameStep", max_episode_steps=30, **TASKS[env_id].examples.batch
     )
     spec = EnvSpec.from_json(envs.spec.to_json())
     assert spec == envs.spec
     twin = gym.make_vec(spec)
-    assert twin.num_envs == 7 and twin.metadata == envs.metadata
+    assert twin.num_envs == lanes(env_id) and twin.metadata == envs.metadata
     assert_same(envs.reset(seed=1), twin.reset(seed=1))
     for action in actions(40, envs.action_space):
         assert_same(envs.step(action), twin.step(action))
