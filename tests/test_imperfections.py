@@ -92,10 +92,17 @@ def test_each_keyword_single_and_vector(keywords):
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", TASKS)
 def test_every_environment(env_id):
-    names = make_task(env_id).observation
-    noisy = {"observation_noise": {names[0]: 0.1, names[-1]: 0.2}}
-    gravity = {"randomize": {"gravity": (0.9, 1.1)}}
-    played(env_id, 3, 60, duration=0.8, **ALL | noisy | gravity)
+    task = make_task(env_id)
+    names, drawn = (
+        task.observation,
+        next(n for n in task.scene._numbers() if 0.0 < getattr(task.scene, n) < 1e9),
+    )
+    keywords = ALL | {
+        "observation_noise": {names[0]: 0.1, names[-1]: 0.2},
+        "randomize": {drawn: (0.9, 1.1)},
+        "action_noise": None if task.formulas.choices else 0.1,
+    }
+    played(env_id, 3, 60, duration=40 * task.dt, **keywords)
 
 
 @pytest.mark.slow
@@ -516,3 +523,12 @@ def test_pictures_show_the_drawn_parameters():
     envs = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", **keywords)
     envs.reset(seed=1, options={"state": np.tile([0.0, 0.0, 0.5, 0.0], (2, 1))})
     assert not np.array_equal(*envs.render())
+
+
+@slow
+def test_a_piece_longer_by_a_rounding_than_the_lag_is_followed_is_taken():
+    env = gym.make("PivotedBarFree-v0", dt=0.05, lag=0.01, observation_delay=0.03)
+    env.reset(seed=5)
+    for _ in range(20):  # pieces of 0.020000000000000004 s
+        env.step(np.ones(1, np.float32))
+    assert env.unwrapped.control == pytest.approx(5.0)

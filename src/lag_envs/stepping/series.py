@@ -596,7 +596,9 @@ class Series:
             if name.startswith("decay_"):
                 gap = inputs[f"gap_{name.removeprefix('decay_')}"]
                 reach = t.add(inputs[ELAPSED], t.div(t.number(REACH), inputs[name]))
-                shorter = t.both(t.less(reach, h), t.less(t.number(0.0), t.abs(gap)))
+                # What is longer by a rounding only would leave a rest too short to be stepped.
+                over = t.less(t.mul(t.number(1.001), reach), h)
+                shorter = t.both(over, t.less(t.number(0.0), t.abs(gap)))
                 h = t.select(shorter, reach, h)
         return h
 
