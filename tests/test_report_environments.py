@@ -21,7 +21,7 @@ from lag_envs.report.stepped import Stepped
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
-#: Limit on the error of one second of an environment with an exact flow, relative to the state's size; measured 5.3e-16.
+#: Limit on the error of a second with an exact flow, relative to the state's size; measured 5.3e-16.
 ONE_SECOND = 2e-15
 
 
