@@ -18,9 +18,10 @@ from lag_envs.report.integrators import comparison
 from lag_envs.report.oracle import Oracle, oracle_of
 from lag_envs.report.runner import Result
 from lag_envs.report.stepped import Stepped
-from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.stepping.series import TOLERANCE
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
-#: Limit on the error of one second of any environment, relative to the state's size; measured 5.3e-16.
+#: Limit on the error of a second with an exact flow, relative to the state's size; measured 5.3e-16.
 ONE_SECOND = 2e-15
 
 
@@ -130,12 +131,16 @@ def same(path, start, given):
 
 @pytest.mark.parametrize("id", covering(PERFECT))
 def test_one_second_of_every_environment(id):
+    """Exact flows to rounding; series leave out what their certificate allows, in each step."""
     (row,) = environments.ours(id, seed=0, duration=1.0)
     assert row["seconds"] > 0.2
+    assert row["disagreement"] < 1e-25
+    if TASKS[id]().scene._form is None:
+        assert 0.0 < row["error"]["one step"] <= TOLERANCE and row["error"]["the end"] <= 1e-12
+        return
     assert row["error"]["the end"] <= ONE_SECOND
     assert 0.0 < row["error"]["one step"] < environment_results.LARGEST_STEP
     assert row["error"]["the end"] <= environment_results.ROUNDINGS * row["amplified"]["the end"]
-    assert row["disagreement"] < 1e-25
 
 
 @pytest.mark.slow
@@ -144,12 +149,13 @@ def test_one_second_of_every_environment(id):
 def test_every_step_of_whole_episodes(id, seed):
     """What README says of random actions; beside it stubborn ones, that spin a bar round and round."""
     (row,) = environments.ours(id, seed)
-    assert row["error"]["one step"] < environment_results.LARGEST_STEP
+    exact = TASKS[id]().scene._form is not None
+    assert row["error"]["one step"] < (environment_results.LARGEST_STEP if exact else 1e-12)
     env = gym.make(id, disable_env_checker=True)
     env.reset(seed=seed)
     episode = play(env, iter(actions(10_000, 1, seed=seed + 9)))
     row = environments.against_exact(env.unwrapped.task, episode, seed)
-    assert row["error"]["one step"] < 1e-14
+    assert row["error"]["one step"] < (1e-14 if exact else 1e-12)
 
 
 def test_one_step_is_the_worst_of_all_steps():
