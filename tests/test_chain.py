@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents import optimum, plans
 from lag_envs.controllers import build, make_controller
 from lag_envs.controllers.basic import Constant, feedback
 from lag_envs.controllers.chain import loss, replan
@@ -154,6 +155,22 @@ def test_plans_that_cannot_be_read(tmp_path):
         Tracking.load(chain.SwingUpTriple(), tmp_path / "plan.npz")
     again = Tracking.load(task, tmp_path / "plan.npz")
     assert again.gains.dtype == np.float64 and (again.gains == recorded(task).gains).all()
+
+
+@pytest.mark.slow
+def test_command_writes_plans_where_it_is_told(tmp_path, capsys, monkeypatch):
+    for name, number in {"batch": 6, "iterations": 10, "quick": {"steps": 60, "batch": 2}}.items():
+        monkeypatch.setattr(chain.SwingUp, name, number)
+    for name, number in {"PROMISING": 2, "EPISODES": 10, "STARTS": 1}.items():
+        monkeypatch.setattr(plans, name, number)
+    before = recorded(chain.SwingUp()).actions
+    assert optimum.main([chain.SwingUp.id, "--quick", "--folder", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "in 10 episodes" in said and "best of 3 plans" in said
+    made = {file.name: Tracking.load(chain.SwingUp(), file) for file in tmp_path.iterdir()}
+    assert sorted(name.rpartition("-")[2] for name in made) == ["followed.npz", "quick.npz"]
+    assert all(len(plan.actions) in (60, 65) for plan in made.values())
+    assert (recorded(chain.SwingUp()).actions == before).all()
 
 
 @pytest.mark.slow

@@ -237,7 +237,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     defaults = {**SwingUp.defaults, "track": 0.5}
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
-    quick = MappingProxyType({**SwingUp.quick, "steps": 108})
+    quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
