@@ -272,7 +272,7 @@ def test_references_are_controllers_that_are_known_and_help(env_id):
     assert 0.9 < score(env_id, mean) <= 1.003 and episodes >= 65_536
     agent = make_controller(env_id, name)
     few = play(env_id, agent, range(10**10, 10**10 + 500))
-    assert abs(few.mean() - mean) < 5.0 * few.std() / len(few) ** 0.5  # not another controller's mean
+    assert abs(few.mean() - mean) <= 5.0 * few.std() / len(few) ** 0.5  # not another controller's mean
     assert error == pytest.approx(few.std() / episodes**0.5, rel=0.25)
     if known.policy == name:
         assert known.best == pytest.approx(mean, abs=5.0 * error)
