@@ -120,9 +120,10 @@ def trial(env_id: str, changed: Mapping[str, Any], seed: int, steps: int, episod
 
 def search(env_id: str, count: int, seeds: int, steps: int, episodes: int, jobs: int, file: Path) -> Any:
     """Try settings that have not been tried, side by side; return all that was tried."""
-    about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
-    data = read(file, about) or about | {"machine": machine(), "settings": []}
     own = hyperparameters(LEARNER, env_id)
+    about: dict[str, Any] = {"env": env_id, "learner": LEARNER, "steps": steps, "episodes": episodes}
+    about["changed_from"] = own
+    data = read(file, about) or about | {"machine": machine(), "settings": []}
     for number in range(len(data["settings"]), count):
         changed = {name: value for name, value in drawn(number).items() if own[name] != value}
         data["settings"].append({"number": number, "changed": changed, "runs": []})
@@ -156,7 +157,8 @@ def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
             f"{file} cannot be read ({error!r}); remove it, or choose another --output"
         ) from error
     if different:
-        what = ", ".join(f"{name} {data[name]!r}" for name in different)
+        own = "other settings of the task"
+        what = ", ".join(own if name == "changed_from" else f"{name} {data[name]!r}" for name in different)
         raise UserError(f"{file} is of a search with {what}; choose another --output")
     return data
 
