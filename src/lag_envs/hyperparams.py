@@ -98,7 +98,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "ent_coef": 1e-3,
         "vf_coef": 0.5,
         "max_grad_norm": 3.0,
-        "reward_scale": 0.3,
+        "reward_scale": 0.1,
         "episode_share": 0.5,
         "state_noise": True,
         "noise_steps": 4,
