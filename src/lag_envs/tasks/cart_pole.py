@@ -404,7 +404,16 @@ class CartPoleSwingUp(_OnTrack):
         weights={"x": 0.1, "x_dot": 0.02, "theta": 1.0, "theta_dot": 0.02},
         effort=0.03,
     )
-    hyperparameters = {"ppo": {"gamma": 0.99}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.99},
+        "fast_ppo": {
+            "n_timesteps": 1e6,
+            "n_epochs": 5,
+            "reward_scale": 1.0,
+            "episode_share": 1.0,
+            "actor": [64, 64],
+        },
+    }
     examples = Examples(
         start={"state": [0.1, -0.2, 2.0, 3.0]},
         refused=[{"state": [2.5, 0.0, 0.0, 0.0]}],

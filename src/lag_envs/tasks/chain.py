@@ -157,6 +157,13 @@ class SwingUp(GuardedTrack, _Chain):
         "Two unstable bars on one control, within a short track. Energy alone does not do it: both bars have "
         "to come upright at the same moment and at rest, which the chaotic swing before makes hard to time."
     )
+    hyperparameters = {
+        "fast_ppo": {
+            "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
+            "first_layer_scale": 3.0,
+        },
+    }  # fmt: skip
     note = """
 Best known is planning anew for each start. One recorded plan with time-varying feedback is nearly as good,
 for all starts are near to each other.
@@ -264,6 +271,15 @@ class SwingUpTriple(SwingUp):  # noqa: D101
         batch=SwingUp.examples.batch,
         variants={"endless track": {"track": math.inf}},
     )
+    hyperparameters = {
+        "fast_ppo": {
+            "n_timesteps": 5e6,
+            "n_epochs": 5,
+            "reward_scale": 1.0,
+            "episode_share": 1.0,
+            "actor": [64, 64],
+        }
+    }
     difficulty = (
         "Three unstable bars on one control. The chain has to arrive nearly at rest in all three angles at "
         "once, and what is planned at the limits of the control cannot be corrected on the way."
@@ -485,6 +501,12 @@ class Balance(_Chain):
         "Two unstable bars on one control, and kicks at random. To push the bars back the support must first "
         "move the wrong way, which uses up the track."
     )
+    hyperparameters = {
+        "fast_ppo": {
+            "n_timesteps": 5e6, "n_epochs": 8, "batch_size": 2048, "clip_range": 0.1, "ent_coef": 3e-3,
+            "episode_share": 1.0, "log_std_init": 0.5, "critic": [128, 128],
+        },
+    }  # fmt: skip
     note = """
 The LQR is tuned for small deviations; feedback whose gains were searched for directly bears larger kicks.
 """

@@ -309,6 +309,14 @@ class SwingUpUnknown(SwingUp):
             tune={"catch": (0.5, 6.0), "lose": (6.0, 60.0), "pump": (0.3, 6.0), "centring": (1.0, 15.0)},
         ),
     }
+    hyperparameters = {
+        **SwingUp.hyperparameters,
+        "fast_ppo": {
+            "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
+            "first_layer_scale": 3.0,
+        },
+    }  # fmt: skip
     value_iteration = None
     examples = Examples(
         start=SwingUp.examples.start,

@@ -114,7 +114,13 @@ class RotarySwingUp(Task):
         weights={"phi": 0.1, "phi_dot": 0.002, "theta": 1.0, "theta_dot": 0.002},
         effort=0.1,
     )
-    hyperparameters = {"ppo": {"gamma": 0.99}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.99},
+        "fast_ppo": {
+            "n_timesteps": 1e6, "n_epochs": 8, "batch_size": 2048, "clip_range": 0.1, "ent_coef": 3e-3,
+            "episode_share": 1.0, "log_std_init": 0.5, "critic": [128, 128],
+        },
+    }  # fmt: skip
     examples = Examples(
         start={"state": [0.3, -2.0, 2.0, 3.0]},
         moving=[0.3, -8.0, 2.0, 12.0],
