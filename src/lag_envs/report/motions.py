@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -38,7 +39,9 @@ class SceneEquation(Equation):
 
     @cached_property
     def _motion(self) -> tuple[list[Expr], list[Expr]]:
-        numbers = {parameter(name): Expr.of(getattr(self.scene, name)) for name in self.scene._numbers()}
+        given = {name: getattr(self.scene, name) for name in self.scene._numbers()}
+        # What may be infinite, such as a track, is in no formula.
+        numbers = {parameter(name): Expr.of(x) for name, x in given.items() if math.isfinite(x)}
         found = self.scene.mechanics
         return [substitute(e, numbers) for e in found.entries()], [
             substitute(f, numbers) for f in found.force
