@@ -28,7 +28,11 @@ def go_on(env: gym.Env, steps: int, seed: int = 0) -> list:
     """Return all that is seen in so many steps, resets included."""
     rng, seen = np.random.default_rng(seed), []
     for _ in range(steps):
-        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        action = (
+            rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            if np.issubdtype(env.action_space.dtype, np.floating)
+            else rng.integers(0, 2, env.action_space.shape)
+        )
         try:
             results = env.step(action)
         except ResetNeeded:
