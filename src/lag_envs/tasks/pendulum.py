@@ -122,7 +122,7 @@ class PendulumExact(_Rod):
     fastest_seen = 8.0  # [rad/s]
 
     controllers = {
-        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+        "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
     hyperparameters = {"ppo": {"gamma": 0.95}}
@@ -238,12 +238,12 @@ class PendulumRegret(_Rod):
         arrival="upright",
     )
     optimum = Optimum(
-        "lag_envs.controllers.energy:value_at_start",
+        "lag_envs.controllers.pendulum:value_at_start",
         "pump the energy up, then act as a damped spring; V(start), which nobody exceeds",
     )
     controllers = {
-        "optimal law": Controller("lag_envs.controllers.energy:OwnLaw"),
-        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+        "optimal law": Controller("lag_envs.controllers.pendulum:OwnLaw"),
+        "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
     hyperparameters = {"ppo": {"gamma": 0.999}}
