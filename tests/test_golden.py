@@ -9,15 +9,32 @@ import functools
 
 import numpy as np
 import pytest
-from covering import PERFECT
+from covering import PERFECT, quick
 from golden_rollouts import GOLDEN, Roll, Run, planned, play, runs, stack
 
 from lag_envs.tasks import TASKS
 
 RUNS = runs()
-each_run = pytest.mark.parametrize("name", RUNS)
+IDS = dict.fromkeys(name.partition("/")[0] for name in RUNS)
+
+
+def each(ids):
+    """Return the runs of some ids as parameters; quick are those of a covering set, and one of every id."""
+    chosen = quick(ids)
+    runs = {name: name.partition("/")[::2] for name in RUNS}
+    return pytest.mark.parametrize(
+        "name",
+        [
+            pytest.param(name, marks=() if env_id in chosen or kind == "defaults" else pytest.mark.slow)
+            for name, (env_id, kind) in runs.items()
+            if env_id in ids
+        ],
+    )
+
+
+each_run = each(IDS)
 #: A step of the others depends on more than the state and the action.
-each_perfect_run = pytest.mark.parametrize("name", [n for n in RUNS if n.partition("/")[0] in PERFECT])
+each_perfect_run = each([env_id for env_id in IDS if env_id in PERFECT])
 TOLERANCE = 1e-12
 
 

@@ -112,7 +112,7 @@ class AcrobotExact(Task):
 
     controllers = {
         "switch": Controller(
-            "lag_envs.controllers.energy:Switch",
+            "lag_envs.controllers.basic:Switch",
             {"weights": {"sin(theta_1)": 1.3, "theta_1_dot": -0.3, "sin(theta_2)": -0.3, "theta_2_dot": 0.9}},
         )
     }
@@ -268,7 +268,7 @@ class AcrobotReal(Task):
     )
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
+            "lag_envs.controllers.acrobot:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
         ),
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
     }
@@ -367,7 +367,7 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of bot
     plans = dataclasses.replace(AcrobotReal.plans, steps=85)
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:PublishedLQR",
+            "lag_envs.controllers.acrobot:PublishedLQR",
             {"weights": (0.00125, 0.65, 0.000688, 0.000936), "effort": 25.0},
         ),
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),

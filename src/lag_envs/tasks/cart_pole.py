@@ -134,7 +134,7 @@ class CartPoleExact(_OnTrack):
 
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:Regulator",
+            "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1}, "effort": 0.01},
         )
     }
@@ -248,7 +248,7 @@ class CartPoleContinuous(_OnTrack):
     goal = Goal("success: not fallen, and on the track", hold=None, arrival="")
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:Regulator",
+            "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.03, "x_dot": 0.03, "theta": 10.0, "theta_dot": 0.21}, "effort": 5e-4},
             tune={"effort": (1e-4, 1.0)},
         )
