@@ -117,7 +117,7 @@ class PendulumExact(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
-    hyperparameters = {"ppo": {"gamma": 0.95}}
+    hyperparameters = {"ppo": {"gamma": 0.95}, "fast_ppo": {"gamma": 0.95, "episode_share": 1.0}}
     examples = Examples(
         start={"state": [2.0, 3.0]},
         moving=[2.0, 12.0],
@@ -249,7 +249,10 @@ class PendulumRegret(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
-    hyperparameters = {"ppo": {"gamma": 0.999}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.999},
+        "fast_ppo": {"n_timesteps": 1e6, "gamma": 0.995, "episode_share": 1.0},
+    }
     examples = Examples(
         start={"state": [2.0, 3.0]},
         moving=[2.0, 12.0],
