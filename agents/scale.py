@@ -26,7 +26,7 @@ from agents.learners import label
 from agents.measure import Entrant, learned
 from agents.optimum import Optimal, played
 from agents.results import ROOT, to_json
-from agents.run import RESULT, UserError, check_env, reports_errors
+from agents.run import RESULT, UserError, check_env, read_result, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
@@ -172,11 +172,12 @@ def measured(
 def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
     """Return of each learner the seed with the best mean return at the end of its training, by its label."""
     found: dict[str, Entrant] = {}
+    best: dict[str, float] = {}
     for file in sorted(runs.glob(f"{env_id}/*/seed*/{RESULT}")):
-        entrant = learned(env_id, file.parent)
+        entrant, mean = learned(env_id, file.parent), read_result(file)["mean_return"]
         name = label(entrant.name)
-        if name not in found or entrant.run["mean_return"] > found[name].run["mean_return"]:
-            found[name] = entrant
+        if mean > best.get(name, -np.inf):
+            found[name], best[name] = entrant, mean
     return found
 
 

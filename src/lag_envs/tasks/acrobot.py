@@ -291,7 +291,7 @@ class AcrobotReal(Task):
     hyperparameters = {
         "ppo": {"gamma": 0.999},
         "fast_ppo": {
-            "n_timesteps": 1e6, "n_steps": 256, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
+            "n_timesteps": 5e5, "n_steps": 256, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
             "reward_scale": 1.0, "noise_steps": 25,
         },
     }  # fmt: skip

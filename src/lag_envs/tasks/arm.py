@@ -104,7 +104,7 @@ class Reach(Task):
     hyperparameters = {
         "ppo": {"gamma": 0.98},
         "fast_ppo": {
-            "n_timesteps": 1e6, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
+            "n_timesteps": 5e5, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
             "actor": [64, 64],
         },
     }  # fmt: skip
