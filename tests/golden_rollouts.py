@@ -60,8 +60,9 @@ def runs() -> dict[str, Run]:
 def planned() -> dict[str, Run]:
     """Return what to record: runs of every task by its examples.
 
-    They are few and short, so that a file of all tasks stays small, and chaos does not get far. Of the tasks that were recorded first it
-    has longer ones, and batches in every mode of resetting, which is no matter of tasks.
+    They are few and short, so that a file of all tasks stays small, and chaos does not get far. Of the tasks
+    that were recorded first it has longer ones, and batches in every mode of resetting, which is no matter of
+    tasks.
     """
     out = {}
     for env_id, task in TASKS.items():
