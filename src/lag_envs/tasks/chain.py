@@ -505,7 +505,8 @@ class Balance(_Chain):
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 1e6, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0, "critic": [64, 64],
+            "n_timesteps": 1e6, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0,
+            "critic": [64, 64],
         },
     }  # fmt: skip
     note = """
