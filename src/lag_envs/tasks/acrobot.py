@@ -288,7 +288,13 @@ class AcrobotReal(Task):
         effort=0.5,
         smooth={"dry_friction": 0.0, "dry_friction_2": 0.0},
     )
-    hyperparameters = {"ppo": {"gamma": 0.999}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.999},
+        "fast_ppo": {
+            "n_timesteps": 5e5, "n_steps": 256, "batch_size": 2048, "gamma": 0.998, "gae_lambda": 0.95,
+            "reward_scale": 1.0, "noise_steps": 25,
+        },
+    }  # fmt: skip
     examples = Examples(
         start={"state": [2.8, -1.0, 0.3, 1.0]},
         moving=[1.0, 8.0, -1.0, -9.0],

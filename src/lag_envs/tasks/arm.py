@@ -101,7 +101,13 @@ class Reach(Task):
         ),
     }
     reference = "computed torque"
-    hyperparameters = {"ppo": {"gamma": 0.98}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.98},
+        "fast_ppo": {
+            "n_timesteps": 5e5, "n_epochs": 5, "gamma": 0.98, "reward_scale": 1.0, "episode_share": 1.0,
+            "actor": [64, 64],
+        },
+    }  # fmt: skip
     examples = Examples(
         start={"state": [-1.0, 1.0, 0.5, -1.0], "target": [0.4, 0.1]},
         moving=[-1.0, 6.0, 0.5, -9.0],

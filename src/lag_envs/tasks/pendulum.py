@@ -125,7 +125,7 @@ class PendulumExact(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
-    hyperparameters = {"ppo": {"gamma": 0.95}}
+    hyperparameters = {"ppo": {"gamma": 0.95}, "fast_ppo": {"gamma": 0.95, "episode_share": 1.0}}
     examples = dataclasses.replace(
         _Rod.examples,
         batch={
@@ -246,7 +246,10 @@ class PendulumRegret(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
-    hyperparameters = {"ppo": {"gamma": 0.999}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.999},
+        "fast_ppo": {"gamma": 0.995, "episode_share": 1.0},
+    }
     examples = dataclasses.replace(
         _Rod.examples,
         batch={

@@ -117,8 +117,8 @@ class RotarySwingUp(Task):
     hyperparameters = {
         "ppo": {"gamma": 0.99},
         "fast_ppo": {
-            "n_timesteps": 1e6, "n_epochs": 8, "batch_size": 2048, "clip_range": 0.1, "ent_coef": 3e-3,
-            "episode_share": 1.0, "log_std_init": 0.5, "critic": [128, 128],
+            "n_timesteps": 5e5, "n_steps": 32, "gamma": 0.97, "max_grad_norm": 1.0, "reward_scale": 1.0,
+            "state_noise": False, "log_std_init": 0.5, "critic": [64, 64],
         },
     }  # fmt: skip
     examples = Examples(
