@@ -8,6 +8,7 @@ from typing import Any
 
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.shapes import Bodies, Circle
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal
 
@@ -123,11 +124,7 @@ class Reach(Task):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosines, sines, scaled rates and the point."""
-        return {
-            "cos(theta_1)": xp.cos(after.theta_1),
-            "sin(theta_1)": xp.sin(after.theta_1),
-            "cos(theta_2)": xp.cos(after.theta_2),
-            "sin(theta_2)": xp.sin(after.theta_2),
+        return circle(after, "theta_1", "theta_2", xp=xp) | {
             "theta_1_dot/5": 0.2 * after.theta_1_dot,
             "theta_2_dot/10": 0.1 * after.theta_2_dot,
             "goal_x": target.goal_x,
@@ -136,7 +133,7 @@ class Reach(Task):
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of cosines and sines."""
-        return dict.fromkeys(list(self.quantities)[:4], 1.0)
+        return bounds_of_circle(self.quantities)
 
     def off(self, after: Any, target: Any, xp: Any) -> Any:
         """Return the square of the hand's distance from the point [m²]."""

@@ -9,6 +9,7 @@ from typing import Any
 from lag_envs.scenes import CartPole
 from lag_envs.scenes.shapes import Bodies, Line, Window, outlines
 from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
@@ -436,14 +437,13 @@ class CartPoleSwingUp(_OnTrack):
         return {
             "x/2.4": after.x * (1.0 / self.track),
             "x_dot/4": 0.25 * after.x_dot,
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
+            **circle(after, "theta", xp=xp),
             "theta_dot/8": 0.125 * after.theta_dot,
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds of cosine and sine."""
-        return {"cos(theta)": 1.0, "sin(theta)": 1.0}
+        return bounds_of_circle(self.quantities)
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² (1 - 0.1 a²) with the height h = (1 + cosθ)/2."""

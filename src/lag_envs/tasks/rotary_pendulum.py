@@ -8,6 +8,7 @@ from typing import Any
 
 from lag_envs.scenes import RotaryPendulum
 from lag_envs.scenes.shapes import Bodies, outlines
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
@@ -144,17 +145,15 @@ class RotarySwingUp(Task):
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosφ, sinφ, φ'/10, cosθ, sinθ, θ'/20."""
         return {
-            "cos(phi)": xp.cos(after.phi),
-            "sin(phi)": xp.sin(after.phi),
+            **circle(after, "phi", xp=xp),
             "phi_dot/10": 0.1 * after.phi_dot,
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
+            **circle(after, "theta", xp=xp),
             "theta_dot/20": 0.05 * after.theta_dot,
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of cosines and sines."""
-        return dict.fromkeys(("cos(phi)", "sin(phi)", "cos(theta)", "sin(theta)"), 1.0)
+        return bounds_of_circle(self.quantities)
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² (0.8 + 0.2 cosφ)(1 - 0.1 a²)."""
