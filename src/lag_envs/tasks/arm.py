@@ -44,11 +44,6 @@ class Reach(Task):
 
     Termination: never.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Both links are uniform.
@@ -57,10 +52,6 @@ class Reach(Task):
 
     SI units. θ₁ is measured from the level, counter-clockwise, so -π/2 hangs; θ₂ = 0 is stretched. Neither is
     wrapped. The shoulder is the origin, x to the right and y upward.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 

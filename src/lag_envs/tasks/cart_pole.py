@@ -209,11 +209,6 @@ class CartPoleContinuous(_OnTrack):
 
     Termination: |x| > 2.4 m or |θ| > 12 degrees at a step's end. That step pays nothing.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Upright and without a force, the pole of the default parameters falls e-fold in 0.25 s.
@@ -221,10 +216,6 @@ class CartPoleContinuous(_OnTrack):
     ## Signs and Units
 
     SI units. θ = 0 is upright and positive to the right, x positive to the right.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
@@ -331,11 +322,6 @@ class CartPoleSwingUp(_OnTrack):
 
     Termination: |x| > 2.4 m at a step's end. That step still pays.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Force and motion are coupled: the swinging pole acts back on the cart.
@@ -344,10 +330,6 @@ class CartPoleSwingUp(_OnTrack):
 
     SI units. θ = 0 is upright and θ = π hangs; θ is positive to the right and not wrapped. x is positive to
     the right.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 

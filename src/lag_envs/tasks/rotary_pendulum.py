@@ -43,11 +43,6 @@ class RotarySwingUp(Task):
 
     Termination: never.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     A fast arm throws the pendulum outwards: the term with φ'² sin(2θ).
@@ -55,10 +50,6 @@ class RotarySwingUp(Task):
     ## Signs and Units
 
     SI units. θ = 0 hangs straight down and θ = π stands; neither angle is wrapped.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
