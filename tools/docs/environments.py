@@ -328,7 +328,7 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
     if task.scene._form is None:
         texts.append(
             "Stepped by Taylor series. Each comes with a proved bound on what it leaves out: at most "
-            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. Where even that does not help, "
+            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. Where that does not help, "
             "say with a link of a millimetre, an error names state and control, and the state is kept."
         )
     for row in _summary_rows(accuracy, "environments"):
