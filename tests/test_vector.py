@@ -10,7 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, quick
+from covering import covering, engine, quick
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -21,6 +21,7 @@ from lag_envs.scenes.checks import StepRefused
 from lag_envs.tasks import TASKS, incline, pivoted_bar
 
 each_id = pytest.mark.parametrize("env_id", covering())
+each_engine = pytest.mark.parametrize("env_id", covering(of=engine))
 each_single = pytest.mark.parametrize("env_id", covering(SINGLE))
 MODES = ["NextStep", "SameStep", "Disabled"]
 each_mode = pytest.mark.parametrize("mode", MODES)
@@ -140,7 +141,7 @@ def test_same_bits_for_long(env_id, mode, n, steps):
     assert assert_alike(native, sync, steps, seed=2) >= n
 
 
-@each_id
+@each_engine
 @each_mode
 def test_same_bits_where_parameters_differ(env_id, mode):
     native, sync = mixed_pair(env_id, mode, **lasting(env_id, 250))
@@ -249,21 +250,21 @@ def test_disabled_asks_for_a_reset():
     envs = gym.make_vec("PivotedBar-v0", num_envs=3, autoreset_mode="Disabled", duration=0.1)
     envs.reset(seed=1)
     for _ in range(3):
-        envs.step(np.zeros((3, 1)))
+        envs.step(np.zeros((3, 1), np.float32))
     envs.reset(options={"reset_mask": np.array([False, True, False])})
     for _ in range(2):
-        *_, truncated, _ = envs.step(np.zeros((3, 1)))
+        *_, truncated, _ = envs.step(np.zeros((3, 1), np.float32))
     assert truncated.tolist() == [True, False, True]
     state = envs.state
     with pytest.raises(ResetNeeded, match=r"environments \[0, 2\] are over"):
-        envs.step(np.zeros((3, 1)))
+        envs.step(np.zeros((3, 1), np.float32))
     assert (envs.state == state).all()
     envs.reset(options={"reset_mask": np.array([True, False, False])})
     with pytest.raises(ResetNeeded, match=r"environments \[2\] are over"):
-        envs.step(np.zeros((3, 1)))
+        envs.step(np.zeros((3, 1), np.float32))
     envs.reset(options={"reset_mask": truncated})
     assert truncated.tolist() == [True, False, True]
-    envs.step(np.zeros((3, 1)))
+    envs.step(np.zeros((3, 1), np.float32))
 
 
 def test_the_mask_is_read_only():
@@ -386,7 +387,7 @@ def test_observations_stay_in_the_space(env_id):
 # --- copies and specs ---
 
 
-@each_id
+@each_engine
 @pytest.mark.parametrize(
     "clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
@@ -405,7 +406,7 @@ def test_copies_go_on_alike(env_id, clone):
     assert twin.metadata == envs.metadata and twin.spec == envs.spec
 
 
-@each_id
+@each_engine
 def test_spec_survives_json(env_id):
     envs = gym.make_vec(
         env_id, lanes(env_id), autoreset_mode="SameStep", max_episode_steps=30, **TASKS[env_id].examples.batch
@@ -426,7 +427,8 @@ def test_spec_of_arrays_and_enums_survives_json():
     twin = gym.make_vec(EnvSpec.from_json(envs.spec.to_json()))
     assert twin.spec == envs.spec and twin.metadata == envs.metadata
     assert_same(envs.reset(seed=1), twin.reset(seed=1))
-    assert_same(envs.step(np.ones((3, 1))), twin.step(np.ones((3, 1))))
+    push = np.ones((3, 1), np.float32)
+    assert_same(envs.step(push), twin.step(push))
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -500,7 +502,7 @@ def test_bad_actions(action):
     envs, twin = running(3), running(3)
     with pytest.raises(ValueError, match=r"actions|inhomogeneous"):
         envs.step(action)
-    assert_same(envs.step(np.zeros((3, 1))), twin.step(np.zeros((3, 1))))
+    assert_same(envs.step(np.zeros((3, 1), np.float32)), twin.step(np.zeros((3, 1))))
 
 
 def test_other_actions_mean_their_value():

@@ -10,6 +10,7 @@ from typing import Any
 from lag_envs.scenes import Pendulum
 from lag_envs.scenes.shapes import Bodies, outlines
 from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Optimum
 
@@ -33,10 +34,6 @@ class _Rod(Task):
         "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
         "sin(theta)": ("1", "its sine"),
     }
-
-    def observe_direction(self, after: Any, xp: Any) -> dict[str, Any]:
-        """Return cosθ and sinθ."""
-        return {"cos(theta)": xp.cos(after.theta), "sin(theta)": xp.sin(after.theta)}
 
     def bodies(self) -> Bodies:
         """Add the upright rod."""
@@ -141,11 +138,11 @@ class PendulumExact(_Rod):
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ and the clipped θ'."""
         top = self.fastest_seen
-        return self.observe_direction(after, xp) | {"theta_dot": clip(after.theta_dot, -top, top, xp)}
+        return circle(after, "theta", xp=xp) | {"theta_dot": clip(after.theta_dot, -top, top, xp)}
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of Gymnasium's space."""
-        return dict.fromkeys(self.direction, 1.0) | {"theta_dot": self.fastest_seen}
+        return bounds_of_circle(self.direction) | {"theta_dot": self.fastest_seen}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return -(θ² + 0.1 θ'² + 0.001 u²) with the state before the step."""
@@ -267,13 +264,13 @@ class PendulumRegret(_Rod):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ, θ'/8."""
-        return self.observe_direction(after, xp) | {"theta_dot/8": 0.125 * after.theta_dot}
+        return circle(after, "theta", xp=xp) | {"theta_dot/8": 0.125 * after.theta_dot}
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation: the speed's is start + (w + U)/J · length."""
         inertia, weight = self._numbers()
         fastest = FASTEST_START + (weight + self.action["torque"]) / inertia * self.duration
-        return dict.fromkeys(self.direction, 1.0) | {"theta_dot/8": 0.125 * fastest}
+        return bounds_of_circle(self.direction) | {"theta_dot/8": 0.125 * fastest}
 
     def value(self, state: Any, xp: Any) -> Any:
         """Return V: 100 (w (1 - cosθ) + J θ'²/2)/(2w)."""
