@@ -309,7 +309,11 @@ class Stepper:
 
         def vjp(xp: Any, numbers: Mapping[str, Any]) -> list:
             state, u = [numbers[name] for name in y], [numbers[name] for name in self.controls]
-            lifted = state if self._angle is None else [*state, xp.cos(state[self._angle]), xp.sin(state[self._angle])]
+            lifted = (
+                state
+                if self._angle is None
+                else [*state, xp.cos(state[self._angle]), xp.sin(state[self._angle])]
+            )
             k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._names})
             variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
             moved = flow.fast(variables, coefficients, numbers["dt"], xp)
