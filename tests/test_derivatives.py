@@ -114,3 +114,19 @@ def test_what_has_no_derivative():
         Spring().jacobian([1.0, 0.0], parameters=["reach"])
     a, _, p = Spring().jacobian([1.0, 0.0], parameters=["mass", "softness"])
     assert a.shape == (2, 2) and np.isfinite(p).all()
+
+
+@pytest.mark.parametrize("env_id", covering())
+def test_vjp_is_the_jacobian_transposed(env_id):
+    """At rest, at moderate and at high speeds, where the step is divided."""
+    scene, rng = TASKS[env_id]().scene, seeded(env_id)
+    n, names = len(scene.state_names), finite(scene)
+    states = rng.uniform(-1.0, 1.0, (3, 4, n)) * np.array([0.0, 2.0, 20.0])[:, None, None]
+    controls = rng.uniform(0.0, 2.0, (3, 4, len(scene.control_names)))
+    seeds = rng.uniform(-1.0, 1.0, states.shape)
+    jacobian = scene.jacobian(states, controls, 0.02, parameters=names)
+    found = scene.vjp(states, controls, 0.02, seeds, parameters=names)
+    for x, matrix in zip(found, jacobian, strict=True):
+        expected = np.einsum("...i,...ij->...j", seeds, matrix)
+        size = np.einsum("...i,...ij->...j", np.abs(seeds), np.abs(matrix))
+        np.testing.assert_array_less(np.abs(x - expected), 1e-12 * size + 1e-15)

@@ -585,6 +585,50 @@ class Scene(metaclass=SceneType):
         """
         return steps.jacobian(self, state, control, dt, parameters)
 
+    def vjp(
+        self,
+        state: ArrayLike,
+        control: ArrayLike,
+        dt: float,
+        cotangent: ArrayLike,
+        *,
+        parameters: Sequence[str] | None = None,
+    ) -> tuple[Array, ...]:
+        """Return a gradient by the state after a control step as gradients by what the step depends on.
+
+        This is reverse mode: row by row the product of `cotangent` with what `jacobian` returns, in less
+        time.
+
+        Parameters
+        ----------
+        state, control, dt, parameters
+            As for `jacobian`.
+        cotangent : array_like, shape (..., n_state)
+            The gradient of something by the entries of the state after the step.
+
+        Returns
+        -------
+        state : ndarray, shape (..., n_state)
+            Its gradient by the state before the step.
+        control : ndarray, shape (..., n_controls)
+            By the controls.
+        parameters : ndarray, shape (..., n_parameters)
+            By the parameters; only where they were asked for.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As `jacobian` does; ValueError also for a cotangent of another shape.
+
+        Examples
+        --------
+        >>> from lag_envs.scenes import PivotedBar
+        >>> by_state, by_control = PivotedBar().vjp([0.0, 0.0, 3.0, 0.1], 2.0, 0.02, [0.0, 0.0, 1.0, 0.0])
+        >>> by_state.shape, by_control.shape
+        ((4,), (1,))
+        """
+        return steps.vjp(self, state, control, dt, cotangent, parameters)
+
     def _mechanics_by(self, parameters: tuple[str, ...]) -> Mechanics:
         """Return the equations of motion with these parameters in them, be they 0."""
         if not set(parameters) & set(self.mechanics.zeros):

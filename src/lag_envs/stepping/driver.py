@@ -200,7 +200,7 @@ def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-unty
 def compile_advance_tangents(
     record: SeriesRecord, columns: tuple[str, ...], guided: bool = False, tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``advance(values, slopes, guide, dt, order)``; see `_advance_tangents` and `compile_tangent`."""
+    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents`, `compile_tangent`."""
     helpers = compile_attempt(record, 1), compile_tangent(record, columns)
     numbers = _numbers(record, tolerance) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)

@@ -343,6 +343,14 @@ class SeriesTangent:
         finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, k)
         return stacked(finished, count), 0
 
+    def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
+        """Return cotangents of the states at the step's end as those of states, controls and parameters.
+
+        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
+        """
+        found, refused = self.jacobian(states, controls, dt, order)
+        return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+
 
 class StepBound(NamedTuple):
     """How a control step is divided, and what its series leave out.

@@ -182,8 +182,7 @@ class NormalForm:
         Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
         `rates` their derivatives by the parameters.
         """
-        absent = frozenset(name for name, value in constants.items() if value == 0.0)
-        stepper = self.stepper(dt, absent)
+        stepper, absent = self._stepper(dt, constants)
         by = tuple(
             name
             for name, terms in self.terms.items()
@@ -200,6 +199,45 @@ class NormalForm:
             by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
             found = np.concatenate([found[..., :first], found[..., first:] @ by_constants], axis=-1)
         return found, refused
+
+    def vjp(
+        self,
+        states: Any,
+        controls: Any,
+        constants: Mapping[str, float],
+        dt: float,
+        cotangents: Any,
+        rates: Mapping[str, Sequence[float]],
+        parameters: int,
+    ) -> tuple[Any, int]:
+        """Return what cotangents of the states at the step's end are as those of states, controls, parameters.
+
+        The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
+        """
+        stepper, _ = self._stepper(dt, constants)
+        width = states.shape[1] + controls.shape[1]
+        given = np.concatenate([states.T, controls.T, cotangents.T])
+        found = np.empty((width + len(rates) + 1, len(states)))
+        numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
+        stepper.compile_vjp(tuple(rates))(given, found, numbers)
+        slopes = np.empty((len(states), width + parameters))
+        slopes[:, :width] = found[:width].T
+        if parameters:
+            by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
+            slopes[:, width:] = found[width:-1].T @ by_constants
+        (others,) = np.nonzero(found[-1] == 0.0)
+        if len(others):
+            some = np.ascontiguousarray(states[others]), np.ascontiguousarray(controls[others])
+            jacobian, refused = self.jacobian(*some, constants, dt, rates, parameters)
+            if refused:
+                return slopes, int(others[refused - 1]) + 1
+            slopes[others] = np.einsum("ni,nij->nj", cotangents[others], jacobian)
+        return slopes, 0
+
+    def _stepper(self, dt: float, constants: Mapping[str, float]) -> tuple[Stepper, frozenset[str]]:
+        """Return the code of a step with these constants, and those that are zero."""
+        absent = frozenset(name for name, value in constants.items() if value == 0.0)
+        return self.stepper(dt, absent), absent
 
     # --- what depends on numbers ---------------------------------------------------------------------------
 
