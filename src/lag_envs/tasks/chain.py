@@ -274,7 +274,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 1e6,
+            "n_timesteps": 5e5,
             "n_epochs": 5,
             "reward_scale": 1.0,
             "episode_share": 1.0,
