@@ -229,7 +229,7 @@ def test_whole_step(env_id):
 
 def test_what_is_clipped_has_no_gradient():
     model = Model(TASKS["PivotedBar-v0"]())
-    states, actions = np.zeros((4, 4)) + [0.0, 0.0, 3.0, 0.0], [-1.5, -1.0, 1.0, 1.5]
+    states, actions = [[0.0, 0.0, 3.0, 0.0]] * 4, [-1.5, -1.0, 1.0, 1.5]
     found = model.vjp(states, actions, by_states=[0.0, 1.0, 0.0, 1.0])
     np.testing.assert_array_equal(found.actions[[0, 3]], 0.0)
     assert (np.abs(found.actions[[1, 2]]) > 0.1).all()
@@ -245,8 +245,8 @@ def test_kicks_are_constants():
     # The observation of the kicked state, moved with the state before the kick.
     h = 1e-6
     for j in range(4):
-        step = h * np.eye(4)[j]
-        above, below = (model.observe(model(states + side, actions[:, 0])[0] + kicks) for side in (step, -step))
+        sides = states + h * np.eye(4)[j], states - h * np.eye(4)[j]
+        above, below = (model.observe(model(side, actions[:, 0])[0] + kicks) for side in sides)
         np.testing.assert_allclose(found.states[:, j], (above - below).sum(axis=1) / (2 * h), atol=1e-7)
 
 
