@@ -199,8 +199,8 @@ class TorchVectorEnv:
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every environment, or in those of a mask; see `LagrangianVectorEnv.reset`.
 
-        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of what
-        follows reach it, but not through the observations that are returned here.
+        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of
+        what follows reach it, but not through the observations that are returned here.
 
         Returns
         -------

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
-from lag_envs.envs.single import absent
 from lag_envs.envs.reverse import Reverse
+from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.tasks.base import Task
 

@@ -73,7 +73,7 @@ class Reverse:
         return rewards, ended > 0.0
 
     def after(self, *given: Array) -> list[Array]:
-        """Return gradients by what follows the motion as those by states, ends, controls, targets, parameters.
+        """Return gradients by states, ends, controls, targets and parameters from those by what follows.
 
         Given are states before and after the motion, controls, targets and states after the kick; then the
         gradients by the last ones, by the observations and by the reward.
