@@ -322,9 +322,9 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
     )
     examples = dataclasses.replace(SwingUpTriple.examples, variants={"perfect": {"observation_noise": None}})
     difficulty = (
-        "In the linear approximation a filter's estimate would do, with control and track to spare. But under "
-        "what is left of the noise the chain strays farther than that reaches, and is lost on the way up or "
-        "at the top."
+        "In the linear approximation a filter's estimate would do, with control and track to spare. But "
+        "under what is left of the noise the chain strays farther than that reaches, and is lost on the way "
+        "up or at the top."
     )
     note = """
 Best is the plan followed gently by a filter's estimate. Whoever sees the exact state hardly ever loses the
