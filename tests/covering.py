@@ -22,7 +22,7 @@ from lag_envs.tasks.base import Task
 WORDS_AND_NUMBERS = frozenset(
     "id scene defaults interval steps action start target usable usable_ranges check check_start fastest "
     "edges observe bounds reward reached behaviour controllers reference hyperparameters goal "
-    "value_iteration examples difficulty note quantities".split()
+    "value_iteration examples difficulty note open quantities".split()
 )
 #: What a covering set covers.
 Features = Callable[[type[Task]], frozenset[str]]

@@ -226,6 +226,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "title": given["id"],
         "about": [],
         "difficulty": "",
+        "open": None,
         "drives": [],
     }
     board |= {"protocol": protocol} | given | describe(given["id"])
