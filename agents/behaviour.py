@@ -8,6 +8,7 @@ which ``python -m agents.results --redraw`` makes that page's tables of it.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.learners import LEARNERS, label
 from agents.results import ROOT, to_json
 from agents.run import FIRST_FRESH_SEED, check_env, fresh_seeds, reports_errors
 from agents.submit import AUTHORS
@@ -67,7 +69,8 @@ def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, 
     for folder in sorted(submissions.glob(f"{env_id}-*")):
         found = load(folder)
         if found.kind == "learned" and list(found.authors) == AUTHORS:
-            yield found.name.lower(), [policy.agent() for _, policy in found.policies]
+            names = {label(algo): algo for algo in LEARNERS}
+            yield names[found.name], [policy.agent() for _, policy in found.policies]
 
 
 def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float]]]:
@@ -83,17 +86,22 @@ def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return 0, or 2 for a user's mistake."""
     p = argparse.ArgumentParser(prog="python -m agents.behaviour", description=__doc__)
-    p.add_argument("env", nargs="*", metavar="ID", help="print those of some environments, and write nothing")
+    p.add_argument(
+        "env", nargs="*", metavar="ID", help="measure some environments; others keep their numbers"
+    )
     args = p.parse_args(arguments)
     envs = [check_env(name) for name in args.env] or [env_id for env_id, task in TASKS.items() if task.goal]
     found: dict[str, Any] = {}
+    if args.env and OUTPUT.exists():
+        found = json.loads(OUTPUT.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
         found[env_id] = rounded(measured(env_id))
         for name, measures in found[env_id].items():
             lines = (f"{key}: {values}" for key, values in measures.items())
             print(env_id, name, *lines, sep="\n  ", flush=True)
-    if not args.env:
-        write(OUTPUT, to_json({"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED, "envs": found}))
+        in_order = {name: found[name] for name in TASKS if name in found}
+        about = {"episodes": EPISODES, "first_seed": FIRST_FRESH_SEED}
+        write(OUTPUT, to_json(about | {"envs": in_order}))
     return 0
 
 

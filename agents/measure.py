@@ -232,11 +232,25 @@ class Evaluation:
         if not first:
             self.absent.append("learners: no finished run")
 
-    def jobs(self, names: Sequence[str] | None, episodes: int) -> list[Job]:
-        """Return what is measured of agents of some names; in fewer episodes of those that plan."""
-        few = min(episodes, PLANNED)
+    def jobs(self, names: Sequence[str] | None, episodes: int, changed: int | None = None) -> list[Job]:
+        """Return what is measured of agents of some names.
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            The agents; by default all.
+        episodes : int
+            How many are played.
+        changed : int, optional
+            At most so many where something is changed; by default `PLANNED` of agents that plan.
+        """
+
+        def count(entrant: Entrant, condition: Condition) -> int:
+            most = changed or (PLANNED if entrant.plans else episodes)
+            return episodes if condition.name == NOMINAL else min(episodes, most)
+
         return [
-            Job(entrant, condition, few if entrant.plans and condition.name != NOMINAL else episodes)
+            Job(entrant, condition, count(entrant, condition))
             for entrant in self.entrants
             if names is None or entrant.name in names
             for condition in conditions(self.env)

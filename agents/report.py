@@ -288,12 +288,15 @@ def _method(data: Data) -> str:
 def _fewer(data: Data) -> list[str]:
     """Tell which agents took too long for all episodes."""
     found: dict[tuple[str, int], None] = {}
-    for env in data["envs"].values():
+    for env_id, env in data["envs"].items():
+        fewer = {}
         for name, agent in env["agents"].items():
-            most = agent["conditions"][NOMINAL]["episodes"]
-            found |= {
-                (name, c["episodes"]): None for c in agent["conditions"].values() if c["episodes"] < most
-            }
+            counts = [condition["episodes"] for condition in agent["conditions"].values()]
+            if min(counts) < agent["conditions"][NOMINAL]["episodes"]:
+                fewer[name] = min(counts)
+        alike = len(fewer) == len(env["agents"]) > 1 and len(set(fewer.values())) == 1
+        some = {f"all of {env_id}": n for n in fewer.values()} if alike else fewer
+        found |= dict.fromkeys(some.items())
     if not found:
         return []
     names = ", ".join(f"{name} in {n:,} episodes only" for name, n in found)

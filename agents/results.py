@@ -58,6 +58,7 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="FOLDER", help="default: this checkout; with --quick, RUNS/quick"
     )
     p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
+    p.add_argument("--changed", type=int, metavar="N", help="at most so many where something is changed")
     p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether all works")
     p.add_argument("--new", action="store_true", help="forget what the summary has of other agents")
     p.add_argument("--redraw", action="store_true", help="measure nothing: figures and page from the summary")
@@ -77,10 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes = usual if args.episodes is None else args.episodes
         if not 1 <= episodes <= 1_000_000:
             raise UserError(f"--episodes must lie between 1 and 1000000, got {episodes}")
+        if args.changed is not None and args.changed < 1:
+            raise UserError(f"--changed must be at least 1, got {args.changed}")
         if not args.new:
             load_summary(output)  # better now than when all is measured
         with terminable():
-            found = measure_all(envs, args.agents, args.runs, episodes)
+            found = measure_all(envs, args.agents, args.runs, episodes, args.changed)
             # Only now: another command may have written it meanwhile.
             data = summarise(found, usual, {} if args.new else load_summary(output))
             write(output / SUMMARY, to_json(data))
@@ -102,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def measure_all(
-    envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int
+    envs: Sequence[str], names: Sequence[str] | None, runs: Path, episodes: int, changed: int | None
 ) -> list[tuple[Evaluation, list[Job]]]:
     """Measure what has not been measured; return the environments with all that there is to measure."""
     if runs.exists() and not runs.is_dir():
@@ -112,7 +115,7 @@ def measure_all(
         there = {entrant.name for evaluation in evaluations for entrant in evaluation.entrants}
         if unknown := sorted(set(names) - there):
             raise UserError(f"there is no agent {unknown[0]!r} here; there are {', '.join(sorted(there))}")
-    found = [(evaluation, evaluation.jobs(names, episodes)) for evaluation in evaluations]
+    found = [(evaluation, evaluation.jobs(names, episodes, changed)) for evaluation in evaluations]
     jobs = [(evaluation, job) for evaluation, own in found for job in own]
     todo = [(evaluation, job) for evaluation, job in jobs if job.key not in evaluation.returns]
     print(f"{len(jobs)} measurements, {len(jobs) - len(todo)} of them made before", flush=True)

@@ -5,7 +5,8 @@ the board's reference, and prints means and standard errors beside the numbers i
 long plays the first of the episodes only, and the luck in them is taken out by what the reference gets there
 and in all (a control variate); what the reference is set to comes from other episodes, independent of all
 that. ``--output src/lag_envs/tasks/measured.json`` keeps the numbers, and README shows them: what is in use
-stays, an environment without gets its own, the best of its controllers being the best known.
+stays, an environment without gets its own. The best known is then the best of its controllers and of the
+learners that were trained, of each of which the seed that ended best plays.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.learners import label
+from agents.measure import Entrant, learned
 from agents.optimum import Optimal, played
-from agents.results import to_json
-from agents.run import UserError, check_env, reports_errors
+from agents.results import ROOT, to_json
+from agents.run import RESULT, UserError, check_env, read_result, reports_errors
 from lag_envs import TASKS
 from lag_envs.controllers import build, controllers, make_controller
 from lag_envs.evaluation.rollout import Rollout, play
@@ -59,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     p.add_argument("--quick", action="store_true", help="leave out policies that take long")
     p.add_argument(
+        "--runs", type=Path, default=ROOT / "runs", metavar="FOLDER", help="learners' runs (default runs/)"
+    )
+    p.add_argument(
         "--output", type=Path, metavar="FILE", help="keep the numbers as JSON, beside others' there"
     )
     args = p.parse_args(arguments)
@@ -73,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         kept = json.loads(args.output.read_text(encoding="utf-8"))["envs"]
     for env_id in envs:
         before = kept.get(env_id, of_package(env_id))
-        kept[env_id] = measured(env_id, args.batches, args.quick, before, args.size, args.planned)
+        kept[env_id] = measured(env_id, args.batches, args.quick, before, args.size, args.planned, args.runs)
         if args.output:
             about = {"command": "python -m agents.scale", "date": datetime.date.today().isoformat()}
             about["machine"] = machine()
@@ -90,6 +96,7 @@ def measured(
     kept: dict[str, Any] | None = None,
     size: int = BATCH,
     planned: int = PLANNED,
+    runs: Path = ROOT / "runs",
 ) -> dict[str, Any]:
     """Measure an environment's policies, and print a line for each.
 
@@ -107,6 +114,8 @@ def measured(
         Episodes of a batch, `BATCH` at most.
     planned : int
         Episodes of a policy that plans.
+    runs : Path
+        Where learners' runs are.
 
     Returns
     -------
@@ -118,10 +127,11 @@ def measured(
     """
     kept, task = dict(kept or {}), TASKS[env_id]()
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
-    known = controllers(task)
+    known, learners = controllers(task), trained(env_id, runs)
     slow = {name: planned for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
-    everyone = not scale or task.open
-    names = ["random", "zero", *(task.controllers if everyone else [scale["policy"]])]
+    names = ["random", "zero", *([scale["policy"]] if scale else [])]
+    if not scale or task.open:
+        names += [*task.controllers, *learners]
     if not scale and env_id in played():
         names.append("optimal")
     found: dict[str, Any] = {}
@@ -133,23 +143,30 @@ def measured(
 
     in_use = {"random": scale["random"], scale["policy"]: scale["best"]} if scale else {}
     for name in dict.fromkeys(names):
-        if name not in slow:
-            returns = many(env_id, name, batches, size)
+        if name not in {*known, *learners, "optimal"}:
+            print(f"{env_id:28} {name:20} is not in {runs}; what was measured of it before stays", flush=True)
+            found[name] = kept["measured"][name]
+        elif name not in slow:
+            agent = learners[name].make() if name in learners else make_controller(env_id, name)
+            returns = many(env_id, agent, batches, size)
             show(name, *mean_and_error(returns), len(returns), in_use.get(name))
         elif not quick:
             agent = Optimal(env_id) if name == "optimal" else build(task, name)
             returns = play(env_id, agent, range(FIRST_SEED, FIRST_SEED + slow[name]))
-            same = many(env_id, task.reference, batches, size) if task.reference else None
+            same = None
+            if task.reference:
+                same = many(env_id, make_controller(env_id, task.reference), batches, size)
             show(name, *without_luck(returns, same), len(returns), in_use.get(name))
     if task.reference:
-        returns = many(env_id, task.reference, batches, size, REFERENCE_SEED)
+        returns = many(env_id, make_controller(env_id, task.reference), batches, size, REFERENCE_SEED)
         show("reference", *mean_and_error(returns), len(returns), used)
         kept.setdefault("reference", found["reference"])
     if task.optimum:
         best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH, size) for k in range(batches)])
         show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
     if task.open:
-        returns = many(env_id, task.open.controller, batches, size, **task.open.options)
+        agent = make_controller(env_id, task.open.controller, **task.open.options)
+        returns = many(env_id, agent, batches, size, **task.open.options)
         show("privileged", *mean_and_error(returns), len(returns))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
@@ -159,9 +176,20 @@ def measured(
     return {"scale": scale} | kept | {"measured": found}
 
 
-def many(env_id: str, name: str, batches: int, size: int, first: int = FIRST_SEED, **options: Any) -> Array:
-    """Return a quick controller's returns, in the environment with these keywords."""
-    agent = make_controller(env_id, name, **options)
+def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
+    """Return of each learner the seed with the best mean return at the end of its training, by its label."""
+    found: dict[str, Entrant] = {}
+    best: dict[str, float] = {}
+    for file in sorted(runs.glob(f"{env_id}/*/seed*/{RESULT}")):
+        entrant, mean = learned(env_id, file.parent), read_result(file)["mean_return"]
+        name = label(entrant.name)
+        if mean > best.get(name, -np.inf):
+            found[name], best[name] = entrant, mean
+    return found
+
+
+def many(env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED, **options: Any) -> Array:
+    """Return a quick policy's returns, in the environment with these keywords."""
     firsts = (first + k * BATCH for k in range(batches))
     return np.concatenate([play(env_id, agent, range(first, first + size), **options) for first in firsts])
 

@@ -13,10 +13,13 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from agents import bench, demo, report, scale
+from agents import bench, demo, ppo, report, scale
+from lag_envs.controllers import make_controller
+from lag_envs.evaluation.rollout import play
 from lag_envs.sb3 import ScaledReward, VecEnv, make_vec_env
 from lag_envs.scores import known_returns, score
-from lag_envs.tasks import cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
+from lag_envs.tasks.measured import measured
 from tools.missing import have
 
 ROOT = Path(__file__).parents[1]
@@ -244,3 +247,26 @@ def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     mean, error, used = (float(x) for x in re.findall(r"-?\d+\.\d+", line))
     assert abs(mean - used) < 5.0 * error < 1.0
     assert scale.main(["PivotedBra-v0"]) == 2 and scale.main(["--batches", "0"]) == 2
+
+
+def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
+    """The best seed of each plays; where it is the best known and not there any more, its numbers stay."""
+    env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured(incline.Brake.id)
+    for seed, (push, mean) in enumerate([(-1.0, -12.0), (1.0, -2.0), (0.5, -3.0)]):
+        folder = runs / env_id / "fast_ppo" / f"seed{seed}"
+        folder.mkdir(parents=True)
+        layer = np.zeros((1, len(TASKS[env_id]().observation)), np.float32), np.array([push], np.float32)
+        ppo.Policy([layer], ()).save(folder / "model.zip")
+        result = {"schema": 1, "env": env_id, "algo": "fast_ppo", "seed": seed, "trained": 1, "steps": 1}
+        result |= {"wall_seconds": 1.0, "mean_return": mean, "score": 0.0, "curve": [], "hyperparameters": {}}
+        (folder / "result.json").write_text(json.dumps(result | {"evaluation": {"returns": []}}))
+    new = scale.measured(env_id, 1, True, {}, 100, runs=runs)
+    constant = make_controller(env_id, "full damping")
+    expected = play(env_id, constant, range(scale.FIRST_SEED, scale.FIRST_SEED + 100)).mean()
+    assert new["measured"]["fast PPO"]["mean"] == pytest.approx(expected, abs=1e-6)
+    assert new["scale"]["policy"] == before["scale"]["policy"]
+    best = before | {"scale": new["scale"] | {"policy": "fast PPO"}, "measured": new["measured"]}
+    capsys.readouterr()
+    gone = scale.measured(env_id, 1, True, best, 100, runs=tmp_path / "none")
+    assert gone["measured"]["fast PPO"] == new["measured"]["fast PPO"]
+    assert "fast PPO             is not in" in capsys.readouterr().out

@@ -19,7 +19,7 @@ from lag_envs import scores
 from lag_envs.leaderboard import board as module
 from lag_envs.leaderboard import protocol, ranking, standings, submission
 from lag_envs.leaderboard.board import Board, BoardError, closed, id_of
-from lag_envs.leaderboard.log import fold, parse
+from lag_envs.leaderboard.log import Line, fold, parse
 from lag_envs.leaderboard.parallel import map_submissions, packed
 from lag_envs.leaderboard.pending import finish
 from lag_envs.leaderboard.protocol import first_seed
@@ -326,6 +326,44 @@ def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):
     board.publish("3")
     finish(board)
     assert states(board) == {old: "superseded", waiting: "verified", gone: "verified", new: "verified"}
+
+
+def test_boards_of_new_environments_join_the_protocol(board, monkeypatch):
+    new = pivoted_bar.SwingUpFree.id
+    tasks = {name: task for name, task in module.TASKS.items() if name != new}
+    with monkeypatch.context() as before:
+        for place in (module, protocol, standings):
+            before.setattr(place, "TASKS", tasks)
+        old = add(board, nonce="1")
+        shown = board_data(board, "today")["environments"][0]
+    with pytest.raises(BoardError, match="add to a board of protocol 1: success differ"):
+        add(board, "TQC")
+    assert board.open() == 1 and events(board)[-1] == "opened"
+    joined = board.read().protocols[1]
+    assert set(joined.scales) == set(protocol.boards()) and joined.rules.model_dump() == protocol.rules()
+    assert joined.references.keys() == {id for id in protocol.boards() if protocol.reference(id)}
+    assert states(board) == {old: "verified"}  # nothing is verified anew
+    assert board_data(board, "today")["environments"][0] == shown
+    other = add(board, env=new, nonce="2")
+    assert states(board) == {old: "verified", other: "verified"}
+    told = next(line for line in parse(board.log.read_bytes())[0] if line.event.event == "opened")
+    again = [
+        *parse(board.log.read_bytes())[0],
+        Line(99, told.event.model_copy(update={"at": board.read().last})),
+    ]
+    with pytest.raises(BoardError, match=f"{new} joins protocol 1, and has a board there already"):
+        fold(again)
+    assert board.open() == 2  # now that all are there
+
+
+def test_boards_join_no_protocol_of_other_rules(board, monkeypatch):
+    tasks = {name: task for name, task in module.TASKS.items() if name != pivoted_bar.SwingUpFree.id}
+    with monkeypatch.context() as before:
+        for place in (module, protocol, standings):
+            before.setattr(place, "TASKS", tasks)
+        add(board, nonce="1")
+    monkeypatch.setattr(protocol, "LEARNED_POLICIES", 7)
+    assert board.open() == 2
 
 
 def test_a_later_record_does_not_move_the_scale_of_a_board(board, monkeypatch):

@@ -9,15 +9,32 @@ import functools
 
 import numpy as np
 import pytest
-from covering import PERFECT
+from covering import PERFECT, quick
 from golden_rollouts import GOLDEN, Roll, Run, planned, play, runs, stack
 
 from lag_envs.tasks import TASKS
 
 RUNS = runs()
-each_run = pytest.mark.parametrize("name", RUNS)
+IDS = dict.fromkeys(name.partition("/")[0] for name in RUNS)
+
+
+def each(ids):
+    """Return the runs of some ids as parameters; quick are those of a covering set, and one of every id."""
+    chosen = quick(ids)
+    runs = {name: name.partition("/")[::2] for name in RUNS}
+    return pytest.mark.parametrize(
+        "name",
+        [
+            pytest.param(name, marks=() if env_id in chosen or kind == "defaults" else pytest.mark.slow)
+            for name, (env_id, kind) in runs.items()
+            if env_id in ids
+        ],
+    )
+
+
+each_run = each(IDS)
 #: A step of the others depends on more than the state and the action.
-each_perfect_run = pytest.mark.parametrize("name", [n for n in RUNS if n.partition("/")[0] in PERFECT])
+each_perfect_run = each([env_id for env_id in IDS if env_id in PERFECT])
 TOLERANCE = 1e-12
 
 
@@ -54,7 +71,7 @@ def assert_close(mine: np.ndarray, golden: np.ndarray, what: str, tolerance: flo
 def test_the_file_holds_every_run():
     assert {key.rpartition("/")[0] for key in kept()} - {""} == set(RUNS)
     ids = {name.partition("/")[0] for name in RUNS}
-    assert ids <= set(TASKS) and {name for name in planned() if name.partition("/")[0] in ids} == set(RUNS)
+    assert ids <= set(TASKS) and {name for name in planned() if name.partition("/")[0] in ids} <= set(RUNS)
     ends = np.concatenate([arrays(name)["over"].ravel() for name in RUNS])
     assert all(np.count_nonzero(ends == kind) > 50 for kind in (1, 2))
     assert GOLDEN.stat().st_size < 1e6
@@ -64,7 +81,7 @@ def test_the_file_holds_every_run():
 def test_whole_run(name):
     # From its seed and actions alone. The motion makes up to 2,000 of a rounding on the way.
     golden = arrays(name)
-    mine = stack(play(name.partition("/")[0], RUNS[name], golden["actions"], len(golden["over"])))
+    mine = stack(play(name.partition("/")[0], RUNS[name], golden["actions"]))
     assert mine.keys() == golden.keys() - {"actions"}
     for key, value in mine.items():
         assert_close(value, golden[key], key, 10 * TOLERANCE)
@@ -95,9 +112,10 @@ def test_each_step(name):
         steps.append(roll.step((golden["actions"][t + 1] / 100.0).astype(np.float32)))
     mine = stack(steps)
     state, wanted = mine["state"], golden["state"][1:]
-    if TASKS[env_id].draws:  # kicks are drawn anew: they hit few, and theta_dot only
+    if TASKS[env_id].draws:  # kicks are drawn anew: they hit few, and the last rate only
         kicked = np.abs(state[..., -1] - wanted[..., -1]) > 1e-6
-        assert np.mean(kicked[stepped & ~restarted]) < 0.1
+        alike = ~kicked[stepped & ~restarted]
+        assert np.count_nonzero(~alike) <= max(3, 0.1 * alike.size)
         stepped &= ~kicked
     going_on = stepped & ~restarted
     assert_close(state[going_on], wanted[going_on], "state", TOLERANCE)

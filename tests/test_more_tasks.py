@@ -277,7 +277,7 @@ def test_no_policy_exceeds_the_value_of_the_start(name):
 
 
 def test_the_known_optimum_is_the_value_of_the_start():
-    from lag_envs.controllers.energy import value_at_start
+    from lag_envs.controllers.pendulum import value_at_start
 
     states = np.array([[math.pi, 0.0], [2.0, 1.0], [0.0, 0.0]])
     found = value_at_start(make_task(PendulumRegret.id), *states.T)

@@ -26,14 +26,14 @@ COMMANDS = {
     "plan": "python -m agents.optimum ID",
     "value iteration": "python -m agents.optimum ID",
     "agents": "python -m agents.results --envs ID",
-    "behaviour": "python -m agents.behaviour",
+    "behaviour": "python -m agents.behaviour ID",
     "board": "lag-envs leaderboard open",
     "speed": "make bench-docs",
     "accuracy": "make report ARGS='--docs .'",
     "picture": "python -m tools.docs --pictures",
 }
 #: What only some environments have.
-SOME = ("plan", "value iteration", "board", "accuracy", "picture")
+SOME = ("plan", "value iteration", "behaviour", "board", "accuracy", "picture")
 
 
 def have(what: str) -> list[str]:
@@ -51,7 +51,7 @@ def missing(env_id: str) -> dict[str, str]:
     if task.plans is not None:
         for_all.append("plan")
     if task.goal:
-        for_all += ["board", "picture"]  # pictures are those of the board's best
+        for_all += ["behaviour", "board", "picture"]  # of the agents on the board, and its best one's
     if not task.imperfections:
         for_all.append("accuracy")
     return {what: COMMANDS[what].replace("ID", env_id) for what in for_all if env_id not in _there(what)}

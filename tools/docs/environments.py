@@ -24,6 +24,7 @@ from lag_envs.leaderboard.docs import plain
 from lag_envs.scenes import Scene
 from lag_envs.scenes.declaring import complete
 from lag_envs.scores import share_of_privileged
+from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
@@ -324,6 +325,12 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
             f"Stepped by a Taylor series of order {order}. One series per step is certified to leave out "
             f"at most 1e-12 rad/s as long as |`{rate}`| is at most {math.floor(10.0 * speed) / 10.0:.1f} "
             "rad/s, whatever the control. Above that the step is divided, by the same bound."
+        )
+    if task.scene._form is None:
+        texts.append(
+            "Stepped by Taylor series. Each comes with a proved bound on what it leaves out: at most "
+            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. Where that does not help, "
+            "say with a link of a millimetre, an error names state and control, and the state is kept."
         )
     for row in _summary_rows(accuracy, "environments"):
         if row["environment"] == env_id:

@@ -1,8 +1,10 @@
-"""What controllers share, and three that know nothing of the motion."""
+"""What controllers share, and a few that know nothing of the motion."""
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,6 +72,29 @@ def feedback(task: Task, **gains: float) -> Feedback:
         if name not in task.observation:
             raise ValueError(f"there is no observation {name!r}, only {', '.join(task.observation)}")
     return Feedback(task, gain=[[gains.get(name, 0.0) for name in task.observation]])
+
+
+class Switch:
+    """The largest control to one side or the other, by the sign of a sum of observations.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``, with one control.
+    weights : mapping
+        What each entry of the observation counts in the sum.
+    """
+
+    def __init__(self, task: Task, *, weights: Mapping[str, float]) -> None:
+        self.task = task
+        self.weights = np.array([weights.get(name, 0.0) for name in task.observation])
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation."""
+        side = np.where(observation @ self.weights < 0.0, -1.0, 1.0)
+        return actions_for(self.task, side * self.task.limit_control), state
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
@@ -159,6 +184,13 @@ class FeedbackController(ABC):
     ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
         return actions_for(self.task, self.control(*self.read(observation))), state
+
+
+def remade(task: Task, kind: type[Task] | None = None, /, **changes: Any) -> Task:
+    """Return a task with the same parameters, but for those that change; perhaps of another class."""
+    fields = dataclasses.fields(task.scene)
+    own = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
+    return (kind or type(task))(**({"dt": task.dt, "duration": task.duration} | own | changes))
 
 
 def actions_for(task: Task, controls: Array) -> NDArray:

@@ -40,6 +40,7 @@ from lag_envs.leaderboard.log import (
     Entry,
     Hash,
     Line,
+    Opened,
     Protocol,
     State,
     fold,
@@ -426,7 +427,7 @@ def _nonces(board: Board, found: Cheap) -> Finding:
         decided = [
             line.number
             for line in found.lines
-            if lines < line.number < number and isinstance(line.event, Added | Protocol)
+            if lines < line.number < number and isinstance(line.event, Added | Opened | Protocol)
         ]
         if lines >= number or not found.log.startswith(then):
             finding.wrong.append(f"{where} is of a commit that held another log; {REMEDY}")

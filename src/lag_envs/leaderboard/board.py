@@ -154,10 +154,12 @@ class Board:
             yield state, append
 
     def open(self) -> int:
-        """Begin the next protocol, which freezes the scale of now, and return its number.
+        """Open boards that there are none of yet, or begin the next protocol; return the protocol's number.
 
-        All that is verified or pending goes over to it, to be verified anew. In a log in which nothing tells
-        the scale of its current protocol, that is told instead.
+        Where environments have no board under the current protocol, theirs join it, with the scale of now,
+        and nothing else changes. Otherwise, or where the rules of the others have changed, the next protocol
+        freezes the scale of now, and all that is verified or pending goes over to it, to be verified anew. In
+        a log in which nothing tells the scale of its current protocol, that is told instead.
         """
         with self.change() as (state, append):
             return self._open(state, append)
@@ -165,8 +167,9 @@ class Board:
     def _open(self, state: State, append: Callable[..., None]) -> int:
         from lag_envs.scores import known_returns
 
-        known = state.number in state.protocols
+        known = state.protocols.get(state.number)
         number = state.number + 1 if known or not state.number else state.number
+        rules = protocol.rules()
         scales = {
             env_id: {name: getattr(scale, name) for name in ("random", "best", "policy")}
             for env_id in protocol.boards()
@@ -174,7 +177,14 @@ class Board:
         }
         found = {env_id: protocol.reference(env_id) for env_id in protocol.boards()}
         references = {env_id: reference._asdict() for env_id, reference in found.items() if reference}
-        append("protocol", number=number, rules=protocol.rules(), scales=scales, references=references)
+        if known and (new := {env_id: scales[env_id] for env_id in scales if env_id not in known.scales}):
+            frozen = known.rules.model_dump()
+            success = {env_id: text for env_id, text in rules["success"].items() if env_id in new}
+            if rules == frozen | {"success": frozen["success"] | success}:
+                references = {env_id: references[env_id] for env_id in new if env_id in references}
+                append("opened", number=state.number, success=success, scales=new, references=references)
+                return state.number
+        append("protocol", number=number, rules=rules, scales=scales, references=references)
         return number
 
     def add(self, submission: Submission) -> Entry:

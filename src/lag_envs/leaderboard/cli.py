@@ -115,7 +115,10 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one = action("pin", "write the log's head into a file that a release carries", _pin)
     one.add_argument("file", metavar="FILE", nargs="?", type=Path, help="default: that of this package")
     one = action(
-        "open", "begin the next protocol: freeze the scale as it is now, and verify all anew under it", _open
+        "open",
+        "open boards of environments that have none; else begin the next protocol: freeze the scale as "
+        "it is now, and verify all anew under it",
+        _open,
     )
     one = action("build", "write the page", _build)
     one.add_argument(
@@ -196,8 +199,14 @@ def _publish(board: Board, value: str | None, source: str) -> None:
 
 def _open(args: argparse.Namespace) -> int:
     board = Board(args.board)
-    number = board.open()
-    waiting = len(board.read().waiting())
+    before = board.read()
+    number, after = board.open(), board.read()
+    waiting = len(after.waiting())
+    if number == before.number and number in before.protocols:
+        there = before.protocols[number].scales
+        print("\n".join(env_id for env_id in after.protocols[number].scales if env_id not in there))
+        print(f"joined protocol {number}; what was verified under it stays")
+        return 0
     print(f"protocol {number}; to be verified under it: {waiting}")
     if waiting:
         print("commit and push, then `lag-envs leaderboard nonce`")

@@ -111,6 +111,16 @@ class Protocol(Event):
     references: dict[EnvId, Reference]
 
 
+class Opened(Event):
+    """Boards that there were none of join the current protocol; what was verified on others stays."""
+
+    event: Literal["opened"]
+    number: Annotated[int, between(1, 10**6)]
+    success: dict[EnvId, Text]
+    scales: dict[EnvId, Scale]
+    references: dict[EnvId, Reference]
+
+
 class Added(Event):
     """A submission was taken in, or taken in again after it was rejected or withdrawn."""
 
@@ -167,7 +177,9 @@ class Withdrawn(Event):
     reason: Text
 
 
-AnyEvent = Annotated[Protocol | Added | Nonce | Verified | Rejected | Withdrawn, Field(discriminator="event")]
+AnyEvent = Annotated[
+    Protocol | Opened | Added | Nonce | Verified | Rejected | Withdrawn, Field(discriminator="event")
+]
 _EVENTS: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 
 
@@ -293,7 +305,8 @@ class State:
 
     #: The current protocol; 0 where there is none yet.
     number: int = 0
-    #: What each protocol fixed. Protocol 1 of an old log says it late, or not yet.
+    #: What each protocol fixed, with the boards that joined it. Protocol 1 of an old log says it late, or not
+    #: yet.
     protocols: dict[int, Protocol] = field(default_factory=dict)
     #: The submissions under each protocol, by id.
     boards: dict[int, dict[str, Entry]] = field(default_factory=dict)
@@ -365,6 +378,8 @@ def _apply(state: State, event: Any, line: int) -> None:
     state.last = event.at
     if isinstance(event, Protocol):
         _begin(state, event, line)
+    elif isinstance(event, Opened):
+        _join(state, event)
     elif isinstance(event, Nonce):
         if any(event.value == value for _, value, _ in state.nonces):
             raise ValueError(f"the nonce {shown(event.value)} was published before, so it was known")
@@ -395,6 +410,19 @@ def _begin(state: State, event: Protocol, line: int) -> None:
                 del state.entries[id]
     state.number = event.number
     state.boards[event.number] = carried
+
+
+def _join(state: State, event: Opened) -> None:
+    known = state.protocols.get(state.number)
+    if known is None or event.number != state.number:
+        raise ValueError(f"boards join protocol {event.number}, the current is {state.number}")
+    if there := sorted(set(event.scales) & set(known.scales)):
+        raise ValueError(f"{there[0]} joins protocol {event.number}, and has a board there already")
+    rules = known.rules.model_copy(update={"success": event.success | known.rules.success})
+    scales, references = known.scales | event.scales, event.references | known.references
+    state.protocols[state.number] = known.model_copy(
+        update={"rules": rules, "scales": scales, "references": references}
+    )
 
 
 def _add(state: State, event: Added, line: int) -> None:

@@ -246,6 +246,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -274,7 +275,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 5e6,
+            "n_timesteps": 5e5,
             "n_epochs": 5,
             "reward_scale": 1.0,
             "episode_share": 1.0,
@@ -317,7 +318,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
             "plan + TVLQR": "the best of 18 plans, followed by what is seen",
             "filter + plan + TVLQR": "the same plan by the estimate of an extended Kalman filter on the "
             "exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
-            "PPO": "5 million steps for each of five seeds, without memory",
+            "fast PPO": "5 million steps for each of five seeds, without memory",
         },
     )
     examples = dataclasses.replace(SwingUpTriple.examples, variants={"perfect": {"observation_noise": None}})
@@ -406,6 +407,7 @@ class SwingUpAnywhere(SwingUp):
     id = "DoubleBarAnywhere-v0"
     draws = 2
     kick_chance, largest_kick = 0.005, 1.0
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
 
     controllers = {
         "LQR": Controller("lag_envs.controllers.tracking:hold"),
@@ -549,8 +551,8 @@ class Balance(_Chain):
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 5e6, "n_epochs": 8, "batch_size": 2048, "clip_range": 0.1, "ent_coef": 3e-3,
-            "episode_share": 1.0, "log_std_init": 0.5, "critic": [128, 128],
+            "n_timesteps": 1e6, "gae_lambda": 0.8, "max_grad_norm": 1.0, "reward_scale": 1.0,
+            "critic": [64, 64],
         },
     }  # fmt: skip
     note = """
