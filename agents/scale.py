@@ -129,8 +129,9 @@ def measured(
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
     known, learners = controllers(task), trained(env_id, runs)
     slow = {name: planned for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
-    everyone = not scale or task.open
-    names = ["random", "zero", *([*task.controllers, *learners] if everyone else [scale["policy"]])]
+    names = ["random", "zero", *([scale["policy"]] if scale else [])]
+    if not scale or task.open:
+        names += [*task.controllers, *learners]
     if not scale and env_id in played():
         names.append("optimal")
     found: dict[str, Any] = {}

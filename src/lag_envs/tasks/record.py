@@ -26,12 +26,16 @@ class Goal:
     arrival : str
         What is reached then, in a word or two. docs/agents.md reports when that is, and what is lost by then;
         with an empty string it does not.
+    rules : int
+        Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
+        parameters. A board keeps the version that it began with.
     """
 
     text: str
     hold: float | None = 1.0
     terminated: bool | None = False
     arrival: str = ""
+    rules: int = 2
 
 
 @dataclass(frozen=True)
