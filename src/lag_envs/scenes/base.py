@@ -8,7 +8,7 @@ import math
 from abc import ABCMeta
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -423,10 +423,14 @@ class Scene(metaclass=SceneType):
 
     def _order(self, dt: float, lagged: bool = False) -> int:
         """Return the order of the series for a control step; 0 for a closed form, which no lagged one is."""
-        from lag_envs.stepping.general import usual_order
-
         if self._form and not lagged:
             return self._form.order(dt)
+        return self._series_order(dt)
+
+    def _series_order(self, dt: float) -> int:
+        """Return the order by which the general series takes a control step."""
+        from lag_envs.stepping.general import usual_order
+
         return vars(self).get(ORDER) or usual_order(dt)
 
     def _limit(self, dt: float, lagged: bool = False) -> float:
@@ -524,7 +528,24 @@ class Scene(metaclass=SceneType):
 
     truncation_bound = step_bound
 
-    def jacobian(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> tuple[Array, Array]:
+    @overload
+    def jacobian(
+        self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02, *, parameters: None = None
+    ) -> tuple[Array, Array]: ...
+
+    @overload
+    def jacobian(
+        self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02, *, parameters: Sequence[str]
+    ) -> tuple[Array, Array, Array]: ...
+
+    def jacobian(
+        self,
+        state: ArrayLike,
+        control: ArrayLike = 0.0,
+        dt: float = 0.02,
+        *,
+        parameters: Sequence[str] | None = None,
+    ) -> tuple[Array, ...]:
         """Return the derivatives of the state after a control step by the state before it and by controls.
 
         The derivatives go through the same series and substeps as the step itself.
@@ -537,6 +558,9 @@ class Scene(metaclass=SceneType):
             The controls that are held.
         dt : float
             Length of the step [s].
+        parameters : sequence of str, optional
+            Names of parameters by which derivatives are wanted too. The others are held, those that would
+            follow from it by default too.
 
         Returns
         -------
@@ -544,13 +568,33 @@ class Scene(metaclass=SceneType):
             By the state.
         B : ndarray, shape (..., n_state, n_controls)
             By the controls.
+        P : ndarray, shape (..., n_state, n_parameters)
+            By the parameters, per unit of each; only where they were asked for.
 
         Raises
         ------
         ValueError, StepRefused
-            As `simulate` does.
+            As `simulate` does; ValueError also for a parameter that the scene lacks, or by which the motion
+            has no derivative, as it may be where it is 0.
+
+        Examples
+        --------
+        >>> from lag_envs.scenes import PivotedBar
+        >>> A, B, P = PivotedBar().jacobian([0.0, 0.0, 3.0, 0.1], 2.0, parameters=["damping", "mass"])
+        >>> A.shape, B.shape, P.shape
+        ((4, 4), (4, 1), (4, 2))
         """
-        return steps.jacobian(self, state, control, dt)
+        return steps.jacobian(self, state, control, dt, parameters)
+
+    def _mechanics_by(self, parameters: tuple[str, ...]) -> Mechanics:
+        """Return the equations of motion with these parameters in them, be they 0."""
+        if not set(parameters) & set(self.mechanics.zeros):
+            return self.mechanics
+        known = vars(self).setdefault("_cached_mechanics_by", {})
+        if parameters not in known:
+            record = recording.record(self, self._layout)
+            known[parameters] = motion.derive_motion(self, self._layout, record, parameters)
+        return known[parameters]
 
     def fit(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from lag_envs.scenes.checks import (
     check_both,
     check_controls,
     check_lags,
+    check_parameters,
     check_sequence,
     check_state,
     check_step,
@@ -107,27 +108,49 @@ def step_bound(
     return StepBound(status, order, by_state, "proved with the step")
 
 
-def jacobian(scene: Scene, state: ArrayLike, control: ArrayLike, dt: float) -> tuple[Array, Array]:
+def jacobian(
+    scene: Scene, state: ArrayLike, control: ArrayLike, dt: float, parameters: Sequence[str] | None = None
+) -> tuple[Array, ...]:
     """See `Scene.jacobian`."""
     states, controls, shape = check_both(scene, state, control)
     dt = check_step(dt)
+    by = check_parameters(scene, () if parameters is None else parameters)
     n, m = states.shape[-1], controls.shape[-1]
     count = math.prod(shape)
     states = np.array(np.broadcast_to(states, (*shape, n)), order="C").reshape(count, n)
     controls = np.array(np.broadcast_to(controls, (*shape, m)), order="C").reshape(count, m)
-    if scene._form:
-        found, refused = scene._form.jacobian(states, controls, scene._constants(), dt)
-    else:
-        tangent = vars(scene).get("_cached_tangent")
-        if tangent is None:
-            tangent = scene._stepper.tangent({name: getattr(scene, name) for name in scene._numbers()})
-            vars(scene)["_cached_tangent"] = tangent
-        found, refused = tangent.jacobian(states, controls, dt, scene._order(dt))
+    found, refused = _derivatives(scene, by)(states, controls, dt)
     if refused:
         i = refused - 1
         raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {i}")
-    found = found.reshape(*shape, n, n + m)
-    return found[..., :n], found[..., n:]
+    found = found.reshape(*shape, n, n + m + len(by))
+    parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
+    return parts[:2] if parameters is None else parts
+
+
+def _derivatives(scene: Scene, by: tuple[str, ...]) -> Callable[[Array, Array, float], tuple[Any, int]]:
+    """Return what takes states, controls and a step to `SeriesTangent.jacobian`'s results."""
+    from lag_envs.stepping.general import stepper_of
+    from lag_envs.stepping.normal_forms import normal_form
+
+    known = vars(scene).setdefault("_cached_derivatives", {})
+    if by not in known:
+        mechanics = scene._mechanics_by(by)
+        form, numbers = normal_form(mechanics), {name: getattr(scene, name) for name in scene._numbers()}
+        try:
+            if form:
+                constants, rates = form.constants(numbers), form.rates(numbers, by)
+                known[by] = lambda y, u, dt: form.jacobian(y, u, constants, dt, rates, len(by))
+            else:
+                tangent = stepper_of(mechanics).tangent(numbers, by)
+                known[by] = lambda y, u, dt: tangent.jacobian(y, u, dt, scene._series_order(dt))
+        except (ArithmeticError, ValueError) as error:
+            given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
+            raise ValueError(
+                f"the motion has no derivative by the parameters at {given}: {error}; leave out those that "
+                "are 0 where a formula divides by them"
+            ) from error
+    return known[by]
 
 
 def energy_balance(

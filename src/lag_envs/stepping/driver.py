@@ -147,7 +147,8 @@ def compile_advance_block(
 def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
     """Take one control step and its derivatives; return the number of attempts, negative where refused.
 
-    `rows` are those of a lane, `slopes` those of `compile_tangent`.
+    `rows` are those of a lane, by which the step is divided, `slopes` those of `compile_tangent`. Where the
+    step is `GUIDED`, they differ in their constants.
     """
     rows[status] = 0.0
     rows[left] = rows[wish] = dt
@@ -159,23 +160,29 @@ def _advance_tangent(rows, slopes, dt, order):  # type: ignore[no-untyped-def]
             slopes[status + 1] = before - rows[left]
             tangent(slopes, 0, order)
             for i in range(2 * n):
-                slopes[q + i] = rows[q + i]
+                if GUIDED:
+                    rows[q + i] = slopes[q + i]
+                else:
+                    slopes[q + i] = rows[q + i]
         if rows[left] > 0.0 and (rows[status] >= LARGEST_COUNT or not rows[wish] > SMALLEST_PART * dt):
             return -np.int64(rows[status])
     return np.int64(rows[status])
 
 
-def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def]
+def _advance_tangents(values, slopes, guide, dt, order):  # type: ignore[no-untyped-def]
     """Take a control step from each row of `values`; return the row that was refused, or 0.
 
     A row of `values` holds inputs, places and velocities; the last two are replaced. A row of `slopes` is the
-    matrix of derivatives of places and velocities, row by row, and is replaced too.
+    matrix of derivatives of places and velocities, row by row, and is replaced too. Where a number of `guide`
+    is not 0, it takes the place of an input when the step is divided.
     """
     rows, matrix = np.zeros(size), status + 2
     moving = np.zeros(matrix + slopes.shape[1])
     for i in range(values.shape[0]):
         for j in range(status):
             rows[j] = moving[j] = values[i, j]
+            if GUIDED and j < q and guide[j] != 0.0:
+                rows[j] = guide[j]
         for j in range(slopes.shape[1]):
             moving[matrix + j] = slopes[i, j]
         if advance(rows, moving, dt, order) < 0:
@@ -191,10 +198,10 @@ def _advance_tangents(values, slopes, dt, order):  # type: ignore[no-untyped-def
 
 @cache
 def compile_advance_tangents(
-    record: SeriesRecord, columns: tuple[str, ...], tolerance: float = TOLERANCE
+    record: SeriesRecord, columns: tuple[str, ...], guided: bool = False, tolerance: float = TOLERANCE
 ) -> Callable:
-    """Compile ``advance(values, slopes, dt, order)``, see `_advance_tangents` and `compile_tangent`."""
+    """Compile ``advance(values, slopes, guide, dt, order)``, see `_advance_tangents` and `compile_tangent`."""
     helpers = compile_attempt(record, 1), compile_tangent(record, columns)
-    numbers = _numbers(record, tolerance)
+    numbers = _numbers(record, tolerance) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)

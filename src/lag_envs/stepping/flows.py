@@ -214,6 +214,7 @@ class Stepper:
         self._flow = lambda: flow.compile(present)
         self._tangent = lambda by: flow.compile_tangent(present, by)
         self._given, self._prepare, self._finish = given, prepare, finish
+        self._names = [f"k_{name}" for name in constants]
 
     @property
     def operations(self) -> int:
@@ -234,15 +235,15 @@ class Stepper:
         return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
 
     @cache  # noqa: B019 - steppers are kept anyway
-    def compile_jacobian(self, by: tuple[str, ...]) -> Callable:
+    def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
         """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
 
-        It fills ``out[i]`` with the derivatives of the state after step i by state and controls, and returns
-        the row whose step was refused, counted from 1, or 0. `by` names the coefficients that states or
-        controls change.
+        It fills ``out[i]`` with the derivatives of the state after step i by state, controls and constants,
+        and returns the row whose step was refused, counted from 1, or 0. `by` names the coefficients that
+        these change.
         """
         n = self._n_state
-        columns = [*self.start[:n], *self.controls]
+        columns = [*self.start[:n], *self.controls, *(f"k_{name}" for name in constants)]
         wide, size, rows = len(columns), self.flow.size, self.flow.size + len(self.terms)
 
         def given(names: Sequence[Any], numbers: Sequence) -> list[Variable]:
@@ -253,14 +254,14 @@ class Stepper:
             return found
 
         def prepare(xp: Any, *numbers: Any) -> list:
-            names = [*self.start, *self.controls, *self._given]
+            names = [*self.start, *self.controls, *self._names]
             found = self._prepare(VariableFunctions(xp), *given(names, numbers))
             results = [x if isinstance(x, Variable) else Variable.of_column(columns, "", x) for x in found]
             return [x.value for x in results] + [slope for x in results for slope in x.slopes]
 
         def finish(xp: Any, *numbers: Any) -> list:
             slopes, rest = split(numbers, 2 * wide)
-            names = [*self.start, *self.controls, "dt", *self._given]
+            names = [*self.start, *self.controls, "dt", *self._names]
             moved = [Variable(0.0, np.array(part, dtype=object)) for part in split(slopes, wide)]
             others = [Variable(0.0, 0.0)] * (size - 2)
             ends = self._finish(VariableFunctions(xp), *moved, *others, *given(names, rest))

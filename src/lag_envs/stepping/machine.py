@@ -367,7 +367,7 @@ def compile_tangent(record: SeriesRecord, columns: tuple[str, ...]) -> Callable:
     record : SeriesRecord
         What is stepped, made with tangents.
     columns : tuple of str
-        By what derivatives are taken: names of inputs are told from others.
+        By what derivatives are taken: places and velocities, and what the record's tangents name.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {columns} tangent".encode()).hexdigest()[:16]
     kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])
@@ -392,7 +392,7 @@ def _write_tangent(
         numbers = [ir.Constant(_DOUBLE, float(i == column)) for i in range(width)]
         return numbers[0] if width == 1 else ir.Constant(wide.kind, numbers)
 
-    tangents = {source: unit(i) for i, source in enumerate(columns) if source in layout.inputs}
+    tangents = {source: unit(i) for i, source in enumerate(columns)}
     t: Any = Dual(plain, wide, wide.broadcast, tangents)
 
     def at(row: int) -> ir.Value:
