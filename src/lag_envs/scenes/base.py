@@ -606,10 +606,11 @@ class Scene(metaclass=SceneType):
     ) -> Fit:
         """Fit parameters to recordings of the motion.
 
-        All recordings are fitted together, by least squares of what was measured less what is simulated, which
-        is likeliest for normal noise. Unknown are the free parameters and the start of each recording. The
-        search is by multiple shooting with exact derivatives: it begins with recordings in short pieces, and
-        so finds its way from parameters that are far off. A chaotic recording stays in pieces, which join.
+        Least squares of what was measured less what is simulated, of all recordings together: the most
+        likely parameters where the noise is normal and independent. The start of each recording is unknown
+        too. The search is by multiple shooting with exact derivatives: it cuts recordings into short pieces,
+        so that it finds its way from parameters that are far off and along chaotic motions, and closes the
+        gaps between them.
 
         Parameters
         ----------
@@ -619,8 +620,8 @@ class Scene(metaclass=SceneType):
             ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; a last
             one for the last sample may be there and is not used. None where all are 0, or there is none.
         free : sequence of str
-            The parameters to find; the scene's values of them are where the search begins. Others are held, but
-            for those which have the value that their default makes of the free ones: they follow.
+            The parameters to find. The search begins with the scene's values. Others are held, except those
+            with the value that their default makes from others: they go on following.
         noise : mapping from str to float, optional
             Standard deviation of the measurements of each state. By default it is estimated, each state's its
             own.
@@ -629,7 +630,7 @@ class Scene(metaclass=SceneType):
 
         Returns
         -------
-        Fit
+        fitting.result.Fit
             Estimates, standard errors, intervals, the fitted scene, residuals. It prints as a table, and
             `plot` draws the residuals.
 

@@ -11,7 +11,8 @@ Array = NDArray[np.float64]
 
 #: Derivatives whose singular values, at unit length, are below this depend on each other.
 DEPENDENT = 1e-7
-#: Where twice a parameter moves no state by more than this part of its range, it has no effect.
+#: Where twice a parameter, or one more unit of it, moves no state by more than this part of its range, it has
+#: no effect.
 NO_EFFECT = 1e-10
 
 
@@ -47,11 +48,11 @@ class Determined:
 
         self._parameters = shooting.parameters
         p, of = len(self._parameters.names), shooting.states_of_residuals()
-        #: What a change of the scaled parameters by 100 % is.
-        self._whole = np.where(self._parameters.logs, 1.0, self._parameters.values(z[:p]))
+        values = self._parameters.values(z[:p])
+        self._whole = np.where(self._parameters.logs, 1.0, values)  # a change by 100 %, scaled
         derivatives = shooting.jacobian(z)
         by_parameters, by_starts = derivatives[:, :p], derivatives[:, p:]
-        moved = by_parameters * (shooting.noise / ranges)[of][:, None] * self._whole
+        moved = by_parameters * (shooting.noise / ranges)[of][:, None] * np.maximum(np.abs(self._whole), 1.0)
         lengths = np.linalg.norm(by_starts, axis=0)
         starts = orth(by_starts / np.where(lengths > 0.0, lengths, 1.0), rcond=1e-10)
         rest = by_parameters - starts @ (starts.T @ by_parameters)
@@ -82,11 +83,11 @@ class Determined:
                 texts.append(f"{next(iter(parts))}, which has no effect of its own on what was measured")
             else:
                 texts.append(
-                    f"{' and '.join(parts)} apart: changing {', '.join(parts.values())} together changes nothing "
-                    "that was measured"
+                    f"{' and '.join(parts)} apart: changing {', '.join(parts.values())} together changes "
+                    "nothing that was measured"
                 )
         if texts:
             raise ValueError(
-                f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is held, or "
-                "add recordings that it shows in, such as some under known controls"
+                f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is held, "
+                "or add recordings that it shows in, such as some under known controls"
             )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lag_envs.errors import hint
 from lag_envs.scenes.base import Scene
-from lag_envs.scenes.checks import check_number, shown
+from lag_envs.scenes.checks import check_number, check_parameters, shown
 from lag_envs.scenes.fitting.determined import Determined
 from lag_envs.scenes.fitting.parameters import FreeParameters
 from lag_envs.scenes.fitting.recordings import Recording, guess, recordings_of
@@ -48,7 +48,12 @@ def fit(
     level: float = 0.95,
 ) -> Fit:
     """See `Scene.fit`."""
-    names = _check_free(scene, free)
+    try:
+        names = check_parameters(scene, free)
+    except ValueError as error:
+        raise ValueError(f"free: {error}") from None
+    if not names:
+        raise ValueError("free must name at least one parameter")
     level = check_number("level", level)
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must be between 0 and 1, got {level:g}")
@@ -62,35 +67,17 @@ def fit(
         )
     shooting, z = _approach(FreeParameters(scene, names), data, sizes)
     relaxed = sizes.noise.copy()
-    for closed in (*CLOSING, *[CLOSING[-1]] * WEIGHINGS):
-        shooting = Shooting(
-            shooting.parameters, data, shooting.pieces, sizes.noise.copy(), closed * sizes.gap
-        )
-        final = closed == CLOSING[-1]
-        found = shooting.solve(z, FINE if final else COARSE)
-        z = found.x
-        if final:
-            known = Determined(shooting, z, sizes.range)
-            sizes.estimate(shooting, z, known.leverage)
-            if np.allclose(sizes.noise, shooting.noise, rtol=0.01):
-                break
+    for part in CLOSING:
+        shooting = shooting.weighed(sizes.noise, part * sizes.gap)
+        z = shooting.solve(z, COARSE).x
+    for _ in range(WEIGHINGS):
+        shooting = shooting.weighed(sizes.noise, CLOSING[-1] * sizes.gap)
+        found = shooting.solve(z, FINE)
+        z, known = found.x, Determined(shooting, found.x, sizes.range)
+        sizes.estimate(shooting, z, known.leverage)
+        if np.allclose(sizes.noise, shooting.noise, rtol=0.01, atol=0.0):
+            break
     return _result(shooting, found, known, sizes, relaxed, level)
-
-
-def _check_free(scene: Scene, free: Any) -> tuple[str, ...]:
-    known = scene._numbers()
-    if isinstance(free, str) or not isinstance(free, Sequence) or not free:
-        raise ValueError(f"free must be a list of parameters' names, at least one, got {shown(free)}")
-    for i, name in enumerate(free):
-        if name not in known:
-            raise ValueError(
-                f"free: {type(scene).__name__} has no parameter {shown(name)}; {hint(str(name), known)}"
-            )
-        if name in free[:i]:
-            raise ValueError(f"free: {name!r} is named twice")
-        if not math.isfinite(getattr(scene, name)):
-            raise ValueError(f"free: {name} is {getattr(scene, name)}; begin with a finite value")
-    return tuple(free)
 
 
 class _Sizes:
@@ -163,7 +150,7 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
         shooting.simulate(z)  # where this is refused, its error says why
         z[:p] = shooting.solve(z, COARSE, starts=False).x
         sizes.estimate(shooting, z)
-    shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
+    shooting = shooting.weighed(sizes.noise, sizes.gap)
     z = shooting.solve(z, COARSE).x
     sizes.estimate(shooting, z, len(z) / shooting.count)
     return shooting, z
@@ -216,7 +203,8 @@ def _doubts_of_parameters(fitted: Fit, parameters: FreeParameters, best: Array, 
             texts.append(f"{name}={value:.3g} lies at the end of its range: its interval is too short")
         elif fitted.errors[name] > WIDE * abs(value):
             texts.append(
-                f"the data hardly determine {name}: {value:.3g} with a standard error of {fitted.errors[name]:.2g}"
+                f"the data hardly determine {name}: {value:.3g} with a standard error of "
+                f"{fitted.errors[name]:.2g}"
             )
         for j in range(i):
             if abs(fitted.correlation[i, j]) > CORRELATED:

@@ -17,7 +17,7 @@ NEARLY_ZERO = 1e-6
 
 
 class FreeParameters:
-    """Free parameters of a scene, on the scale on which they are sought: logarithms of those that are positive.
+    """Free parameters of a scene, on the scale on which they are sought: the logarithm of positive ones.
 
     A parameter that is not free and has the value which its default makes from others goes on following them,
     as a bar's inertia does its mass.

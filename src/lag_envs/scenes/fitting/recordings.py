@@ -84,15 +84,15 @@ def _recording(scene: Scene, states: Any, controls: Any, dt: Any) -> Recording:
 def _controls(scene: Scene, controls: Any, count: int) -> Array:
     """Return the controls of the steps between so many states; None are controls that are all 0."""
     steps, n = count - 1, len(scene.control_names)
-    if controls is None or n == 0 and not isinstance(controls, int | np.integer) and np.size(controls) == 0:
+    if controls is None:
         return np.zeros((steps, n))
     given = check_sequence(scene, controls)
     if len(given) == count:  # sampled together with the states: the last one acts after the last state
         given = given[:steps]
     if len(given) != steps:
         raise ValueError(
-            f"{count} states need controls for the {steps} steps between them, or one for each state, of which "
-            f"the last is not used; got {len(given)}"
+            f"{count} states need controls for the {steps} steps between them, or one for each state, of "
+            f"which the last is not used; got {len(given)}"
         )
     return given
 

@@ -68,12 +68,15 @@ class Fit:
         units = {f.name: f.metadata.get("unit", "") for f in dataclasses.fields(self.scene)}  # type: ignore[arg-type]
         rows = [("parameter", "estimate", "std. error", f"{100 * self.level:g} % interval", "unit")]
         for name, value in self.estimates.items():
-            low, high = (f"{x:.4g}" for x in self.intervals[name])
-            rows.append((name, f"{value:.5g}", f"{self.errors[name]:.2g}", f"{low} to {high}", units[name]))
+            error = self.errors[name]
+            digits = 2 if error >= abs(value) else 2 + round(math.log10(abs(value) / error))
+            low, high = (f"{x:.{digits}g}" for x in self.intervals[name])
+            rows.append((name, f"{value:.{digits}g}", f"{error:.2g}", f"{low} to {high}", units[name]))
         state = dict(zip(self.scene.state_names, self.scene.state_units, strict=True))
         noise = ", ".join(f"{name} {value:.3g} {state[name]}" for name, value in self.noise.items())
         count = sum(int(r.measured.sum()) for r in self.recordings)
-        one = f"{type(self.scene).__name__}: {len(self.recordings)} recordings, {count} values; noise {noise}"
+        counted = f"{len(self.recordings)} recording{'s' * (len(self.recordings) > 1)}"
+        one = f"{type(self.scene).__name__}: {counted}, {count} values; noise {noise}"
         return "\n".join([one, *columns(rows), *(f"! {text}" for text in self.warnings)])
 
     def plot(self) -> Any:

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class Piece(NamedTuple):
-    """Samples ``first`` to ``last`` of a recording; the next piece, where there is one, begins at ``last``."""
+    """Samples ``first`` to ``last`` of a recording; a next piece begins at ``last``."""
 
     recording: int
     first: int
@@ -76,8 +76,12 @@ class Shooting:
         gap: Array,
     ) -> None:
         self.parameters, self.recordings, self.pieces = parameters, recordings, pieces
-        self.noise, self.gap = noise, gap
+        self.noise, self.gap = noise.copy(), gap.copy()
         self._known: tuple[bytes, Any] = b"", None
+
+    def weighed(self, noise: Array, gap: Array) -> Shooting:
+        """Return the problem with other expected sizes."""
+        return Shooting(self.parameters, self.recordings, self.pieces, noise, gap)
 
     def simulate(self, z: Array) -> tuple[Scene, list[Array]]:
         """Return the scene, and each piece's motion; raise StepRefused, or ValueError for the parameters."""
