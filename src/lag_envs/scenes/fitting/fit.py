@@ -75,7 +75,7 @@ def fit(
         found = shooting.solve(z, FINE)
         z, known = found.x, Determined(shooting, found.x, sizes.range)
         sizes.estimate(shooting, z, known.leverage)
-        if np.allclose(sizes.noise, shooting.noise, rtol=0.01, atol=0.0):
+        if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
             break
     return _result(shooting, found, known, sizes, relaxed, level)
 

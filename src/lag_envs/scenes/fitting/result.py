@@ -69,7 +69,10 @@ class Fit:
         rows = [("parameter", "estimate", "std. error", f"{100 * self.level:g} % interval", "unit")]
         for name, value in self.estimates.items():
             error = self.errors[name]
-            digits = 2 if error >= abs(value) else 2 + round(math.log10(abs(value) / error))
+            # As many digits as the error has, with two of its own.
+            digits = max(
+                2, 2 + math.floor(math.log10(max(abs(value), error))) - math.floor(math.log10(error))
+            )
             low, high = (f"{x:.{digits}g}" for x in self.intervals[name])
             rows.append((name, f"{value:.{digits}g}", f"{error:.2g}", f"{low} to {high}", units[name]))
         state = dict(zip(self.scene.state_names, self.scene.state_units, strict=True))

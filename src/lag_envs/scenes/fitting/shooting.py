@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: The largest factor by which one search may change a parameter that is sought by its logarithm: what short
+#: pieces do not determine must not run away.
+FARTHEST = np.log(1e3)
+
 
 class Piece(NamedTuple):
     """Samples ``first`` to ``last`` of a recording; a next piece begins at ``last``."""
@@ -173,14 +177,17 @@ class Shooting:
         """Return SciPy's result of a minimisation that begins at z; with `starts` held if that is False."""
         from scipy.optimize import least_squares
 
-        p = len(self.parameters.names)
+        p, parameters = len(self.parameters.names), self.parameters
         free, rest = (z, z[:0]) if starts else (z[:p], z[p:])
-        beyond = np.full(len(free) - p, np.inf)
+        reach = np.where(parameters.logs, FARTHEST, np.inf)
+        low, high = np.full((2, len(free)), [[-np.inf], [np.inf]])
+        low[:p] = np.maximum(parameters.low, z[:p] - reach)
+        high[:p] = np.minimum(parameters.high, z[:p] + reach)
         return least_squares(
             lambda x: self.residuals(np.concatenate([x, rest])),
             free,
             lambda x: self.jacobian(np.concatenate([x, rest]))[:, : len(x)],
-            bounds=(np.append(self.parameters.low, -beyond), np.append(self.parameters.high, beyond)),
+            bounds=(low, high),
             x_scale="jac",
             ftol=tolerance,
             xtol=tolerance,
