@@ -292,6 +292,7 @@ def test_one_step(kind, n, seed, allowed):
         assert one_step(case)[0] < allowed, case
 
 
+@pytest.mark.slow
 def test_one_step_of_extremes():
     """Full accuracy or a refusal; measured with what the system itself makes of the state's rounding."""
     refused = 0
