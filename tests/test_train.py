@@ -244,6 +244,7 @@ def test_seeds_side_by_side(command, config, tmp_path):
     assert status == 2 and "result.json cannot be read" in output
 
 
+@pytest.mark.slow
 def test_killed_and_interrupted_runs_go_on(config, tmp_path):
     output = kill_and_interrupt(
         "agents.train", ENV, "--steps", "30000", "--config", str(config), "--jobs", "1",
