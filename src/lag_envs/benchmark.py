@@ -697,8 +697,8 @@ def markdown(report: dict[str, Any]) -> str:
         )
     if found := report.get("divisions"):
         parts.append(
-            "How often the certificate divides steps under random actions, and the time of one series, many at "
-            "once; environments that are not in the table never need more than one."
+            "Into how many series the certificate divides steps under random actions, and the time of one, "
+            "many at once. Others never needed more than one; those with imperfections were left out."
         )
         parts.append(benchmark_divisions.markdown(found, times_of(report)))
     if cold := report["cold_start"]:
