@@ -17,7 +17,7 @@ from lag_envs import benchmark, cli
 from lag_envs.benchmark import Contestant, Settings
 from lag_envs.benchmark_jacobians import compile_steps
 from lag_envs.scenes import CartPole
-from lag_envs.tasks import TASKS, incline, pivoted_bar
+from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
 
 ID = pivoted_bar.SwingUpFree.id
 
@@ -273,6 +273,19 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     ends = [scene.simulate(x, [u], 0.02)[1].sum() for x, u in zip(states, (1.0, -2.0), strict=True)]
     steps = compile_steps(scene, 0.02)(states, np.array([[1.0], [-2.0]]))
     assert steps == pytest.approx(sum(ends), rel=1e-14)
+
+
+@pytest.mark.slow
+def test_how_often_steps_are_divided(tmp_path, capsys):
+    ids = (ID, chain.SwingUp.id, pivoted_bar.SwingUpUnknown.id)
+    report = benchmark.bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, divisions=True, ids=ids))
+    one, two = report["divisions"]  # nothing of the imperfect one
+    assert (one["id"], one["mean"], one["most"], one["divided"]) == (ID, 1.0, 1, 0.0)
+    assert two["most"] > 5 and 1.5 < two["mean"] < two["most"] and 0.5 < two["divided"] < 1.0
+    assert two["fastest"] > 20.0
+    assert "series a step" in capsys.readouterr().out
+    text = benchmark.benchmark_divisions.markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
+    assert text.splitlines()[2].endswith("| 100 ns |") and ID not in text
 
 
 @pytest.mark.slow

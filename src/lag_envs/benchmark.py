@@ -33,7 +33,8 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 import lag_envs
-from lag_envs import benchmark_jacobians
+from lag_envs import benchmark_divisions, benchmark_jacobians
+from lag_envs.benchmark_divisions import divisions
 from lag_envs.benchmark_jacobians import jacobians
 from lag_envs.host import ONE_THREAD, installed, machine
 from lag_envs.own_files import registered
@@ -112,6 +113,7 @@ class Settings:
     keywords: tuple[str, ...] = ()  #: each as a call takes them: measured beside the defaults
     energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
     jacobians: bool = False  #: what derivatives of a step cost beside it
+    divisions: bool = False  #: how often the certificate divides steps
     sizes: tuple[int, ...] = SIZES
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
@@ -399,6 +401,8 @@ def bench(settings: Settings) -> dict[str, Any]:
     report["chains"] = chains(results)
     if settings.jacobians and complete:
         report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
+    if settings.divisions and complete:
+        report["divisions"] = divisions(settings.ids)
     print("\n".join(table(report)))
     if settings.output:
         Path(settings.output).write_text(to_json(report), encoding="utf-8")
@@ -585,6 +589,13 @@ def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
 
 
+def times_of(report: dict[str, Any]) -> dict[str, float]:
+    """Return the time of a step of each environment [ns], in the largest batch."""
+    found = [r for r in report["rows"] if r["library"] == "lag_envs" and "steps_per_second" in r]
+    most = max((r["num_envs"] for r in found), default=0)
+    return {r["id"]: 1e9 / r["steps_per_second"][1] for r in found if r["num_envs"] == most}
+
+
 # --- printing ---
 
 
@@ -620,6 +631,9 @@ def table(report: dict[str, Any]) -> list[str]:
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     if costs := report.get("jacobians"):
         lines += [*columns(benchmark_jacobians.table(costs)), ""]
+    if found := report.get("divisions"):
+        rows = [benchmark_divisions.cells(row, times_of(report).get(row["id"])) for row in found]
+        lines += [*columns([benchmark_divisions.HEAD, *rows]), ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
@@ -681,6 +695,12 @@ def markdown(report: dict[str, Any]) -> str:
             f"Scenes that are only energies, {size:,} at once, beside the same `CartPole-v1`: "
             f"{'; '.join(told)}."
         )
+    if found := report.get("divisions"):
+        parts.append(
+            "Into how many series the certificate divides steps under random actions, and the time of one, "
+            "many at once. Others never needed more than one; those with imperfections were left out."
+        )
+        parts.append(benchmark_divisions.markdown(found, times_of(report)))
     if cold := report["cold_start"]:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")

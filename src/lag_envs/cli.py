@@ -205,6 +205,7 @@ def run_bench(args: argparse.Namespace) -> int:
         "keywords": tuple(args.keywords or ()),
         "energies": not (args.quick or args.ids),
         "jacobians": not (args.quick or args.ids or args.cold),
+        "divisions": not (args.quick or args.cold),
         "speed": not args.cold,
         "clock": args.clock,
         "date": args.date,

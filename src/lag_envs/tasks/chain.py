@@ -318,7 +318,7 @@ class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
             "plan + TVLQR": "the best of 18 plans, followed by what is seen",
             "filter + plan + TVLQR": "the same plan by the estimate of an extended Kalman filter on the "
             "exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
-            "fast PPO": "5 million steps for each of five seeds, without memory",
+            "fast PPO": "5 million steps a seed, without memory",
         },
     )
     examples = dataclasses.replace(SwingUpTriple.examples, variants={"perfect": {"observation_noise": None}})

@@ -69,8 +69,8 @@ COLUMNS = (
     Column(
         "robustness",
         "Robust",
-        "Least score over environments with changed masses, drag and the like, and on newer boards with noise, "
-        "delays and pushes.",
+        "Least score over environments with changed masses, drag and the like, on newer boards also with "
+        "noise, delays and pushes.",
     ),
     Column("often", "10 × rate", "Score when acting ten times as often."),
 )
