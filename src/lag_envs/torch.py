@@ -347,7 +347,7 @@ class _EnvStep(torch.autograd.Function):
     """`TorchVectorEnv.step`."""
 
     @staticmethod
-    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
         envs = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.stepped = envs._read("n") >= 0.0
