@@ -189,7 +189,8 @@ def starts(task, rng, n):
             if ended[0]:
                 break
             states[i] = after[0]
-    return model, states, actions, given
+    # A guard leads exactly to where it begins to act: there two derivatives meet.
+    return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
 
 
 @pytest.mark.parametrize("env_id", covering(SMOOTH))
@@ -229,8 +230,8 @@ def test_whole_step(env_id):
 
 def test_what_is_clipped_has_no_gradient():
     model = Model(TASKS["PivotedBar-v0"]())
-    states, actions = [[0.0, 0.0, 3.0, 0.0]] * 4, [-1.5, -1.0, 1.0, 1.5]
-    found = model.vjp(states, actions, by_states=[0.0, 1.0, 0.0, 1.0])
+    states, actions = [[0.0, 0.0, 3.0, 0.0]] * 4, [-1.5, -0.99, 0.99, 1.5]
+    found = model.vjp(states, actions, by_states=[[0.0, 1.0, 0.0, 1.0]] * 4)
     np.testing.assert_array_equal(found.actions[[0, 3]], 0.0)
     assert (np.abs(found.actions[[1, 2]]) > 0.1).all()
 
@@ -254,3 +255,11 @@ def test_choices_have_no_gradient():
     task = TASKS["CartPoleExact-v0"]()
     with pytest.raises(ValueError, match="list of actions to choose from"):
         Model(task).vjp([[0.0] * 4], [1])
+
+
+def test_shapes_of_gradients():
+    model, bar = Model(TASKS["PivotedBar-v0"]()), PivotedBar()
+    with pytest.raises(ValueError, match=r"by_states must be one number or have shape \(2, 4\), got \(4,\)"):
+        model.vjp(np.zeros((2, 4)), [0.0, 0.0], by_states=np.ones(4))
+    with pytest.raises(ValueError, match=r"cotangent must have the shape .* \(2, 4\), got \(4,\)"):
+        bar.vjp(np.zeros((2, 4)), 0.0, 0.02, np.ones(4))

@@ -86,13 +86,12 @@ class Step:
     """
 
     def __init__(self, task: str | Task, **options: Any) -> None:
-        if isinstance(task, str):
-            task = gym.make(task, **options).unwrapped.task  # type: ignore[attr-defined]
-        elif options:
+        if options and not isinstance(task, str):
             raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
-        self.task = _checked_task(task)
-        self.model = Model(task)
-        formulas = task.formulas
+        made: Any = gym.make(task, **options).unwrapped if isinstance(task, str) else None
+        self.task = _checked_task(task if made is None else made.task)
+        self.model = Model(self.task)
+        formulas = self.task.formulas
         self._sizes = len(formulas.state), formulas.actions, formulas.targets
 
     def __call__(self, states: Tensor, actions: Tensor, targets: Tensor | None = None) -> StepResult:
@@ -269,9 +268,9 @@ class TorchVectorEnv:
         """Close the environments."""
         self.envs.close()
 
-    def _advance(self, actions: Tensor) -> list[NDArray]:
+    def _advance(self, actions: Tensor) -> list[Any]:
         *results, self._infos = self.envs.step(actions.detach().numpy())
-        return results
+        return list(results)
 
 
 class _Step(torch.autograd.Function):
@@ -296,7 +295,7 @@ class _Step(torch.autograd.Function):
         ctx.mark_non_differentiable(output[3])
 
     @staticmethod
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         return None, *_Back.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
 
     @staticmethod
@@ -336,7 +335,7 @@ class _Back(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None: ...
 
     @staticmethod
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         raise NotImplementedError("a step has first derivatives only; leave out create_graph=True")
 
     @staticmethod
@@ -348,7 +347,7 @@ class _EnvStep(torch.autograd.Function):
     """`TorchVectorEnv.step`."""
 
     @staticmethod
-    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
         envs = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.stepped = envs._read("n") >= 0.0
@@ -363,7 +362,7 @@ class _EnvStep(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
         state, actions, after = ctx.saved_tensors
         y, ends = _numbers(state), _numbers(after)
@@ -420,7 +419,7 @@ def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> 
     return tuple(x.unflatten(0, (n, len(x) // n)) for x in found), (0,) * len(found)
 
 
-def _checked_task(task: Task) -> Task:
+def _checked_task(task: Any) -> Task:
     """Return a task whose steps have derivatives, or raise a ValueError."""
     name = type(task).__name__
     if task.formulas.choices:

@@ -211,16 +211,13 @@ class Model:
         states, actions, targets = self._checked(states, actions, targets)
         n, observations = len(states), len(self.task.formulas.observation)
         seeds = [
-            np.broadcast_to(np.asarray(x, np.float64).T, wanted)
-            for x, wanted in (
-                (by_states, (self._n_state, n)),
-                (by_observations, (observations, n)),
-                (by_rewards, (1, n)),
-            )
+            _rows("by_states", by_states, (n, self._n_state)),
+            _rows("by_observations", by_observations, (n, observations)),
+            _rows("by_rewards", by_rewards, (n,)).reshape(1, n),
         ]
         y, a, g, z = states.T, actions.T, targets.T, ends.T
         u = reverse.controls(y, a, g)
-        after = z + np.broadcast_to(np.asarray(kicks, np.float64).T, z.shape)
+        after = z + _rows("kicks", kicks, ends.shape)
         own_y, own_z, own_u, own_g, own_p = reverse.after(y, z, u, g, after, *seeds)
         motion = scene.vjp(states, u.T, self.task.dt, own_z.T, parameters=by)
         last_y, last_a, last_g, last_p = reverse.before(y, a, g, own_u + motion[1].T)
@@ -328,6 +325,14 @@ class Model:
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
             raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
         return np.ascontiguousarray(np.broadcast_to(array.reshape(-1, count), (n, count)))
+
+
+def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return values of a shape, or one for all, with the rows last; or raise a ValueError."""
+    array = real_array(name, values)
+    if array.shape not in ((), shape):
+        raise ValueError(f"{name} must be one number or have shape {shape}, got {array.shape}")
+    return np.broadcast_to(array, shape).T
 
 
 def _moves(m: int) -> Array:

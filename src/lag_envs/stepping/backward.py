@@ -9,7 +9,7 @@ Lengths of substeps are held.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
@@ -83,10 +83,11 @@ class Backward(Series):
         places, weights = self._first_order_back(t, start, h)
         velocities = [t.load(self._bar(self._slots["v", i]), t.index(0)) for i in range(n)]
         found = [
-            total if x is None else t.add(x, total)
-            for x, total in zip(places[:n], ends[:n], strict=True)
+            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends[:n], strict=True)
         ]
-        found += [x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)]
+        found += [
+            x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
+        ]
         return found, [self._of_source(t, start, weights, source) for source in self._sources]
 
     def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str) -> Any:
@@ -152,9 +153,7 @@ class Backward(Series):
 
     def _one_order_back(self, t: Target, start: Start, h: Any, k: Any) -> None:
         """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
-        record, zero, first = self.record, start.zero, t.index(0)
-        per = t.reciprocal(k)
-        step = t.mul(h, per)
+        record, first = self.record, t.index(0)
         bars: dict[int, Any] = {}
         for n in self._live:
             if ("x", n) in self._slots and record.nodes[n].op not in KNOWN:
@@ -188,62 +187,60 @@ class Backward(Series):
                 inner.append((factor, rate, less))
         for n in reversed(self._live):
             if n in bars:
-                self._node_back(t, start, n, bars[n], k, step, per, add, inner)
+                inner += self._node_back(t, start, n, bars[n], h, k, add)
         self._convolve_back(t, k, inner, weighted)
 
     def _node_back(
-        self,
-        t: Target,
-        start: Start,
-        n: int,
-        bar: Any,
-        k: Any,
-        step: Any,
-        per: Any,
-        add: Any,
-        inner: list[tuple[Factor, Factor, Any]],
-    ) -> None:
+        self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable
+    ) -> list[tuple[Factor, Factor, Any]]:
+        """Take a node's cotangent of order k to order 0 and k; return what goes to those between."""
         node, zero, first = self.record.nodes[n], start.zero, t.index(0)
         op, args = node.op, node.args
         if op == "place":
+            step = t.mul(h, t.reciprocal(k))
             self._add(t, self._bar(self._slots["v", node.index]), t.plus(k, -1), step, bar)
-        elif op == "velocity" or op in KNOWN:
+            return []
+        if op == "velocity" or op in KNOWN:
             self._add_to(t, self._factor(n), k, bar, t.number(1.0))
-        elif op == "sum":
-            for a, w in zip(args, node.weights, strict=False):
-                add(a, bar, self._weight(t, start.scalars, w))
-                if w in self._active:
-                    self._weight_bar(t, w, bar, self._factor(a).load(t, k))
-        elif op == "product":
-            x, y = args
-            for a, b in ((x, y), (y, x)):
-                add(a, bar, zero[b])
-                self._add_to(t, self._factor(a), first, bar, self._factor(b).load(t, k))
-            inner.append((self._factor(x), self._factor(y), bar))
-        elif op == "reciprocal":  # Σ x_j z_{k-j} = 0
-            (x,) = args
+            return []
+        if op == "sum":
+            for a, weight in zip(args, node.weights, strict=False):
+                add(a, bar, self._weight(t, start.scalars, weight))
+                if weight in self._active:
+                    self._weight_bar(t, weight, bar, self._factor(a).load(t, k))
+            return []
+        if op == "product":
+            x, y = self._factor(args[0]), self._factor(args[1])
+            add(args[0], bar, zero[args[1]])
+            add(args[1], bar, zero[args[0]])
+            self._add_to(t, x, first, bar, y.load(t, k))
+            self._add_to(t, y, first, bar, x.load(t, k))
+            return [(x, y, bar)]
+        if op == "reciprocal":  # Σ x_j z_{k-j} = 0
+            x, z = self._factor(args[0]), self._factor(n)
             less = t.neg(t.mul(bar, zero[n]))
-            add(x, less, zero[n])
-            self._add_to(t, self._factor(x), first, less, self._factor(n).load(t, k))
-            self._add_to(t, self._factor(n), first, less, self._factor(x).load(t, k))
-            inner.append((self._factor(x), self._factor(n), less))
-        elif op == "sqrt":  # Σ z_j z_{k-j} = x_k
+            add(args[0], less, zero[n])
+            self._add_to(t, x, first, less, z.load(t, k))
+            self._add_to(t, z, first, less, x.load(t, k))
+            return [(x, z, less)]
+        if op == "sqrt":  # Σ z_j z_{k-j} = x_k
+            z = self._factor(n)
             half = t.mul(bar, t.div(t.number(0.5), zero[n]))
+            less = t.neg(half)
             add(args[0], half, t.number(1.0))
-            z, less = self._factor(n), t.neg(half)
             self._add_to(t, z, first, t.add(less, less), z.load(t, k))
-            inner.append((z, z, less))
-        else:  # k z_k = Σ_{j>0} D_j w_{k-j}
-            assert op in FUNCTIONS
-            bar = t.neg(bar) if op == "cos" else bar
-            slope, w = self._slope(n), self._factor(args[1])
-            scaled = t.mul(step if slope.back else per, bar)
-            self._add_to(t, w, first, scaled, slope.load(t, k))
-            if slope.back:
-                self._add_to(t, slope, k, scaled, zero[args[1]])
-            else:
-                add(args[0], bar, zero[args[1]])
-            inner.append((slope, w, scaled))
+            return [(z, z, less)]
+        assert op in FUNCTIONS  # k z_k = Σ_{j>0} D_j w_{k-j}
+        slope, w = self._slope(n), self._factor(args[1])
+        bar = t.neg(bar) if op == "cos" else bar
+        scaled = t.mul(t.reciprocal(k), bar)
+        if slope.back:  # D is h times the argument's rate
+            scaled = t.mul(h, scaled)
+            self._add_to(t, slope, k, scaled, zero[args[1]])
+        else:
+            add(args[0], bar, zero[args[1]])
+        self._add_to(t, w, first, scaled, slope.load(t, k))
+        return [(slope, w, scaled)]
 
     def _convolve_back(
         self,
@@ -295,12 +292,12 @@ class Backward(Series):
         for f, bar in zip(record.force, self._solve_back(t, start, h, first), strict=True):
             if f >= 0:
                 add(bars, f, bar, one)
-        for place, (node, weight, constant) in record.mass.items():
+        for place, (entry, weight, constant) in record.mass.items():
             bar = t.load(*self._cell(t, place))
             self._weight_bar(t, constant, bar, one)
-            if node >= 0:
-                add(bars, node, bar, self._weight(t, start.scalars, weight))
-                self._weight_bar(t, weight, bar, zero[node])
+            if entry >= 0:
+                add(bars, entry, bar, self._weight(t, start.scalars, weight))
+                self._weight_bar(t, weight, bar, zero[entry])
         for i in reversed(range(len(record.nodes))):
             node = record.nodes[i]
             op, args = node.op, node.args

@@ -244,7 +244,8 @@ def _pull_all(values, seeds, found, dt, order):  # type: ignore[no-untyped-def]
                 kept[substeps, 2 * n + 1, i] = used
                 moved |= used > 0.0
                 if rows[left * BLOCK + i] > 0.0 and (
-                    rows[status * BLOCK + i] >= LARGEST_COUNT or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
+                    rows[status * BLOCK + i] >= LARGEST_COUNT
+                    or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
                 ):
                     return first + i + 1
             substeps += moved

@@ -353,7 +353,9 @@ class SeriesTangent:
         by_start, by_end = self._linear(dt)
         moving, count = len(self._moving), len(states)
         seeds = cotangents @ by_end
-        given = np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
+        given = (
+            np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
+        )
         values = np.empty((len(self._given) + moving, count))
         values[: len(self._given)] = self._constants[:, None]
         for i, name in enumerate([*self._given, *self._moving]):
