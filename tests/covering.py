@@ -2,12 +2,13 @@
 
 Tests over environments take their parameters from `covering`. Those outside the covering set are marked
 slow, so ``make test`` costs about the same however many environments there are, and ``make test-slow`` runs
-the rest. Checks of a few milliseconds run on all: they are parametrised with `TASKS` itself.
+the rest. Checks of a few milliseconds run on all: they are parametrised with `TASKS` itself. Those that
+compile programs of their own, and are about the engine and not about formulas, cover the engines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
@@ -21,10 +22,10 @@ from lag_envs.tasks.base import Task
 WORDS_AND_NUMBERS = frozenset(
     "id scene defaults interval steps action start target usable usable_ranges check check_start fastest "
     "edges observe bounds reward reached behaviour controllers reference hyperparameters goal "
-    "value_iteration examples difficulty note quantities".split()
+    "value_iteration examples difficulty note open quantities".split()
 )
-
-
+#: What a covering set covers.
+Features = Callable[[type[Task]], frozenset[str]]
 #: Those that are stepped as their tasks say: without hidden parameters, imperfect sensors or actuators.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
@@ -46,9 +47,15 @@ def features(kind: type[Task]) -> frozenset[str]:
     return frozenset(found)
 
 
-def quick(ids: Iterable[str] = TASKS) -> list[str]:
+def engine(kind: type[Task]) -> frozenset[str]:
+    """Return what decides how a step is printed, whatever its formulas are."""
+    form = kind().scene._form
+    return frozenset({f"{form.kind.__name__ if form else 'series'}, {len(kind.imperfections)} imperfections"})
+
+
+def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:
     """Return a covering set, chosen greedily: what adds most features, and then has fewest coordinates."""
-    left = {env_id: features(TASKS[env_id]) for env_id in ids}
+    left = {env_id: of(TASKS[env_id]) for env_id in ids}
     size = {env_id: len(TASKS[env_id]().scene._layout.free) for env_id in left}
     missing, found = frozenset[str]().union(*left.values()), []
     while missing:
@@ -57,8 +64,8 @@ def quick(ids: Iterable[str] = TASKS) -> list[str]:
     return [env_id for env_id in left if env_id in found]
 
 
-def covering(ids: Iterable[str] = TASKS) -> list[Any]:
+def covering(ids: Iterable[str] = TASKS, of: Features = features) -> list[Any]:
     """Return all ids for the parameters of a test, those outside their covering set marked slow."""
     every = list(ids)
-    chosen = quick(every)
+    chosen = quick(every, of)
     return [pytest.param(i, marks=() if i in chosen else pytest.mark.slow) for i in every]

@@ -275,6 +275,7 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     assert steps == pytest.approx(sum(ends), rel=1e-14)
 
 
+@pytest.mark.slow
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "LONGEST", 2)
     report = benchmark.bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))

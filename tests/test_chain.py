@@ -18,7 +18,13 @@ from lag_envs.controllers.tracking import Tracking, follow, recorded, search
 from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.tasks import chain, pivoted_bar
 
-SWING_UPS = (chain.SwingUp, chain.SwingUpWeak, chain.SwingUpTriple)
+
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+# They share their formulas; each has programs of its own, which compile for seconds.
+SWING_UPS = (chain.SwingUp, slow(chain.SwingUpWeak), slow(chain.SwingUpTriple))
 each_swing_up = pytest.mark.parametrize("kind", SWING_UPS, ids=lambda kind: kind.id)
 SEEDS = range(3_600_000_000, 3_600_000_050)
 
@@ -64,7 +70,7 @@ def test_doing_nothing_earns_nothing(kind):
 # --- whipping ---
 
 
-@pytest.mark.parametrize(("kind", "fastest"), [(chain.SwingUp, 45.0), (chain.SwingUpTriple, 70.0)])
+@pytest.mark.parametrize(("kind", "fastest"), [(chain.SwingUp, 45.0), slow(chain.SwingUpTriple, 70.0)])
 def test_bars_whip_and_steps_are_divided(kind, fastest):
     """Random actions turn bars so fast that one series diverges; divided, a step equals its four quarters."""
     played = record(Rollout(kind.id, make_controller(kind.id, "random"), range(300)))
@@ -98,6 +104,7 @@ def test_balancing_needs_a_track_and_an_upright_start():
         env.reset(options={"state": [0.0, 0.0, math.pi, 0.0, 0.0, 0.0]})
 
 
+@pytest.mark.slow
 def test_feedback_balances():
     # The means over many more episodes are 344 and 376, those of doing nothing 14.
     means = {name: play(chain.Balance.id, make_controller(chain.Balance.id, name), SEEDS).mean()
@@ -110,7 +117,7 @@ def test_feedback_balances():
 
 @pytest.mark.parametrize(
     ("kind", "least"),
-    [(chain.SwingUp, 446.0), (chain.SwingUpWeak, 400.0), (chain.SwingUpTriple, 398.0)],
+    [(chain.SwingUp, 446.0), slow(chain.SwingUpWeak, 400.0), slow(chain.SwingUpTriple, 398.0)],
     ids=lambda one: getattr(one, "id", ""),
 )
 def test_recorded_plans_are_followed(kind, least):

@@ -9,15 +9,33 @@ import functools
 
 import numpy as np
 import pytest
-from covering import PERFECT
+from covering import PERFECT, quick
 from golden_rollouts import GOLDEN, Roll, Run, planned, play, runs, stack
 
 from lag_envs.tasks import TASKS
 
 RUNS = runs()
-each_run = pytest.mark.parametrize("name", RUNS)
+IDS = dict.fromkeys(name.partition("/")[0] for name in RUNS)
+
+
+def each(ids):
+    """Return the runs of some ids as parameters.
+
+    Quick are single environments of a covering set, and one run of every id; a batch has the bits of single
+    ones (test_vector.py), and programs of its own to compile.
+    """
+    chosen, found = quick(ids), []
+    for name, run in RUNS.items():
+        env_id, _, kind = name.partition("/")
+        if env_id in ids:
+            fast = kind == "defaults" or (env_id in chosen and not run.mode)
+            found.append(pytest.param(name, marks=() if fast else pytest.mark.slow))
+    return pytest.mark.parametrize("name", found)
+
+
+each_run = each(IDS)
 #: A step of the others depends on more than the state and the action.
-each_perfect_run = pytest.mark.parametrize("name", [n for n in RUNS if n.partition("/")[0] in PERFECT])
+each_perfect_run = each([env_id for env_id in IDS if env_id in PERFECT])
 TOLERANCE = 1e-12
 
 

@@ -193,7 +193,7 @@ def test_serve(run):
         text=True,
         env=os.environ | {"PYTHONPATH": path},
     )
-    stop = threading.Timer(60, server.kill)
+    stop = threading.Timer(300, server.kill)
     stop.start()
     try:
         address = server.stdout.readline().split()[0]

@@ -83,7 +83,9 @@ def best(env_id):
     return known_returns(env_id).best
 
 
-@pytest.mark.parametrize("env_id", [CartPoleSwingUp.id, CartPoleContinuous.id])
+@pytest.mark.parametrize(
+    "env_id", [CartPoleSwingUp.id, pytest.param(CartPoleContinuous.id, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_leaving_does_not_pay(env_id, side):
     assert play(env_id, Constant(side), range(20)).max() < 0.2 * best(env_id)
@@ -277,7 +279,7 @@ def test_no_policy_exceeds_the_value_of_the_start(name):
 
 
 def test_the_known_optimum_is_the_value_of_the_start():
-    from lag_envs.controllers.energy import value_at_start
+    from lag_envs.controllers.pendulum import value_at_start
 
     states = np.array([[math.pi, 0.0], [2.0, 1.0], [0.0, 0.0]])
     found = value_at_start(make_task(PendulumRegret.id), *states.T)

@@ -1,10 +1,6 @@
 """PPO in one file: it learns, repeats and resumes bit for bit, and takes every kind of action."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from trainings import go, kill_and_interrupt
 
 import lag_envs
 from agents import learners, ppo, race, submit, train, tune
@@ -98,20 +95,6 @@ def own():
 
 def make_run(folder, env_id=ENV, seed=3, steps=768, **more):
     return Run(Path(folder), env_id, ppo.NAME, seed, steps, hyperparameters(ppo.NAME, env_id) | SHORT | more)
-
-
-def go(run, until=10**9):
-    """Train until so many steps are done; return whether the run is finished."""
-
-    def show(run):
-        if until <= run.trained < run.steps:
-            raise KeyboardInterrupt
-
-    try:
-        learners.train(run, show=show, tested=lambda run: None)
-    except KeyboardInterrupt:
-        return False
-    return True
 
 
 def learnt(run):
@@ -459,17 +442,6 @@ def test_seeds_over_a_ray_cluster_are_the_same(tmp_path):
 
 @pytest.mark.slow
 def test_killed_and_interrupted_runs_go_on(tmp_path):
-    arguments = [sys.executable, "-m", "agents.ppo", ENV, "--steps", "200000", "--output", str(tmp_path)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
-    for number in (signal.SIGKILL, signal.SIGINT):
-        process = subprocess.Popen(
-            arguments, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
-        for line in process.stdout:
-            if " steps, " in line and ":         0 steps" not in line:
-                break
-        process.send_signal(number)
-        output = process.communicate(timeout=60)[0]
-    assert process.returncode == 130, output
-    assert "To go on:" in output and f"agents.ppo {ENV}" in output
+    output = kill_and_interrupt("agents.ppo", ENV, "--steps", "200000", "--output", str(tmp_path))
+    assert f"agents.ppo {ENV}" in output
     assert train.main([ENV, "--algo", ppo.NAME, "--steps", "200000", "--output", str(tmp_path)]) == 0

@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from rollouts import one_by_one
+from trainings import go, kill_and_interrupt
 
 from agents import learners, run, train
 from agents.learners import ALGORITHMS, hyperparameters, load_policy
@@ -46,20 +46,6 @@ def short(monkeypatch):
 def make_run(folder, algo="ppo", env_id=ENV, steps=400, **more):
     hyper = hyperparameters(algo, env_id) | SHORT[algo] | more
     return Run(Path(folder), env_id, algo, 3, steps, hyper)
-
-
-def go(run, until=10**9):
-    """Train until so many steps are done; return whether the run is finished."""
-
-    def show(run):
-        if until <= run.trained < run.steps:
-            raise KeyboardInterrupt
-
-    try:
-        learners.train(run, show=show, tested=lambda run: None)
-    except KeyboardInterrupt:
-        return False
-    return True
 
 
 @pytest.fixture
@@ -258,29 +244,13 @@ def test_seeds_side_by_side(command, config, tmp_path):
     assert status == 2 and "result.json cannot be read" in output
 
 
+@pytest.mark.slow
 def test_killed_and_interrupted_runs_go_on(config, tmp_path):
-    arguments = [
-        sys.executable, "-m", "agents.train", ENV, "--steps", "30000", "--config", str(config), "--jobs", "1",
+    output = kill_and_interrupt(
+        "agents.train", ENV, "--steps", "30000", "--config", str(config), "--jobs", "1",
         "--output", str(tmp_path),
-    ]  # fmt: skip
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))
-    }
-
-    def start():
-        return subprocess.Popen(
-            arguments, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
-
-    for number in (signal.SIGKILL, signal.SIGINT):
-        process = start()
-        for line in process.stdout:
-            if " steps, " in line and ":         0 steps" not in line:
-                break
-        process.send_signal(number)
-        output = process.communicate(timeout=60)[0]
-    assert process.returncode == 130, output
-    assert "To go on:" in output and f"agents.train {ENV}" in output
+    )  # fmt: skip
+    assert f"agents.train {ENV}" in output
     content = Run(tmp_path / ENV / "ppo" / "seed0", ENV, "ppo", 0, 30000, hyperparameters("ppo", ENV, config))
     assert content.load_checkpoint() is not None and content.trained >= 3700 and len(content.curve) >= 3
 
@@ -428,7 +398,8 @@ def beside_the_example(monkeypatch):
         pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
         # It chooses among three actions.
         pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),
-        (f"{SEVERAL}:Deliver", "OwnCrane-v0"),  # two controls, two targets
+        # It has two controls and two targets. Quick is the training in test_add_task.py.
+        pytest.param(f"{SEVERAL}:Deliver", "OwnCrane-v0", marks=pytest.mark.slow),
     ],
 )
 def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_example, tmp_path):

@@ -83,7 +83,9 @@ def check_against_fused(env, seeds):
         assert np.max(error / condition) <= 1e-15
 
 
-@pytest.mark.parametrize("task", [*OWN, Six], ids=lambda task: task.__name__)
+@pytest.mark.parametrize(
+    "task", [*OWN, pytest.param(Six, marks=pytest.mark.slow)], ids=lambda task: task.__name__
+)
 def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     outer = made(task)
     scene = outer.scene

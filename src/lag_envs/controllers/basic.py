@@ -1,8 +1,10 @@
-"""What controllers share, and three that know nothing of the motion."""
+"""What controllers share, and a few that know nothing of the motion."""
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,6 +72,29 @@ def feedback(task: Task, **gains: float) -> Feedback:
         if name not in task.observation:
             raise ValueError(f"there is no observation {name!r}, only {', '.join(task.observation)}")
     return Feedback(task, gain=[[gains.get(name, 0.0) for name in task.observation]])
+
+
+class Switch:
+    """The largest control to one side or the other, by the sign of a sum of observations.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``, with one control.
+    weights : mapping
+        What each entry of the observation counts in the sum.
+    """
+
+    def __init__(self, task: Task, *, weights: Mapping[str, float]) -> None:
+        self.task = task
+        self.weights = np.array([weights.get(name, 0.0) for name in task.observation])
+
+    def predict(
+        self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> tuple[NDArray, Any]:
+        """Return the action for each observation."""
+        side = np.where(observation @ self.weights < 0.0, -1.0, 1.0)
+        return actions_for(self.task, side * self.task.limit_control), state
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
@@ -161,6 +186,13 @@ class FeedbackController(ABC):
         return actions_for(self.task, self.control(*self.read(observation))), state
 
 
+def remade(task: Task, kind: type[Task] | None = None, /, **changes: Any) -> Task:
+    """Return a task with the same parameters, but for those that change; perhaps of another class."""
+    fields = dataclasses.fields(task.scene)
+    own = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
+    return (kind or type(task))(**({"dt": task.dt, "duration": task.duration} | own | changes))
+
+
 def actions_for(task: Task, controls: Array) -> NDArray:
     """Return the actions that ask for controls, or for the nearest to them that there are.
 
@@ -226,6 +258,7 @@ class ObservationDecoder:
         while not np.allclose(risen(size), 2.0 * risen(0.5 * size)):
             size *= 0.5
         slopes = risen(size) / size
+        self._slopes, self._angles = slopes, angles
         self._inverse = np.linalg.pinv(slopes)
         #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
@@ -249,6 +282,17 @@ class ObservationDecoder:
             state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])
         targets = lifted[..., self._width :]
         return state, targets[..., 0] if targets.shape[-1] == 1 else targets
+
+    def expected(self, states: Array) -> tuple[Array, Array]:
+        """Return what states (n, n_state) look like without targets, and its derivatives by them."""
+        turned = states[:, self._angles]
+        circles = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        lifted = np.concatenate([states, circles.reshape(len(states), -1)], axis=1)
+        slopes = np.tile(self._slopes[: self._n].T, (len(states), 1, 1))
+        for j, i in enumerate(self._angles):
+            by_cos, by_sin = self._slopes[self._n + 2 * j : self._n + 2 * j + 2]
+            slopes[:, :, i] += np.outer(-circles[:, j, 1], by_cos) + np.outer(circles[:, j, 0], by_sin)
+        return self._zero + lifted @ self._slopes[: self._width], slopes
 
     def difference(self, states: Array, others: Array) -> Array:
         """Return states (..., n_state) minus others, the shorter way around where only that is seen."""

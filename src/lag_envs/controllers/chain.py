@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array, ObservationDecoder
+from lag_envs.controllers.basic import Array, ObservationDecoder, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import regulator
 from lag_envs.controllers.mpc import MPC
@@ -19,7 +18,7 @@ from lag_envs.tasks.chain import SwingUp
 
 def easier(
     task: SwingUp, *, effort: float, share: float = 0.9, edge: float = 0.9
-) -> tuple[SwingUp, Callable[[Array], Array]]:
+) -> tuple[Task, Callable[[Array], Array]]:
     """Return a task that is easier to plan for, and what its end costs.
 
     In place of the guard, which has kinks, it has a penalty that begins before the track's end. It pays for
@@ -59,9 +58,7 @@ def easier(
         away = 2.0 * (1.0 + np.cos(angles)).sum(axis=1) + 0.01 * (rates**2).sum(axis=1)
         return 10.0 * (away + 0.3 * (s / task.length) ** 2 + 0.1 * s_dot**2)
 
-    fields = dataclasses.fields(task.scene)
-    parameters = {field.name: getattr(task.scene, field.name) for field in fields}
-    return Easier(dt=task.dt, duration=task.duration, **parameters), end
+    return remade(task, Easier), end
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:

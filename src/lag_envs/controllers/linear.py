@@ -133,6 +133,55 @@ def time_varying(
     return gains, hold
 
 
+class Regulator(FeedbackController):
+    """Hold a rest by a linear-quadratic regulator of the exact control step.
+
+    Parameters
+    ----------
+    task : Task
+        The task, ``env.unwrapped.task``.
+    at : mapping, optional
+        Entries of the state at the rest that are not 0.
+    weights : mapping
+        What the square of an entry of the state costs in a step.
+    effort : float
+        What the square of a control costs, as a share of the largest.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        *,
+        weights: Mapping[str, float],
+        effort: float,
+        at: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(task)
+        scene = task.scene
+        self.rest = np.array([(at or {}).get(name, 0.0) for name in scene.state_names])
+        columns = [scene.control_names.index(a.control) for a in task.formulas.acting]
+        a, b = scene.jacobian(self.rest, np.zeros(len(scene.control_names)), task.dt)
+        b = b[:, columns]
+        q = np.diag([weights.get(name, 0.0) for name in scene.state_names])
+        r = effort * np.diag(1.0 / np.atleast_1d(task.limit_control) ** 2)
+        self.cost = solve_discrete_are(a, b, q, r)
+        self.gain = np.linalg.solve(r + b.T @ self.cost @ b, b.T @ self.cost @ a)
+
+    def off(self, state: Array) -> Array:
+        """Return states relative to the rest, by the shorter way around."""
+        return self.read.difference(state, self.rest)
+
+    def cost_to_go(self, state: Array) -> Array:
+        """Return what the regulator expects to pay from states on."""
+        off = self.off(state)
+        return np.einsum("...i,ij,...j->...", off, self.cost, off)
+
+    def control(self, state: Array, target: Array) -> Array:
+        """Return -K times the distance from the rest."""
+        u = -self.off(state) @ self.gain.T
+        return u[..., 0] if self.gain.shape[0] == 1 else u
+
+
 class BalanceLQR(FeedbackController):
     """Keep what moves on a support upright by a linear-quadratic regulator, in spite of kicks.
 

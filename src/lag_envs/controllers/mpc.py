@@ -95,6 +95,7 @@ class MPC:
         self.task, self.horizon, self.every = task, horizon, min(every, horizon)
         self.guesses, self.good, self.pause, self.surprise = guesses, good, pause, surprise
         self.hold, self.holds, self.tail = hold, holds, tail
+        self.largest = task.formulas.largest
         self.rng, self.read = np.random.default_rng(seed), ObservationDecoder(task)
         calm = without_kicks(task)
         self.model = Model(calm)
@@ -138,7 +139,7 @@ class MPC:
         if held.any():
             action = np.where(held, self.hold.act(x, targets, np.full(n, np.inf)), action)
         plan.step[:] = np.where(held, self.horizon, plan.step + 1)
-        return as_actions(action.reshape(values.shape[:-1])), plan
+        return as_actions(action.reshape(values.shape[:-1]), self.largest), plan
 
     def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
         """Plan anew for some of the episodes."""
@@ -167,7 +168,7 @@ class MPC:
             off = self.read.difference(x, plan.states[rows, now])
             action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
             after = 0.0 if self.hold is None else self.hold.act(x, targets, np.full(len(x), np.inf))
-            actions[:, t] = np.clip(np.where(step < self.horizon, action, after), -1.0, 1.0)
+            actions[:, t] = np.where(step < self.horizon, action, after).clip(-self.largest, self.largest)
             x, _, _ = self.model(x, actions[:, t], self.planner._goals(targets, (len(x),)))
         return actions
 
@@ -180,7 +181,7 @@ class MPC:
     def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
         """Return the best of plans from random guesses, and what it is worth."""
         n, m = len(x), self.guesses
-        guesses = waves(self.rng, n * m, self.horizon, self.task.dt)
+        guesses = self.largest * waves(self.rng, n * m, self.horizon, self.task.dt)
         found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m), guesses)
         best = values.reshape(n, m).argmax(axis=1) + m * np.arange(n)
         return self.polisher.improve(x, targets, self.share * found.actions[best])

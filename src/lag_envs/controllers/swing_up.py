@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 
-from lag_envs.controllers.basic import Array
+from lag_envs.controllers.basic import Array, remade
 from lag_envs.tasks.base import Task
 
 
@@ -71,6 +70,4 @@ def easier(
             total += end.get(entry, 0.0) * (2.0 * (1.0 - np.cos(off)) if unit == "rad" else off * off)
         return total
 
-    fields = dataclasses.fields(task.scene)
-    parameters = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
-    return Easier(dt=every * task.dt, duration=task.duration, **parameters), lost
+    return remade(task, Easier, dt=every * task.dt), lost

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lag_envs.controllers.basic import remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -125,7 +125,7 @@ class Tracking(Clocked):
 
 def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
     """Return where a task's plan is kept: the one to follow, or the "quick" one to begin planning from."""
-    return (folder or FOLDER) / f"{task.id}-{kind}.npz"
+    return (folder or FOLDER) / f"{task.plans.of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:
@@ -141,16 +141,9 @@ def hold(task: Task) -> Tracking:
 def follow(task: Task, states: ArrayLike, actions: ArrayLike, plans: Plans) -> Tracking:
     """Return the controller that follows states (steps + 1, n_state) and actions (steps,)."""
     states, actions = np.asarray(states, np.float64), np.asarray(actions, np.float64)
-    model = changed(task, plans.smooth) if plans.smooth else task
+    model = remade(task, **plans.smooth) if plans.smooth else task
     gains, last = time_varying(model, states, actions, plans.rest, plans.weights, plans.effort)
     return Tracking(task, states=states, actions=actions, gains=gains, rest=plans.rest, hold=last)
-
-
-def changed(task: Task, parameters: Mapping[str, Any]) -> Task:
-    """Return the same task with other parameters."""
-    fields = (field.name for field in dataclasses.fields(task.scene) if field.init)
-    own = {name: getattr(task.scene, name) for name in fields}
-    return type(task)(dt=task.dt, duration=task.duration, **(own | dict(parameters)))
 
 
 def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
@@ -179,6 +172,7 @@ def search(task: Task, seed: int = 0, **changes: Any) -> Iterator[Tracking]:
     easier, tail = resolve(plans.place)(task, **(dict(plans.numbers) | changes))
     planner = ILQR(easier, [], tail=tail, steps=size["steps"], iterations=size["iterations"])
     guesses = waves(np.random.default_rng(seed), size["batch"], size["steps"], easier.dt)
+    guesses *= easier.formulas.largest
     every = round(easier.dt / task.dt)
     starts = np.tile(np.asarray(task.centre, np.float64), (len(guesses), 1))
     found, values = planner.improve(starts, np.zeros(len(guesses)), guesses)

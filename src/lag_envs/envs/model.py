@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -9,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
+from lag_envs.envs.reverse import Reverse
 from lag_envs.envs.single import absent
-from lag_envs.scenes.checks import real_array
+from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
@@ -36,6 +38,27 @@ class Expansion(NamedTuple):
     slopes: Array
     gradient: Array
     curvature: Array
+
+
+class Gradient(NamedTuple):
+    """A gradient by what a step depends on.
+
+    Attributes
+    ----------
+    states : ndarray, shape (n, n_state)
+        By the states before the step.
+    actions : ndarray, shape (n,), or (n, n_actions) where there are several
+        By the actions.
+    targets : ndarray, shape (n, n_targets)
+        By the targets.
+    parameters : ndarray, shape (n, n_parameters)
+        By the scene's parameters that were named, row by row.
+    """
+
+    states: Array
+    actions: Array
+    targets: Array
+    parameters: Array
 
 
 class Model:
@@ -67,6 +90,7 @@ class Model:
         self._numbers = np.array([constants[name] for name in program.uniform])
         self._step = program.model
         self._n_state = program.n_state
+        self._reversed: dict[tuple[str, ...], Reverse] = {}
 
     def __call__(
         self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None
@@ -99,6 +123,21 @@ class Model:
         StepRefused
             Where a step cannot be taken to full accuracy.
         """
+        states, actions, targets = self._checked(states, actions, targets)
+        n = len(states)
+        ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
+        refused = self._step(states, actions, targets, self._numbers, ends, rewards, ended)
+        if refused:
+            state, action = states[refused - 1], actions[refused - 1]
+            raise self.task.formulas.refusal(
+                state, action, self.task.dt, None, f"the step of row {refused - 1}"
+            )
+        return ends, rewards, ended
+
+    def _checked(
+        self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None
+    ) -> tuple[Array, Array, Array]:
+        """Return states, actions and targets as arrays of two axes, or raise a ValueError."""
         states = np.ascontiguousarray(real_array("states", states))
         n = len(states) if states.ndim else 0
         if states.shape != (n, self._n_state):
@@ -113,14 +152,89 @@ class Model:
             if not np.isfinite(values).all():
                 row = int(np.argwhere(~np.isfinite(values))[0, 0])
                 raise ValueError(f"{name} must be finite, got {values[row]} in row {row}")
-        ends, rewards, ended = np.empty_like(states), np.empty(n), np.empty(n, np.bool_)
-        refused = self._step(states, actions.reshape(n, count), targets, self._numbers, ends, rewards, ended)
-        if refused:
-            state, action = states[refused - 1], actions[refused - 1]
-            raise self.task.formulas.refusal(
-                state, action, self.task.dt, None, f"the step of row {refused - 1}"
+        return states, actions.reshape(n, count), targets
+
+    def observe(self, states: ArrayLike, targets: ArrayLike | None = None) -> Array:
+        """Return the observations of states, shape (n, n_observations)."""
+        states = real_array("states", states)
+        return self._reverse(()).observations(states.T, self._targets(targets, len(states)).T).T
+
+    def vjp(
+        self,
+        states: ArrayLike,
+        actions: ArrayLike,
+        targets: ArrayLike | None = None,
+        *,
+        by_states: ArrayLike = 0.0,
+        by_observations: ArrayLike = 0.0,
+        by_rewards: ArrayLike = 0.0,
+        parameters: Sequence[str] = (),
+        ends: Array | None = None,
+        kicks: ArrayLike = 0.0,
+    ) -> Gradient:
+        """Return a gradient by a step's results as one by what the step depends on.
+
+        This is reverse mode through clipping, guard, motion, reward and observation. docs/derivatives.md says
+        what it means at kinks and ends.
+
+        Parameters
+        ----------
+        states, actions, targets : array_like
+            As for a step.
+        by_states : array_like, shape (n, n_state)
+            The gradient by the states after the step.
+        by_observations : array_like, shape (n, n_observations)
+            By their observations.
+        by_rewards : array_like, shape (n,)
+            By the rewards.
+        parameters : sequence of str
+            Parameters of the scene by which it is wanted.
+        ends : ndarray, shape (n, n_state), optional
+            The states after the step, before kicks, where they are known.
+        kicks : array_like, shape (n, n_state)
+            What kicks added to them. They are constants.
+
+        Returns
+        -------
+        Gradient
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As a step does; ValueError also for a task whose actions are choices, and for unknown parameters.
+        """
+        by = check_parameters(self.task.scene, parameters)
+        reverse, scene = self._reverse(by), self.task.scene
+        shape = np.shape(actions)
+        if ends is None:
+            ends, _, _ = self(states, actions, targets)
+        states, actions, targets = self._checked(states, actions, targets)
+        n, observations = len(states), len(self.task.formulas.observation)
+        seeds = [
+            np.broadcast_to(np.asarray(x, np.float64).T, wanted)
+            for x, wanted in (
+                (by_states, (self._n_state, n)),
+                (by_observations, (observations, n)),
+                (by_rewards, (1, n)),
             )
-        return ends, rewards, ended
+        ]
+        y, a, g, z = states.T, actions.T, targets.T, ends.T
+        u = reverse.controls(y, a, g)
+        after = z + np.broadcast_to(np.asarray(kicks, np.float64).T, z.shape)
+        own_y, own_z, own_u, own_g, own_p = reverse.after(y, z, u, g, after, *seeds)
+        motion = scene.vjp(states, u.T, self.task.dt, own_z.T, parameters=by)
+        last_y, last_a, last_g, last_p = reverse.before(y, a, g, own_u + motion[1].T)
+        return Gradient(
+            (own_y + last_y).T + motion[0],
+            last_a.T.reshape(shape),
+            (own_g + last_g).T,
+            (own_p + last_p).T + motion[2],
+        )
+
+    def _reverse(self, parameters: tuple[str, ...]) -> Reverse:
+        if parameters not in self._reversed:
+            self._reversed[parameters] = Reverse(self.task, parameters)
+        return self._reversed[parameters]
 
     def expand(self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None) -> Expansion:
         """Expand one step about each state and action: its motion to first order, its reward to second.

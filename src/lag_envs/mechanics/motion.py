@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -173,7 +173,7 @@ def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
     return values
 
 
-def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
+def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection[str] = ()) -> Mechanics:
     """Derive the equations of motion from what a scene's formulas gave.
 
     Parameters
@@ -184,6 +184,8 @@ def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
         Its names.
     found : Record
         Its formulas.
+    varying : collection of str
+        Parameters that are not put in although they are 0.
 
     Raises
     ------
@@ -194,7 +196,9 @@ def derive_motion(scene: Any, layout: Layout, found: Record) -> Mechanics:
     zero = {
         parameter(name): Expr.of(0)
         for name in scene._numbers()
-        if getattr(scene, name) == 0.0 and any(_is_hard(e, name) for e in found.exprs())
+        if getattr(scene, name) == 0.0
+        and name not in varying
+        and any(_is_hard(e, name) for e in found.exprs())
     }
     if zero:
         names = ", ".join(f"{atom.name}=0" for atom in zero)

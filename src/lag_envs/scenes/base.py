@@ -6,9 +6,9 @@ import dataclasses
 import inspect
 import math
 from abc import ABCMeta
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, dataclass_transform, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,7 @@ from lag_envs.scenes.shapes import Window
 if TYPE_CHECKING:
     import sympy
 
+    from lag_envs.scenes.fitting.result import Fit
     from lag_envs.stepping.general import SeriesStepper, StepBound
     from lag_envs.stepping.lag import LaggedStepper
     from lag_envs.stepping.normal_forms import NormalForm
@@ -422,10 +423,14 @@ class Scene(metaclass=SceneType):
 
     def _order(self, dt: float, lagged: bool = False) -> int:
         """Return the order of the series for a control step; 0 for a closed form, which no lagged one is."""
-        from lag_envs.stepping.general import usual_order
-
         if self._form and not lagged:
             return self._form.order(dt)
+        return self._series_order(dt)
+
+    def _series_order(self, dt: float) -> int:
+        """Return the order by which the general series takes a control step."""
+        from lag_envs.stepping.general import usual_order
+
         return vars(self).get(ORDER) or usual_order(dt)
 
     def _limit(self, dt: float, lagged: bool = False) -> float:
@@ -523,7 +528,24 @@ class Scene(metaclass=SceneType):
 
     truncation_bound = step_bound
 
-    def jacobian(self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02) -> tuple[Array, Array]:
+    @overload
+    def jacobian(
+        self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02, *, parameters: None = None
+    ) -> tuple[Array, Array]: ...
+
+    @overload
+    def jacobian(
+        self, state: ArrayLike, control: ArrayLike = 0.0, dt: float = 0.02, *, parameters: Sequence[str]
+    ) -> tuple[Array, Array, Array]: ...
+
+    def jacobian(
+        self,
+        state: ArrayLike,
+        control: ArrayLike = 0.0,
+        dt: float = 0.02,
+        *,
+        parameters: Sequence[str] | None = None,
+    ) -> tuple[Array, ...]:
         """Return the derivatives of the state after a control step by the state before it and by controls.
 
         The derivatives go through the same series and substeps as the step itself.
@@ -536,6 +558,9 @@ class Scene(metaclass=SceneType):
             The controls that are held.
         dt : float
             Length of the step [s].
+        parameters : sequence of str, optional
+            Names of parameters by which derivatives are wanted too. The others are held, those that would
+            follow from it by default too.
 
         Returns
         -------
@@ -543,13 +568,133 @@ class Scene(metaclass=SceneType):
             By the state.
         B : ndarray, shape (..., n_state, n_controls)
             By the controls.
+        P : ndarray, shape (..., n_state, n_parameters)
+            By the parameters, per unit of each; only where they were asked for.
 
         Raises
         ------
         ValueError, StepRefused
-            As `simulate` does.
+            As `simulate` does; ValueError also for a parameter that the scene lacks, or by which the motion
+            has no derivative, as it may be where it is 0.
+
+        Examples
+        --------
+        >>> from lag_envs.scenes import PivotedBar
+        >>> A, B, P = PivotedBar().jacobian([0.0, 0.0, 3.0, 0.1], 2.0, parameters=["damping", "mass"])
+        >>> A.shape, B.shape, P.shape
+        ((4, 4), (4, 1), (4, 2))
         """
-        return steps.jacobian(self, state, control, dt)
+        return steps.jacobian(self, state, control, dt, parameters)
+
+    def vjp(
+        self,
+        state: ArrayLike,
+        control: ArrayLike,
+        dt: float,
+        cotangent: ArrayLike,
+        *,
+        parameters: Sequence[str] | None = None,
+    ) -> tuple[Array, ...]:
+        """Return a gradient by the state after a control step as gradients by what the step depends on.
+
+        This is reverse mode: row by row the product of `cotangent` with what `jacobian` returns, in less
+        time.
+
+        Parameters
+        ----------
+        state, control, dt, parameters
+            As for `jacobian`.
+        cotangent : array_like, shape (..., n_state)
+            The gradient of something by the entries of the state after the step.
+
+        Returns
+        -------
+        state : ndarray, shape (..., n_state)
+            Its gradient by the state before the step.
+        control : ndarray, shape (..., n_controls)
+            By the controls.
+        parameters : ndarray, shape (..., n_parameters)
+            By the parameters; only where they were asked for.
+
+        Raises
+        ------
+        ValueError, StepRefused
+            As `jacobian` does; ValueError also for a cotangent of another shape.
+
+        Examples
+        --------
+        >>> from lag_envs.scenes import PivotedBar
+        >>> by_state, by_control = PivotedBar().vjp([0.0, 0.0, 3.0, 0.1], 2.0, 0.02, [0.0, 0.0, 1.0, 0.0])
+        >>> by_state.shape, by_control.shape
+        ((4,), (1,))
+        """
+        return steps.vjp(self, state, control, dt, cotangent, parameters)
+
+    def _mechanics_by(self, parameters: tuple[str, ...]) -> Mechanics:
+        """Return the equations of motion with these parameters in them, be they 0."""
+        if not set(parameters) & set(self.mechanics.zeros):
+            return self.mechanics
+        known = vars(self).setdefault("_cached_mechanics_by", {})
+        if parameters not in known:
+            record = recording.record(self, self._layout)
+            known[parameters] = motion.derive_motion(self, self._layout, record, parameters)
+        return known[parameters]
+
+    def fit(
+        self,
+        recordings: Sequence[tuple[ArrayLike, ArrayLike | int | None, float]],
+        free: Sequence[str],
+        *,
+        noise: Mapping[str, float] | None = None,
+        level: float = 0.95,
+    ) -> Fit:
+        """Fit parameters to recordings of the motion.
+
+        Least squares of what was measured less what is simulated, of all recordings together: the most
+        likely parameters where the noise is normal and independent. The start of each recording is unknown
+        too. The search is by multiple shooting with exact derivatives: it cuts recordings into short pieces,
+        so that it finds its way from parameters that are far off and along chaotic motions, and closes the
+        gaps between them.
+
+        Parameters
+        ----------
+        recordings : sequence of (states, controls, dt)
+            ``states``, shape (N, n_state), at equal intervals ``dt`` [s]; NaN where nothing was measured, be
+            it a sample or a whole column. Angles that were measured within one turn may jump by 2π.
+            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; a last
+            one for the last sample may be there and is not used. None where all are 0, or there is none.
+        free : sequence of str
+            The parameters to find. The search begins with the scene's values. Others are held, except those
+            with the value that their default makes from others: they go on following.
+        noise : mapping from str to float, optional
+            Standard deviation of the measurements of each state. By default it is estimated, each state's its
+            own.
+        level : float, default 0.95
+            Level of the confidence intervals.
+
+        Returns
+        -------
+        fitting.result.Fit
+            Estimates, standard errors, intervals, the fitted scene, residuals. It prints as a table, and
+            `plot` draws the residuals.
+
+        Warns
+        -----
+        FitWarning
+            Where data determine a parameter badly or two hardly apart, where residuals are larger than the
+            noise or not independent. `Fit.warnings` has the texts.
+
+        Raises
+        ------
+        ValueError
+            For data that do not determine the parameters, naming those; for a parameter that the scene lacks;
+            for recordings of a wrong shape, with too few values, or with controls that are not finite.
+        StepRefused
+            Where the motion cannot be simulated with the parameters that the search begins with.
+        """
+        from lag_envs.scenes.fitting.fit import fit
+
+        return fit(self, recordings, free, noise, level)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: parameters, state, controls, equations."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -158,6 +158,24 @@ def check_sequence(scene: Any, controls: ArrayLike | int) -> Array:
     if bad.any():
         raise ValueError(f"controls must be finite, got {array[bad][0]} in row {int(np.argwhere(bad)[0, 0])}")
     return array
+
+
+def check_parameters(scene: Any, parameters: Sequence[str]) -> tuple[str, ...]:
+    """Return names of parameters as a tuple, or raise a ValueError for one that the scene lacks."""
+    names = scene._numbers()
+    if isinstance(parameters, str):
+        raise ValueError(f"parameters must be a sequence of names, such as [{parameters!r}]; got a string")
+    found = tuple(parameters)
+    for i, name in enumerate(found):
+        if name not in names:
+            raise ValueError(
+                f"{type(scene).__name__} has no parameter {shown(name)}, only {', '.join(names) or 'none'}"
+            )
+        if name in found[:i]:
+            raise ValueError(f"the parameter {name!r} is named twice")
+        if not math.isfinite(getattr(scene, name)):
+            raise ValueError(f"{name}={getattr(scene, name)}: by what is infinite there are no derivatives")
+    return found
 
 
 # --- lags ---------------------------------------------------------------------------------------------------

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,9 +15,11 @@ from lag_envs.scenes.checks import (
     check_both,
     check_controls,
     check_lags,
+    check_parameters,
     check_sequence,
     check_state,
     check_step,
+    real_array,
 )
 from lag_envs.stepping.pendulum import MAX_SUBSTEPS
 
@@ -107,27 +109,97 @@ def step_bound(
     return StepBound(status, order, by_state, "proved with the step")
 
 
-def jacobian(scene: Scene, state: ArrayLike, control: ArrayLike, dt: float) -> tuple[Array, Array]:
+def jacobian(
+    scene: Scene, state: ArrayLike, control: ArrayLike, dt: float, parameters: Sequence[str] | None = None
+) -> tuple[Array, ...]:
     """See `Scene.jacobian`."""
-    states, controls, shape = check_both(scene, state, control)
-    dt = check_step(dt)
-    n, m = states.shape[-1], controls.shape[-1]
-    count = math.prod(shape)
-    states = np.array(np.broadcast_to(states, (*shape, n)), order="C").reshape(count, n)
-    controls = np.array(np.broadcast_to(controls, (*shape, m)), order="C").reshape(count, m)
-    if scene._form:
-        found, refused = scene._form.jacobian(states, controls, scene._constants(), dt)
-    else:
-        tangent = vars(scene).get("_cached_tangent")
-        if tangent is None:
-            tangent = scene._stepper.tangent({name: getattr(scene, name) for name in scene._numbers()})
-            vars(scene)["_cached_tangent"] = tangent
-        found, refused = tangent.jacobian(states, controls, dt, scene._order(dt))
+    states, controls, shape = _rows(scene, state, control)
+    by = check_parameters(scene, parameters or ())
+    found, refused = _derivatives(scene, by).jacobian(states, controls, check_step(dt))
+    n, m = states.shape[1], controls.shape[1]
+    _check_refused(scene, states, controls, dt, refused)
+    found = found.reshape(*shape, n, n + m + len(by))
+    parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
+    return parts[:2] if parameters is None else parts
+
+
+def vjp(
+    scene: Scene,
+    state: ArrayLike,
+    control: ArrayLike,
+    dt: float,
+    cotangent: ArrayLike,
+    parameters: Sequence[str] | None = None,
+) -> tuple[Array, ...]:
+    """See `Scene.vjp`."""
+    states, controls, shape = _rows(scene, state, control)
+    by = check_parameters(scene, parameters or ())
+    seeds = real_array("cotangent", cotangent)
+    n, m = states.shape[1], controls.shape[1]
+    if seeds.shape != (*shape, n):
+        raise ValueError(
+            f"cotangent must have the shape of the state after the step, {(*shape, n)}, got {seeds.shape}"
+        )
+    found, refused = _derivatives(scene, by).vjp(states, controls, check_step(dt), seeds.reshape(-1, n))
+    _check_refused(scene, states, controls, dt, refused)
+    found = found.reshape(*shape, n + m + len(by))
+    parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
+    return parts[:2] if parameters is None else parts
+
+
+def _rows(scene: Scene, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+    """Return states and controls as rows, and the shape of what they were."""
+    *both, shape = check_both(scene, state, control)
+    states, controls = (
+        np.array(np.broadcast_to(x, (*shape, x.shape[-1])), order="C").reshape(math.prod(shape), x.shape[-1])
+        for x in both
+    )
+    return states, controls, shape
+
+
+def _check_refused(scene: Scene, states: Array, controls: Array, dt: float, refused: int) -> None:
     if refused:
         i = refused - 1
         raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {i}")
-    found = found.reshape(*shape, n, n + m)
-    return found[..., :n], found[..., n:]
+
+
+class _Derivatives(NamedTuple):
+    """Derivatives of steps by rows: ``jacobian(states, controls, dt)``, ``vjp(..., cotangents)``."""
+
+    jacobian: Callable[[Array, Array, float], tuple[Any, int]]
+    vjp: Callable[[Array, Array, float, Array], tuple[Any, int]]
+
+
+def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
+    """Return the derivatives of steps by states, controls and parameters."""
+    from lag_envs.stepping.general import stepper_of
+    from lag_envs.stepping.normal_forms import normal_form
+
+    known = vars(scene).setdefault("_cached_derivatives", {})
+    if by in known:
+        return known[by]
+    mechanics = scene._mechanics_by(by)
+    form, numbers = normal_form(mechanics), {name: getattr(scene, name) for name in scene._numbers()}
+    try:
+        if form:
+            constants, rates = form.constants(numbers), form.rates(numbers, by)
+            known[by] = _Derivatives(
+                lambda y, u, dt: form.jacobian(y, u, constants, dt, rates, len(by)),
+                lambda y, u, dt, seeds: form.vjp(y, u, constants, dt, seeds, rates, len(by)),
+            )
+        else:
+            tangent = stepper_of(mechanics).tangent(numbers, by)
+            known[by] = _Derivatives(
+                lambda y, u, dt: tangent.jacobian(y, u, dt, scene._series_order(dt)),
+                lambda y, u, dt, seeds: tangent.vjp(y, u, dt, scene._series_order(dt), seeds),
+            )
+    except (ArithmeticError, ValueError) as error:
+        given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
+        raise ValueError(
+            f"the motion has no derivative by the parameters at {given}: {error}; leave out those that "
+            "are 0 where a formula divides by them"
+        ) from error
+    return known[by]
 
 
 def energy_balance(

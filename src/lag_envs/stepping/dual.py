@@ -9,6 +9,7 @@ what `Series.expand` and `Series.advance` need, not what the certificate does: c
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -205,12 +206,12 @@ class Variable:
         return self._other(other) / self
 
 
-def variables_of(states: Any, controls: Any) -> tuple[list[Variable], list[Variable]]:
-    """Return the columns of states (n, n_state) and of controls (n, n_controls), each a column of its own."""
-    columns = [*states.T, *controls.T]
+def variables_of(*arrays: Any) -> list[list[Variable]]:
+    """Return for each array of shape (n, ...) its columns as variables, each with a derivative."""
+    columns = [x for array in arrays for x in array.T]
     unit = np.eye(len(columns))[:, :, None]
-    given = [Variable(x, unit[i]) for i, x in enumerate(columns)]
-    return given[: states.shape[1]], given[states.shape[1] :]
+    given = iter([Variable(x, unit[i]) for i, x in enumerate(columns)])
+    return [list(islice(given, array.shape[1])) for array in arrays]
 
 
 def stacked(numbers: Sequence[Variable], count: int) -> Any:

@@ -8,7 +8,7 @@ blocks with the same roundings, which is why a batch and a single environment ag
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import islice
 from types import SimpleNamespace
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping import pendulum, slope
+from lag_envs.stepping.adjoint import compile_lanes
 from lag_envs.stepping.compiling import compile_function, count_operations, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
@@ -213,7 +214,8 @@ class Stepper:
         self._any = [*prepared, call, *finished]
         self._flow = lambda: flow.compile(present)
         self._tangent = lambda by: flow.compile_tangent(present, by)
-        self._given, self._prepare, self._finish = given, prepare, finish
+        self._given, self._prepare, self._finish, self._form = given, prepare, finish, form
+        self._names = [f"k_{name}" for name in constants]
 
     @property
     def operations(self) -> int:
@@ -234,15 +236,15 @@ class Stepper:
         return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
 
     @cache  # noqa: B019 - steppers are kept anyway
-    def compile_jacobian(self, by: tuple[str, ...]) -> Callable:
+    def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
         """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
 
-        It fills ``out[i]`` with the derivatives of the state after step i by state and controls, and returns
-        the row whose step was refused, counted from 1, or 0. `by` names the coefficients that states or
-        controls change.
+        It fills ``out[i]`` with the derivatives of the state after step i by state, controls and constants,
+        and returns the row whose step was refused, counted from 1, or 0. `by` names the coefficients that
+        these change.
         """
         n = self._n_state
-        columns = [*self.start[:n], *self.controls]
+        columns = [*self.start[:n], *self.controls, *(f"k_{name}" for name in constants)]
         wide, size, rows = len(columns), self.flow.size, self.flow.size + len(self.terms)
 
         def given(names: Sequence[Any], numbers: Sequence) -> list[Variable]:
@@ -253,14 +255,14 @@ class Stepper:
             return found
 
         def prepare(xp: Any, *numbers: Any) -> list:
-            names = [*self.start, *self.controls, *self._given]
+            names = [*self.start, *self.controls, *self._names]
             found = self._prepare(VariableFunctions(xp), *given(names, numbers))
             results = [x if isinstance(x, Variable) else Variable.of_column(columns, "", x) for x in found]
             return [x.value for x in results] + [slope for x in results for slope in x.slopes]
 
         def finish(xp: Any, *numbers: Any) -> list:
             slopes, rest = split(numbers, 2 * wide)
-            names = [*self.start, *self.controls, "dt", *self._given]
+            names = [*self.start, *self.controls, "dt", *self._names]
             moved = [Variable(0.0, np.array(part, dtype=object)) for part in split(slopes, wide)]
             others = [Variable(0.0, 0.0)] * (size - 2)
             ends = self._finish(VariableFunctions(xp), *moved, *others, *given(names, rest))
@@ -293,6 +295,41 @@ class Stepper:
             "return 0",
         ]
         return compile_function("jacobian", "\n    ".join(body) + "\n", self._tangent(by))
+
+    @cache  # noqa: B019
+    def compile_vjp(self, constants: tuple[str, ...] = ()) -> Callable:
+        """Compile ``vjp(given, found, numbers)`` of ordinary steps, by lanes; see `compile_lanes`.
+
+        Given are the state's entries, the controls, and cotangents of the state after the step; found are
+        those of state, controls and constants, and whether the step is an ordinary one. The numbers are dt, x
+        and `constants`, as for `advance`.
+        """
+        form, flow, n = self._form, self.flow, self._n_state
+        y, seeds = self.start[:n], [f"seed{i}" for i in range(n)]
+
+        def vjp(xp: Any, numbers: Mapping[str, Any]) -> list:
+            state, u = [numbers[name] for name in y], [numbers[name] for name in self.controls]
+            lifted = (
+                state
+                if self._angle is None
+                else [*state, xp.cos(state[self._angle]), xp.sin(state[self._angle])]
+            )
+            k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._names})
+            variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
+            moved = flow.fast(variables, coefficients, numbers["dt"], xp)
+            within = flow.within(variables, coefficients, numbers["dt"], numbers["x"], xp)
+            ends = form.pack(moved, lifted, u, numbers["dt"], k)[:n]
+            by = [*state, *u, *(numbers[f"k_{name}"] for name in constants)]
+            return [*xp.adjoint(ends, [numbers[name] for name in seeds], by), xp.where(within, 1.0, 0.0)]
+
+        return compile_lanes(
+            "vjp",
+            vjp,
+            [*y, *self.controls, *seeds],
+            ["dt", "x", *self._names],
+            set(self._names) - set(self.constants),
+            n + len(self.controls) + len(constants) + 1,
+        )
 
     @cached_property
     def simulation(self) -> Callable:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lag_envs.mechanics.algebra import Atom, Expr, evaluate
+from lag_envs.mechanics.algebra import Atom, Expr, derivative, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import eliminated, exactly
 from lag_envs.mechanics.layout import Prescribed
@@ -25,6 +25,9 @@ from lag_envs.stepping.dual import Variable, VariableFunctions, stacked, variabl
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
+
+#: What stands in for a parameter that is 0 where a step is divided so that derivatives by it are accurate.
+GUIDE = 1e-2
 
 
 class SeriesStepper:
@@ -43,9 +46,10 @@ class SeriesStepper:
         self._whole = self._lowering.without(*self._parts)
         converted = [*mechanics.mass.values(), *mechanics.coupling.values()] if mechanics.coupling else []
         self._codes: dict[tuple[frozenset[str], bool], StepCode] = {}
+        self._tangents: dict[tuple[str, ...], tuple[Lowering, tuple[list[int], dict]]] = {}
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
-    def _lowered(self, tangents: bool = False) -> tuple[Lowering, tuple[list[int], dict]]:
+    def _lowered(self, tangents: Sequence[str] | None = None) -> tuple[Lowering, tuple[list[int], dict]]:
         """Return what the equations have become, and its parts."""
         lowering = Lowering(self._layout.free, self._moving(), tangents)
         return lowering, lowering.parts(self.mechanics.mass, self.mechanics.force)
@@ -180,17 +184,23 @@ class SeriesStepper:
 
     # --- derivatives ---------------------------------------------------------------------------------------
 
-    @cached_property
-    def _tangents(self) -> tuple[Lowering, tuple[list[int], dict]]:
-        return self._lowered(tangents=True)
-
-    def tangent(self, parameters: Mapping[str, float]) -> SeriesTangent:
-        """Return what differentiates steps of a scene with these parameters."""
-        lowering, parts = self._tangents
+    def tangent(self, parameters: Mapping[str, float], by: tuple[str, ...] = ()) -> SeriesTangent:
+        """Return what differentiates steps of a scene with these parameters, and by which of them."""
+        if by not in self._tangents:
+            self._tangents[by] = self._lowered(tangents=by)
+        lowering, parts = self._tangents[by]
         constants = _evaluated(lowering.constants, parameters)
-        zero = frozenset(name for name, value in constants.items() if value == 0.0)
+        exprs = {name: e for name, e in lowering.constants.items() if constants[name] == 0.0}
+        lifted: dict[str, Expr] = {}
+        for p in by:
+            slopes = _evaluated({n: derivative(e, parameter(p)) for n, e in exprs.items()}, parameters)
+            lifted |= {name: e for name, e in exprs.items() if slopes[name] != 0.0}
+        # Where a series comes in by a parameter that is 0, steps must be short enough for it.
+        above = {name: parameters[name] or (GUIDE if name in by else 0.0) for name in parameters}
+        guide = _evaluated(lifted, above)
         numbers = {f"p_{name}": float(parameters[name]) for name in self._parameters}
-        return SeriesTangent(self, lowering.without(*parts, zero), constants, numbers)
+        record = lowering.without(*parts, frozenset(exprs) - frozenset(lifted))
+        return SeriesTangent(self, record, constants, numbers, by, guide)
 
     # --- code -----------------------------------------------------------------------------------------------
 
@@ -235,6 +245,10 @@ class SeriesTangent:
         What is stepped, made with tangents.
     constants, numbers : mapping from str to float
         Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
+    by : tuple of str
+        Parameters by which derivatives are taken too.
+    guide : mapping from str to float
+        Constants in whose place others decide how a step is divided.
     """
 
     def __init__(
@@ -243,11 +257,13 @@ class SeriesTangent:
         record: SeriesRecord,
         constants: Mapping[str, float],
         numbers: Mapping[str, float],
+        by: tuple[str, ...],
+        guide: Mapping[str, float],
     ) -> None:
-        from lag_envs.stepping.driver import compile_advance_tangents
         from lag_envs.stepping.machine import slots_for
 
-        self._stepper, self._numbers, self._given = stepper, numbers, record.given
+        self._stepper, self._numbers, self._given, self._by = stepper, numbers, record.given, by
+        self._record = record
         n = record.size
         seen = {(node.op, node.index) for node in record.nodes}
         self._still = [i for i in range(n) if ("place", i) not in seen]
@@ -255,16 +271,18 @@ class SeriesTangent:
         self._moving = [*(f"q{i}" for i in range(n)), *(f"v{i}" for i in range(n))]
         without = {*(f"q{i}" for i in self._still), *(f"v{i}" for i in self._free)}
         inputs = [name for name in record.given if name not in record.constants]
+        used = {source for slopes in record.tangents.values() for source in slopes}
+        inputs += [f"parameter_{name}" for name in by if f"parameter_{name}" in used]
         self._columns = tuple(name for name in [*self._moving, *inputs] if name not in without)
         self._first = np.zeros((2 * n, slots_for(len(self._columns))))
         for i, name in enumerate(self._moving):
             if name in self._columns:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
-        self._advance = compile_advance_tangents(record, self._columns)
+        self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
-        """Return the derivatives of the states at the step's end by states and controls.
+        """Return the derivatives of the states at the step's end by states, controls and parameters.
 
         Parameters
         ----------
@@ -279,27 +297,34 @@ class SeriesTangent:
 
         Returns
         -------
-        derivatives : ndarray, shape (n, n_state, n_state + n_controls)
+        derivatives : ndarray, shape (n, n_state, n_state + n_controls + n_parameters)
             The derivatives; None where a step was refused.
         refused : int
             The row whose step was refused, counted from 1; 0 where there is none.
         """
         count, size, first = len(states), len(self._moving) // 2, len(self._given)
         xp = VariableFunctions()
-        y, u = variables_of(states, controls)
-        before = self._stepper.prepare(xp, y, u, self._numbers)
+        numbers = [self._numbers.get(f"p_{name}", 0.0) for name in self._by]
+        y, u, p = variables_of(states, controls, np.broadcast_to(numbers, (count, len(numbers))))
+        moved = {f"parameter_{name}": number for name, number in zip(self._by, p, strict=True)}
+        k: dict[str, Any] = {**self._numbers} | {
+            name: moved[f"parameter_{name.removeprefix('p_')}"]
+            for name in self._numbers
+            if name.removeprefix("p_") in self._by
+        }
+        before = self._stepper.prepare(xp, y, u, k) | moved
         values = np.empty((count, first + 2 * size))
         values[:, :first] = self._constants
         for i, name in enumerate([*self._given, *self._moving]):
             if name in before:
                 values[:, i] = getattr(before[name], "value", before[name])
         slopes = np.repeat(self._first[None], count, axis=0)
-        refused = self._advance(values, slopes.reshape(count, -1), dt, order)
+        refused = self._advance(values, slopes.reshape(count, -1), self._guide, dt, order)
         if refused:
             return None, refused
 
         def stack(names: Sequence[str]) -> Any:
-            found = np.zeros((len(names), len(y) + len(u), width))
+            found = np.zeros((len(names), len(y) + len(u) + len(p), width))
             for i, name in enumerate(names):
                 found[i] = getattr(before[name], "slopes", 0.0)
             return found.transpose(2, 0, 1)
@@ -314,8 +339,76 @@ class SeriesTangent:
             ends[:, i] += dt * start[:, size + i]
             ends[:, size + i] += start[:, size + i]
         after = [Variable(values[:, first + i], ends[:, i].T) for i in range(2 * size)]
-        finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, self._numbers)
+        finished = self._stepper.finish(xp, after[:size], after[size:], y, u, dt, k)
         return stacked(finished, count), 0
+
+    def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
+        """Return gradients by states, controls and parameters from those by the states at the step's end.
+
+        The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
+        """
+        if self._stepper.mechanics.coupling or self._guide.any():
+            found, refused = self.jacobian(states, controls, dt, order)
+            return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+        by_start, by_end = self._linear(dt)
+        moving, count = len(self._moving), len(states)
+        seeds = cotangents @ by_end
+        given = np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
+        values = np.empty((len(self._given) + moving, count))
+        values[: len(self._given)] = self._constants[:, None]
+        for i, name in enumerate([*self._given, *self._moving]):
+            if name in self._rows:
+                values[i] = given[:, self._rows.index(name)]
+        found = np.empty((moving + len(self._sources), count))
+        refused = self._pull(values, np.ascontiguousarray(seeds[:, :moving].T), found, dt, order)
+        if not refused and not np.isfinite(found).all():
+            refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
+        return seeds[:, moving:] + found.T @ by_start[self._pulled], refused
+
+    def _linear(self, dt: float) -> tuple[Any, Any]:
+        """Return what the series starts from by states, controls and parameters; and its end's effect.
+
+        Where no rate is held, both are the same for all states: matrices of shape (rows, n_state + n_controls
+        + n_parameters), and (n_state, places and velocities, then the same columns).
+        """
+        xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
+        sizes = moving, len(layout.state), len(self._stepper.arguments), len(self._by)
+        ends, y, u, p = variables_of(*(np.zeros((1, n)) for n in sizes))
+        before = self._stepper.prepare(xp, y, u, self._numbers)
+        before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
+        by_start = np.zeros((len(self._rows), sum(sizes)))
+        for i, name in enumerate(self._rows):
+            by_start[i] = np.reshape(getattr(before[name], "slopes", 0.0), -1)
+        q, v = ends[: moving // 2], ends[moving // 2 :]
+        finished = self._stepper.finish(xp, q, v, y, u, dt, self._numbers)
+        return by_start[:, moving:], stacked(finished, 1)[0]
+
+    @cached_property
+    def _advance(self) -> Callable:
+        from lag_envs.stepping.driver import compile_advance_tangents
+
+        return compile_advance_tangents(self._record, self._columns, bool(self._guide.any()))
+
+    @cached_property
+    def _sources(self) -> tuple[str, ...]:
+        return tuple(name for name in self._columns if name not in self._moving)
+
+    @cached_property
+    def _rows(self) -> list[str]:
+        """What follows from states, controls and parameters when the series begins."""
+        inputs = [name for name in self._given if name not in self._record.constants]
+        return list(dict.fromkeys([*self._moving, *inputs, *self._sources]))
+
+    @cached_property
+    def _pulled(self) -> list[int]:
+        """Rows whose cotangents are found."""
+        return [self._rows.index(name) for name in (*self._moving, *self._sources)]
+
+    @cached_property
+    def _pull(self) -> Callable:
+        from lag_envs.stepping.driver import compile_pull_all
+
+        return compile_pull_all(self._record, self._sources)
 
 
 class StepBound(NamedTuple):

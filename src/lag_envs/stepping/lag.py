@@ -41,7 +41,7 @@ class LaggedStepper(SeriesStepper):
 
     # --- the series -----------------------------------------------------------------------------------------
 
-    def _lowered(self, tangents: bool = False) -> tuple[Lowering, tuple[list[int], dict]]:
+    def _lowered(self, tangents: Sequence[str] | None = None) -> tuple[Lowering, tuple[list[int], dict]]:
         layout, m = self._layout, self.mechanics
         rates = {name: -Expr.of(Atom("decay", name)) for name in layout.controls}
         rates |= {p.name: rates[p.control or ""] for p in layout.at("acceleration", "rate")}

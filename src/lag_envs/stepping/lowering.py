@@ -83,7 +83,8 @@ class SeriesRecord:
     force : tuple of int
         Nodes of the right-hand side; -1 where it vanishes.
     tangents : mapping from str to mapping
-        For scalars that depend on controls or starts their derivatives by input; empty unless asked for.
+        For scalars that depend on controls, starts or chosen parameters their derivatives by each of them;
+        empty unless asked for.
     """
 
     size: int
@@ -132,8 +133,9 @@ class Lowering:
     prescribed : mapping from str to sequence of Expr
         For each moving prescribed coordinate its place as a polynomial in time, by coefficients in symbols of
         kind ``control`` (held), ``start`` (its place and rate when the control step begins) and `CLOCK`.
-    tangents : bool, default False
-        Whether scalars come with their derivatives by controls and starts.
+    tangents : sequence of str, optional
+        Parameters by which the scalars come with derivatives, besides those by controls and starts; by
+        default they come without any.
     rates : mapping from str to Expr
         Where controls are lagged: for each of them, and for each coordinate that it moves, the rate of its
         exponential. Then `prescribed` holds the controls too, and coefficients as a node ``decay`` has them,
@@ -144,7 +146,7 @@ class Lowering:
         self,
         free: Sequence[str],
         prescribed: Mapping[str, Sequence[Expr]],
-        tangents: bool = False,
+        tangents: Sequence[str] | None = None,
         rates: Mapping[str, Expr] = MappingProxyType({}),
     ) -> None:
         self._wanted = tangents
@@ -152,6 +154,7 @@ class Lowering:
         self._varying = VARYING | {"control"} if rates else VARYING
         self._faded: dict[str, tuple] = {}
         self._slopes: dict[str, dict[str, Any]] = {}
+        self._exprs: dict[str, Expr] = {}
         self._free = list(free)
         self._prescribed = dict(prescribed)
         self._trace: Trace = ElementaryTrace()
@@ -198,13 +201,21 @@ class Lowering:
                         value = value * number if n > 0 else value / number
                 total = total + value
             self._scalars[expr.text] = total
-            if self._wanted and isinstance(total, Number):
-                self._slopes[total.name] = {
-                    f"{s.kind}_{s.name}": self.scalar(derivative(expr, s))
-                    for s in sorted(expr.symbols(), key=lambda s: s.text)
-                    if s.kind in ("control", "start")
-                }
+            if isinstance(total, Number):
+                self._exprs[total.name] = expr
         return self._scalars[expr.text]
+
+    def _differentiate(self, weights: Sequence[Any]) -> None:
+        """Make the derivatives of weights by what they are wanted by."""
+        for weight in weights:
+            if self._wanted is None or not isinstance(weight, Number) or weight.name in self._slopes:
+                continue
+            expr = self._exprs[weight.name]
+            self._slopes[weight.name] = {
+                f"{s.kind}_{s.name}": self.scalar(derivative(expr, s))
+                for s in sorted(expr.symbols(), key=lambda s: s.text)
+                if s.kind in ("control", "start") or (s.kind == "parameter" and s.name in self._wanted)
+            }
 
     def _held(self, atom: Atom) -> Any:
         if atom.kind in FADING:
@@ -388,6 +399,7 @@ class Lowering:
         for where, e in sorted(mass.items()):
             varying = any(self._varies(a) for a in e.atoms())
             entries[where] = (self.series(e), 0.0) if varying else (-1, self.scalar(e))  # node, constant
+        self._differentiate(_weights(self.nodes, entries))
         return right, entries
 
     def record(
@@ -403,7 +415,7 @@ class Lowering:
 
         Terms are left out after products have been arranged: what is left rounds as it would with them.
         """
-        weights = [w for _, _, ws, _ in self.nodes for w in ws] + [w for _, w in entries.values()]
+        weights = _weights(self.nodes, entries)
         slopes = [
             (w.name, source, slope)
             for w in {w.name: w for w in weights if isinstance(w, Number)}.values()
@@ -509,6 +521,11 @@ def _needed(
         tuple(renumber[n] for n in force),
         tangents,
     )
+
+
+def _weights(nodes: Sequence[tuple], entries: Mapping) -> list:
+    """Return all weights of nodes and of entries of the mass matrix, in order."""
+    return [w for _, _, ws, _ in nodes for w in ws] + [w for _, w in entries.values()]
 
 
 def _key(weight: Any) -> Any:

@@ -23,12 +23,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lag_envs.mechanics.algebra import Atom, Expr, Monomial, evaluate
+from lag_envs.mechanics.algebra import Atom, Expr, Monomial, derivative, evaluate
 from lag_envs.mechanics.equations import place, velocity
 from lag_envs.mechanics.evaluation import Exact, exactly
 from lag_envs.mechanics.layout import Layout
 from lag_envs.mechanics.motion import Mechanics
-from lag_envs.mechanics.recording import control
+from lag_envs.mechanics.recording import control, parameter
 from lag_envs.stepping import pendulum, slope
 from lag_envs.stepping.flows import SLIDE, TURN, Flow, Stepper, pendulum_flow
 from lag_envs.stepping.general import StepBound
@@ -156,27 +156,88 @@ class NormalForm:
 
     # --- derivatives ---------------------------------------------------------------------------------------
 
-    def jacobian(
-        self, states: Any, controls: Any, constants: Mapping[str, float], dt: float
-    ) -> tuple[Any, int]:
-        """Return the derivatives of the states at the step's end by states and controls.
+    def rates(self, parameters: Mapping[str, float], by: Sequence[str]) -> dict[str, list[float]]:
+        """Return the derivatives of the constants by parameters, rounded once; rows of 0 are left out."""
+        exprs, values = [self.inertia, *self.expressions.values()], exactly(parameters)
+        inertia, *numbers = map(Fraction, evaluate(exprs, values, Exact()))
+        found: dict[str, list[float]] = {name: [] for name in self.expressions}
+        for p in by:
+            slopes = evaluate([derivative(expr, parameter(p)) for expr in exprs], values, Exact())
+            first, *rest = map(Fraction, slopes)
+            for name, x, rate in zip(found, numbers, rest, strict=True):
+                found[name].append(_float(rate - x * first / inertia, inertia))
+        return {name: row for name, row in found.items() if any(row)}
 
-        Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form.
+    def jacobian(
+        self,
+        states: Any,
+        controls: Any,
+        constants: Mapping[str, float],
+        dt: float,
+        rates: Mapping[str, Sequence[float]],
+        parameters: int,
+    ) -> tuple[Any, int]:
+        """Return the derivatives of the states at the step's end by states, controls and parameters.
+
+        Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
+        `rates` their derivatives by the parameters.
         """
-        absent = frozenset(name for name, value in constants.items() if value == 0.0)
-        stepper = self.stepper(dt, absent)
+        stepper, absent = self._stepper(dt, constants)
         by = tuple(
             name
             for name, terms in self.terms.items()
-            if any(term.held.number is None and term.constant not in absent for term in terms)
+            if any(t.constant in rates or (t.held.number is None and t.constant not in absent) for t in terms)
         )
-        found = np.empty((*states.shape, states.shape[1] + controls.shape[1]))
+        first = states.shape[1] + controls.shape[1]
+        found = np.empty((*states.shape, first + len(rates)))
         numbers = (constants[name.removeprefix("k_")] for name in stepper.constants)
-        jacobian = stepper.compile_jacobian(by)
+        jacobian = stepper.compile_jacobian(by, tuple(rates))
         refused = jacobian(states, controls, found, dt, self.largest_majorant(dt), *numbers)
         if not refused and not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=(1, 2)))) + 1
+        if parameters:
+            by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
+            found = np.concatenate([found[..., :first], found[..., first:] @ by_constants], axis=-1)
         return found, refused
+
+    def vjp(
+        self,
+        states: Any,
+        controls: Any,
+        constants: Mapping[str, float],
+        dt: float,
+        cotangents: Any,
+        rates: Mapping[str, Sequence[float]],
+        parameters: int,
+    ) -> tuple[Any, int]:
+        """Return gradients by states, controls and parameters from those by the states at the step's end.
+
+        The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
+        """
+        stepper, _ = self._stepper(dt, constants)
+        width = states.shape[1] + controls.shape[1]
+        given = np.concatenate([states.T, controls.T, cotangents.T])
+        found = np.empty((width + len(rates) + 1, len(states)))
+        numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
+        stepper.compile_vjp(tuple(rates))(given, found, numbers)
+        slopes = np.empty((len(states), width + parameters))
+        slopes[:, :width] = found[:width].T
+        if parameters:
+            by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
+            slopes[:, width:] = found[width:-1].T @ by_constants
+        (others,) = np.nonzero(found[-1] == 0.0)
+        if len(others):
+            some = np.ascontiguousarray(states[others]), np.ascontiguousarray(controls[others])
+            jacobian, refused = self.jacobian(*some, constants, dt, rates, parameters)
+            if refused:
+                return slopes, int(others[refused - 1]) + 1
+            slopes[others] = np.einsum("ni,nij->nj", cotangents[others], jacobian)
+        return slopes, 0
+
+    def _stepper(self, dt: float, constants: Mapping[str, float]) -> tuple[Stepper, frozenset[str]]:
+        """Return the code of a step with these constants, and those that are zero."""
+        absent = frozenset(name for name, value in constants.items() if value == 0.0)
+        return self.stepper(dt, absent), absent
 
     # --- what depends on numbers ---------------------------------------------------------------------------
 

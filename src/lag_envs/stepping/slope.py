@@ -371,42 +371,53 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
 def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
     """Differentiate a step; see `pendulum._tangent`.
 
-    The values are x, x', cosφ, sinφ, centrifugal, gravity, damping_rate and rate; the three before the rate
-    have no derivatives. A long step is made of a short one by squaring, as in `_turn_any`.
+    The values are x, x', cosφ, sinφ, centrifugal, gravity, damping_rate and rate; `ROWS` are those of the
+    last four by which derivatives are taken. A long step is made of a short one by squaring, as in
+    `_turn_any`.
     """
     x, v, c, s, centrifugal, gravity, damping_rate, rate = values
-    m, by_rate = scratch[:2], scratch[2:]
+    m, by = np.empty((2, 4)), np.empty((len(ROWS), 2, 4))
     growth = dt * (2.0 * damping_rate + (1.0 + 2.0 * math.sqrt(max(abs(centrifugal), 1.0))) * abs(rate))
     doublings, h = halved(growth, dt)
     if doublings < 0:
         return -1
     for j in range(4):
         one = 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0, 1.0 if j == 3 else 0.0
-        m[0, j], m[1, j], by_rate[0, j], by_rate[1, j] = change(
-            *one, centrifugal, gravity, damping_rate, rate, h
-        )
+        found = change(*one, centrifugal, gravity, damping_rate, rate, h)
+        for i in range(2 * len(ROWS) + 2):
+            if i < 2:
+                m[i, j] = found[i]
+            else:
+                by[(i - 2) // 2, i % 2, j] = found[i]
     for _d in range(doublings):
         p, q = math.cos(rate * h), math.sin(rate * h)
-        a, b = m.copy(), by_rate.copy()
+        a, before = m.copy(), by.copy()
         for r in range(2):
             for j in range(4):
                 m[r, j] += a[r, 0] * a[0, j] + a[r, 1] * a[1, j]
-                by_rate[r, j] += b[r, 0] * a[0, j] + b[r, 1] * a[1, j]
-                by_rate[r, j] += a[r, 0] * b[0, j] + a[r, 1] * b[1, j]
             for j in range(2):
                 m[r, j] += a[r, j]
-                by_rate[r, j] += b[r, j]
             m[r, 2] += a[r, 2] * p + a[r, 3] * q
             m[r, 3] += a[r, 3] * p - a[r, 2] * q
-            by_rate[r, 2] += b[r, 2] * p + b[r, 3] * q + (a[r, 3] * p - a[r, 2] * q) * h
-            by_rate[r, 3] += b[r, 3] * p - b[r, 2] * q - (a[r, 2] * p + a[r, 3] * q) * h
+            for i in range(len(ROWS)):
+                b, change_of_angle = before[i], h if ROWS[i] == RATE else 0.0
+                for j in range(4):
+                    by[i, r, j] += b[r, 0] * a[0, j] + b[r, 1] * a[1, j]
+                    by[i, r, j] += a[r, 0] * b[0, j] + a[r, 1] * b[1, j]
+                for j in range(2):
+                    by[i, r, j] += b[r, j]
+                by[i, r, 2] += b[r, 2] * p + b[r, 3] * q + (a[r, 3] * p - a[r, 2] * q) * change_of_angle
+                by[i, r, 3] += b[r, 3] * p - b[r, 2] * q - (a[r, 2] * p + a[r, 3] * q) * change_of_angle
         h *= 2.0
     for j in range(slopes.shape[1]):
         dx, dv, dc, ds = slopes[0, j], slopes[1, j], slopes[2, j], slopes[3, j]
         for r in range(2):
             moved = m[r, 0] * dx + m[r, 1] * dv + (m[r, 2] * dc + m[r, 3] * ds)
-            turned = by_rate[r, 0] * x + by_rate[r, 1] * v + (by_rate[r, 2] * c + by_rate[r, 3] * s)
-            slopes[r, j] += moved + turned * slopes[7, j]
+            for i in range(len(ROWS)):
+                b = by[i]
+                turned = b[r, 0] * x + b[r, 1] * v + (b[r, 2] * c + b[r, 3] * s)
+                moved += turned * slopes[ROWS[i], j]
+            slopes[r, j] += moved
     return 0
 
 
@@ -414,17 +425,25 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
 def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
     """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; it takes any terms."""
     names = ("x", "v", "c", "s", *TurningSlope._fields, "h")
+    columns = tuple(name for name in TurningSlope._fields if name == "rate" or name in by)
 
     def change(xp: Any, *numbers: Any) -> tuple:
         x, v, c, s, *rest, h = (
-            Variable.of_column(["rate"], name, number) for name, number in zip(names, numbers, strict=True)
+            Variable.of_column(columns, name, number) for name, number in zip(names, numbers, strict=True)
         )
         dx, dv = turn_change(x, v, c, s, TurningSlope(*rest), h)
-        return dx.value, dv.value, *dx.slopes, *dv.slopes
+        return (
+            dx.value,
+            dv.value,
+            *(slope for pair in zip(dx.slopes, dv.slopes, strict=True) for slope in pair),
+        )
 
+    rows = tuple(4 + TurningSlope._fields.index(name) for name in columns)
     return compile_python(
         "tangent",
         _turn_tangent,
         compile_traced("change", ", ".join(names), change),
         compile_python("halved", _halved, SMALL_TURN=SMALL_TURN),
+        ROWS=rows,
+        RATE=7,
     )

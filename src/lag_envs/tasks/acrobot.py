@@ -10,19 +10,9 @@ from typing import Any
 from lag_envs.scenes import Acrobot
 from lag_envs.scenes.shapes import Bodies, Line, outlines
 from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
-
-
-def _angles(after: Any, xp: Any) -> dict[str, Any]:
-    """Return cosine and sine of both angles."""
-    return {
-        "cos(theta_1)": xp.cos(after.theta_1),
-        "sin(theta_1)": xp.sin(after.theta_1),
-        "cos(theta_2)": xp.cos(after.theta_2),
-        "sin(theta_2)": xp.sin(after.theta_2),
-    }
-
 
 _ANGLES = {
     "cos(theta_1)": ("1", "cosine of the first link's angle, 1 hanging"),
@@ -112,7 +102,7 @@ class AcrobotExact(Task):
 
     controllers = {
         "switch": Controller(
-            "lag_envs.controllers.energy:Switch",
+            "lag_envs.controllers.basic:Switch",
             {"weights": {"sin(theta_1)": 1.3, "theta_1_dot": -0.3, "sin(theta_2)": -0.3, "theta_2_dot": 0.9}},
         )
     }
@@ -132,13 +122,13 @@ class AcrobotExact(Task):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosines, sines and clipped speeds."""
-        return _angles(after, xp) | {
+        return circle(after, "theta_1", "theta_2", xp=xp) | {
             name: clip(after[name], -top, top, xp) for name, top in self.fastest_seen.items()
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of Gymnasium's space."""
-        return dict.fromkeys(_ANGLES, 1.0) | self.fastest_seen
+        return bounds_of_circle(_ANGLES) | self.fastest_seen
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return -1."""
@@ -268,7 +258,7 @@ class AcrobotReal(Task):
     )
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
+            "lag_envs.controllers.acrobot:PublishedLQR", {"weights": (0.97, 0.93, 0.39, 0.26), "effort": 0.11}
         ),
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),
     }
@@ -317,14 +307,14 @@ class AcrobotReal(Task):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosines, sines and scaled speeds."""
-        return _angles(after, xp) | {
+        return circle(after, "theta_1", "theta_2", xp=xp) | {
             "theta_1_dot/10": 0.1 * after.theta_1_dot,
             "theta_2_dot/20": 0.05 * after.theta_2_dot,
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of cosines and sines."""
-        return dict.fromkeys(_ANGLES, 1.0)
+        return bounds_of_circle(_ANGLES)
 
     def tip(self, after: Any, xp: Any) -> Any:
         """Return the tip's height above the shoulder, as a share of both links' lengths."""
@@ -373,7 +363,7 @@ class PendubotReal(AcrobotReal):  # noqa: D101 (that of AcrobotReal tells of bot
     plans = dataclasses.replace(AcrobotReal.plans, steps=85)
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:PublishedLQR",
+            "lag_envs.controllers.acrobot:PublishedLQR",
             {"weights": (0.00125, 0.65, 0.000688, 0.000936), "effort": 25.0},
         ),
         "plan + TVLQR": Controller("lag_envs.controllers.tracking:recorded"),

@@ -8,6 +8,7 @@ from typing import Any
 
 from lag_envs.scenes import TwoLinkArm
 from lag_envs.scenes.shapes import Bodies, Circle
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal
 
@@ -43,11 +44,6 @@ class Reach(Task):
 
     Termination: never.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Both links are uniform.
@@ -56,10 +52,6 @@ class Reach(Task):
 
     SI units. θ₁ is measured from the level, counter-clockwise, so -π/2 hangs; θ₂ = 0 is stretched. Neither is
     wrapped. The shoulder is the origin, x to the right and y upward.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
@@ -129,11 +121,7 @@ class Reach(Task):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosines, sines, scaled rates and the point."""
-        return {
-            "cos(theta_1)": xp.cos(after.theta_1),
-            "sin(theta_1)": xp.sin(after.theta_1),
-            "cos(theta_2)": xp.cos(after.theta_2),
-            "sin(theta_2)": xp.sin(after.theta_2),
+        return circle(after, "theta_1", "theta_2", xp=xp) | {
             "theta_1_dot/5": 0.2 * after.theta_1_dot,
             "theta_2_dot/10": 0.1 * after.theta_2_dot,
             "goal_x": target.goal_x,
@@ -142,7 +130,7 @@ class Reach(Task):
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of cosines and sines."""
-        return dict.fromkeys(list(self.quantities)[:4], 1.0)
+        return bounds_of_circle(self.quantities)
 
     def off(self, after: Any, target: Any, xp: Any) -> Any:
         """Return the square of the hand's distance from the point [m²]."""

@@ -9,6 +9,7 @@ from typing import Any
 from lag_envs.scenes import CartPole
 from lag_envs.scenes.shapes import Bodies, Line, Window, outlines
 from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
@@ -134,7 +135,7 @@ class CartPoleExact(_OnTrack):
 
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:Regulator",
+            "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.1, "x_dot": 0.1, "theta": 10.0, "theta_dot": 0.1}, "effort": 0.01},
         )
     }
@@ -208,11 +209,6 @@ class CartPoleContinuous(_OnTrack):
 
     Termination: |x| > 2.4 m or |θ| > 12 degrees at a step's end. That step pays nothing.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Upright and without a force, the pole of the default parameters falls e-fold in 0.25 s.
@@ -220,10 +216,6 @@ class CartPoleContinuous(_OnTrack):
     ## Signs and Units
 
     SI units. θ = 0 is upright and positive to the right, x positive to the right.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
@@ -248,7 +240,7 @@ class CartPoleContinuous(_OnTrack):
     goal = Goal("success: not fallen, and on the track", hold=None, arrival="")
     controllers = {
         "LQR": Controller(
-            "lag_envs.controllers.energy:Regulator",
+            "lag_envs.controllers.linear:Regulator",
             {"weights": {"x": 0.03, "x_dot": 0.03, "theta": 10.0, "theta_dot": 0.21}, "effort": 5e-4},
             tune={"effort": (1e-4, 1.0)},
         )
@@ -330,11 +322,6 @@ class CartPoleSwingUp(_OnTrack):
 
     Termination: |x| > 2.4 m at a step's end. That step still pays.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     Force and motion are coupled: the swinging pole acts back on the cart.
@@ -343,10 +330,6 @@ class CartPoleSwingUp(_OnTrack):
 
     SI units. θ = 0 is upright and θ = π hangs; θ is positive to the right and not wrapped. x is positive to
     the right.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
@@ -436,14 +419,13 @@ class CartPoleSwingUp(_OnTrack):
         return {
             "x/2.4": after.x * (1.0 / self.track),
             "x_dot/4": 0.25 * after.x_dot,
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
+            **circle(after, "theta", xp=xp),
             "theta_dot/8": 0.125 * after.theta_dot,
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds of cosine and sine."""
-        return {"cos(theta)": 1.0, "sin(theta)": 1.0}
+        return bounds_of_circle(self.quantities)
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² (1 - 0.1 a²) with the height h = (1 + cosθ)/2."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from lag_envs.scenes import Pendulum
 from lag_envs.scenes.shapes import Bodies, outlines
 from lag_envs.stepping.tracing import clip
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import FASTEST_START, Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Optimum
 
@@ -22,9 +24,16 @@ def wrapped(cosine: Any, sine: Any, xp: Any) -> Any:
 
 
 class _Rod(Task):
-    """What the tasks have in common: the rod is to stand."""
+    """What the tasks have in common: a weak torque is to make the rod stand."""
 
     scene: Any = Pendulum
+    interval, steps = 0.05, 200
+    action = {"torque": 2.0}
+    examples = Examples(start={"state": [2.0, 3.0]}, moving=[2.0, 12.0], reach=12.0, rest=[0.0, 0.0])
+    direction = {
+        "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
+        "sin(theta)": ("1", "its sine"),
+    }
 
     def bodies(self) -> Bodies:
         """Add the upright rod."""
@@ -101,28 +110,21 @@ class PendulumExact(_Rod):
     id = "PendulumExact-v0"
     peer = "Pendulum-v1"
     quantities = {
-        "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
-        "sin(theta)": ("1", "its sine"),
+        **_Rod.direction,
         "theta_dot": ("rad/s", "angular velocity, clipped at 8"),
     }
-    scene: Any = Pendulum
     defaults = {"gravity": 10.0}
-    interval, steps = 0.05, 200
-    action = {"torque": 2.0}
     largest_action = 2.0
     start = {"theta": math.pi, "theta_dot": 1.0}
     fastest_seen = 8.0  # [rad/s]
 
     controllers = {
-        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+        "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
     hyperparameters = {"ppo": {"gamma": 0.95}, "fast_ppo": {"gamma": 0.95, "episode_share": 1.0}}
-    examples = Examples(
-        start={"state": [2.0, 3.0]},
-        moving=[2.0, 12.0],
-        reach=12.0,
-        rest=[0.0, 0.0],
+    examples = dataclasses.replace(
+        _Rod.examples,
         batch={
             "length": [1.0, 0.1, 5.0, 1.0, 0.1, 1.0, 5.0],
             "damping": [0.0, 0.1, 10.0, 0.0, 0.1, 0.0, 10.0],
@@ -136,15 +138,11 @@ class PendulumExact(_Rod):
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ and the clipped θ'."""
         top = self.fastest_seen
-        return {
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
-            "theta_dot": clip(after.theta_dot, -top, top, xp),
-        }
+        return circle(after, "theta", xp=xp) | {"theta_dot": clip(after.theta_dot, -top, top, xp)}
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of Gymnasium's space."""
-        return {"cos(theta)": 1.0, "sin(theta)": 1.0, "theta_dot": self.fastest_seen}
+        return bounds_of_circle(self.direction) | {"theta_dot": self.fastest_seen}
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return -(θ² + 0.1 θ'² + 0.001 u²) with the state before the step."""
@@ -225,14 +223,10 @@ class PendulumRegret(_Rod):
 
     id = "PendulumRegret-v0"
     quantities = {
-        "cos(theta)": ("1", "cosine of the rod's angle, 1 upright"),
-        "sin(theta)": ("1", "its sine"),
+        **_Rod.direction,
         "theta_dot/8": ("rad/s", "angular velocity, divided by 8"),
     }
-    scene: Any = Pendulum
-    interval, steps = 0.05, 200
     scaled = False
-    action = {"torque": 2.0}
     start = {"theta": (math.pi, 0.2), "theta_dot": 0.2}
     penalty = 0.2
 
@@ -241,23 +235,20 @@ class PendulumRegret(_Rod):
         arrival="upright",
     )
     optimum = Optimum(
-        "lag_envs.controllers.energy:value_at_start",
+        "lag_envs.controllers.pendulum:value_at_start",
         "pump the energy up, then act as a damped spring; V(start), which nobody exceeds",
     )
     controllers = {
-        "optimal law": Controller("lag_envs.controllers.energy:OwnLaw"),
-        "energy shaping + LQR": Controller("lag_envs.controllers.energy:PendulumEnergyLQR"),
+        "optimal law": Controller("lag_envs.controllers.pendulum:OwnLaw"),
+        "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
     hyperparameters = {
         "ppo": {"gamma": 0.999},
         "fast_ppo": {"gamma": 0.995, "episode_share": 1.0},
     }
-    examples = Examples(
-        start={"state": [2.0, 3.0]},
-        moving=[2.0, 12.0],
-        reach=12.0,
-        rest=[0.0, 0.0],
+    examples = dataclasses.replace(
+        _Rod.examples,
         batch={
             "length": [1.0, 0.5, 2.0, 1.0, 0.5, 1.0, 2.0],
             "damping": [0.0, 0.01, 0.1, 0.0, 0.01, 0.0, 0.1],
@@ -273,17 +264,13 @@ class PendulumRegret(_Rod):
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosθ, sinθ, θ'/8."""
-        return {
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
-            "theta_dot/8": 0.125 * after.theta_dot,
-        }
+        return circle(after, "theta", xp=xp) | {"theta_dot/8": 0.125 * after.theta_dot}
 
     def bounds(self) -> Mapping[str, float]:
         """Return bounds on the observation: the speed's is start + (w + U)/J · length."""
         inertia, weight = self._numbers()
         fastest = FASTEST_START + (weight + self.action["torque"]) / inertia * self.duration
-        return {"cos(theta)": 1.0, "sin(theta)": 1.0, "theta_dot/8": 0.125 * fastest}
+        return bounds_of_circle(self.direction) | {"theta_dot/8": 0.125 * fastest}
 
     def value(self, state: Any, xp: Any) -> Any:
         """Return V: 100 (w (1 - cosθ) + J θ'²/2)/(2w)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -121,6 +122,7 @@ class SwingUp(GuardedTrack, _Bar):
     goal = Goal(
         "success: within 0.2 rad of upright throughout the last second; time: until it is so for good",
         arrival="upright",
+        rules=1,
     )
     controllers = {
         "energy shaping + LQR": Controller(
@@ -318,6 +320,7 @@ class SwingUpUnknown(SwingUp):
         },
     }  # fmt: skip
     value_iteration = None
+    goal = dataclasses.replace(SwingUp.goal, rules=2)
     examples = Examples(
         start=SwingUp.examples.start,
         refused=SwingUp.examples.refused,
@@ -414,7 +417,10 @@ class Balance(_Bar):
     largest_angle = 0.35
 
     goal = Goal(
-        "success: neither the bar nor the support leaves its limits in 10 s; there is no time", None, None
+        "success: neither the bar nor the support leaves its limits in 10 s; there is no time",
+        None,
+        None,
+        rules=1,
     )
     reference = "LQR"
     controllers = {

@@ -8,6 +8,7 @@ from typing import Any
 
 from lag_envs.scenes import RotaryPendulum
 from lag_envs.scenes.shapes import Bodies, outlines
+from lag_envs.tasks.angles import bounds_of_circle, circle
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.record import Controller, Examples, Goal, Plans
 
@@ -42,11 +43,6 @@ class RotarySwingUp(Task):
 
     Termination: never.
 
-    ## Arguments
-
-    Parameters with which a step cannot be certified, say of a link of a millimetre, make it an error that
-    names them; the state is kept then.
-
     ## Equations
 
     A fast arm throws the pendulum outwards: the term with φ'² sin(2θ).
@@ -54,10 +50,6 @@ class RotarySwingUp(Task):
     ## Signs and Units
 
     SI units. θ = 0 hangs straight down and θ = π stands; neither angle is wrapped.
-
-    ## Numerical Accuracy
-
-    The steps are certified, as those of every environment.
 
     ## Known Returns
 
@@ -144,17 +136,15 @@ class RotarySwingUp(Task):
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
         """Return cosφ, sinφ, φ'/10, cosθ, sinθ, θ'/20."""
         return {
-            "cos(phi)": xp.cos(after.phi),
-            "sin(phi)": xp.sin(after.phi),
+            **circle(after, "phi", xp=xp),
             "phi_dot/10": 0.1 * after.phi_dot,
-            "cos(theta)": xp.cos(after.theta),
-            "sin(theta)": xp.sin(after.theta),
+            **circle(after, "theta", xp=xp),
             "theta_dot/20": 0.05 * after.theta_dot,
         }
 
     def bounds(self) -> Mapping[str, float]:
         """Return the bounds of cosines and sines."""
-        return dict.fromkeys(("cos(phi)", "sin(phi)", "cos(theta)", "sin(theta)"), 1.0)
+        return bounds_of_circle(self.quantities)
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
         """Return h² (0.8 + 0.2 cosφ)(1 - 0.1 a²)."""

@@ -1,0 +1,447 @@
+"""Environments for PyTorch, with exact gradients through the step (extra ``torch``).
+
+`Step` is a task's step as a function of tensors, `TorchVectorEnv` a vector environment whose `step` can be
+differentiated. Both go through the compiled step and its derivatives; torch records one operation per step.
+
+>>> import torch
+>>> envs = TorchVectorEnv("PivotedBar-v0", num_envs=2)
+>>> observations, _ = envs.reset(seed=1)
+>>> push = torch.tensor([[0.5], [-0.5]], requires_grad=True)
+>>> total = sum(envs.step(push)[1].sum() for _ in range(10))
+>>> (slope,) = torch.autograd.grad(total, push)
+>>> slope.shape
+torch.Size([2, 1])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f'{error.name} is missing: pip install "lag-envs[torch]"', name=error.name
+    ) from error
+
+import lag_envs  # noqa: F401  (registers the environments)
+from lag_envs.envs.model import Model
+from lag_envs.envs.vector import LagrangianVectorEnv
+from lag_envs.tasks.base import Task
+
+Tensor = torch.Tensor
+
+
+class StepResult(NamedTuple):
+    """What a step leads to.
+
+    Attributes
+    ----------
+    states : Tensor, shape (..., n_state)
+        The states at its end, of the given states' type.
+    observations : Tensor, shape (..., n_observations)
+        Their observations, of the actions' type.
+    rewards : Tensor, shape (...)
+        The rewards, of the actions' type.
+    terminated : Tensor of bool, shape (...)
+        Whether the episode terminates.
+    """
+
+    states: Tensor
+    observations: Tensor
+    rewards: Tensor
+    terminated: Tensor
+
+
+class Step:
+    """A task's step as a differentiable function: any states, any actions, no random kick, no time limit.
+
+    It can be used with `torch.autograd`, and with `vmap`, `grad`, `vjp` and `jacrev` of `torch.func`. There
+    are no second derivatives.
+
+    Parameters
+    ----------
+    task : str or Task
+        Id of an environment, or ``env.unwrapped.task``.
+    **options
+        Parameters of the environment, where an id is given.
+
+    Raises
+    ------
+    ValueError
+        For a task whose actions are choices, and for one with imperfect sensors or actuators.
+
+    Examples
+    --------
+    >>> step = Step("PivotedBarFree-v0")
+    >>> state, action = torch.tensor([3.0, 0.1]), torch.tensor([0.5])
+    >>> torch.func.jacrev(lambda s: step(s, action).states)(state).shape
+    torch.Size([2, 2])
+    """
+
+    def __init__(self, task: str | Task, **options: Any) -> None:
+        if isinstance(task, str):
+            task = gym.make(task, **options).unwrapped.task  # type: ignore[attr-defined]
+        elif options:
+            raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
+        self.task = _checked_task(task)
+        self.model = Model(task)
+        formulas = task.formulas
+        self._sizes = len(formulas.state), formulas.actions, formulas.targets
+
+    def __call__(self, states: Tensor, actions: Tensor, targets: Tensor | None = None) -> StepResult:
+        """Take one step from each state.
+
+        Parameters
+        ----------
+        states : Tensor, shape (..., n_state)
+            States in the order of ``task.scene.state_names``, float32 or float64.
+        actions : Tensor, shape (..., n_actions)
+            Actions; values outside their space are clipped, and then have no gradient.
+        targets : Tensor, shape (..., n_targets), optional
+            Targets, for a task that has them and does not fix them.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For tensors of another shape, type or device, or with numbers that are not finite.
+        StepRefused
+            Where a step cannot be taken to full accuracy.
+        """
+        n_state, n_actions, n_targets = self._sizes
+        _check("states", states, (n_state,))
+        shape = states.shape[:-1]
+        _check("actions", actions, (*shape, n_actions))
+        if targets is None:
+            fixed = self.task.fixed_target
+            if n_targets and fixed is None:
+                raise ValueError("the task's target is random: targets must be given")
+            given = torch.as_tensor(np.zeros(0) if fixed is None else np.asarray(fixed, np.float64))
+            targets = given.reshape(n_targets).expand(*shape, n_targets)
+        _check("targets", targets, (*shape, n_targets))
+        rows = (x.reshape(shape.numel(), x.shape[-1]) for x in (states, actions, targets))
+        found = _Step.apply(self.model, *rows)
+        return StepResult(*(x.reshape((*shape, *x.shape[1:])) for x in found))
+
+
+class TorchVectorEnv:
+    """Many environments of one task as tensors, with a `step` that can be differentiated.
+
+    The numbers are those of the native vector environment, bit for bit; on the CPU tensors share its memory.
+    Where the actions, or the states that earlier actions led to, require a gradient, `step` is recorded:
+    gradients flow from observations and rewards to actions, and along `state` from step to step until
+    `detach` cuts them off. No gradient flows through an episode's end into the next one.
+
+    Parameters
+    ----------
+    task : str or type
+        Id of an environment, or a task's class.
+    num_envs : int
+        Number of environments.
+    device : {"cpu"}
+        Where tensors are.
+    **options
+        What ``gym.make_vec`` takes: `autoreset_mode`, parameters of the scene and of the task. They are the
+        same for all environments.
+
+    Attributes
+    ----------
+    envs : LagrangianVectorEnv
+        The environments.
+    state : Tensor of float64, shape (num_envs, n_state)
+        The states, with their history.
+
+    Raises
+    ------
+    ValueError
+        For another device, a task whose actions are choices, one with imperfect sensors or actuators, and
+        parameters that differ between environments.
+    """
+
+    def __init__(
+        self, task: str | type[Task], num_envs: int = 1, device: str = "cpu", **options: Any
+    ) -> None:
+        if str(device) != "cpu":
+            raise ValueError(f"device must be 'cpu', got {str(device)!r}; move the tensors that step returns")
+        made = (
+            gym.make_vec(task, num_envs, **options).unwrapped
+            if isinstance(task, str)
+            else LagrangianVectorEnv(task, num_envs, **options)
+        )
+        if not isinstance(made, LagrangianVectorEnv):
+            raise ValueError(f"{task} has no derivatives: it is no environment of this package")
+        if any(other is not made.task for other in made._tasks):
+            raise ValueError("gradients need the same parameters in all environments; give one value for all")
+        _checked_task(made.task)
+        self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
+        self.single_observation_space = made.single_observation_space
+        self.single_action_space = made.single_action_space
+        self.observation_space, self.action_space = made.observation_space, made.action_space
+        self._model: Model | None = None
+        self.state = torch.empty(0)
+        self._infos: dict[str, Any] = {}
+
+    @property
+    def model(self) -> Model:
+        """The step and its derivatives, compiled when they are needed first."""
+        if self._model is None:
+            self._model = Model(self.envs.task)
+        return self._model
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Start an episode in every environment, or in those of a mask; see `LagrangianVectorEnv.reset`.
+
+        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of
+        what follows reach it, but not through the observations that are returned here.
+
+        Returns
+        -------
+        observations : Tensor of float32, shape (num_envs, n_observations)
+            The observations.
+        infos : dict
+            Empty, or the diagnostics.
+        """
+        given = dict(options or {})
+        state = given.get("state")
+        if isinstance(state, Tensor):
+            _check("options['state']", state, (self.num_envs, len(self.envs.scene.state_names)))
+            if state.requires_grad and not state.is_leaf:
+                raise ValueError(
+                    "options['state'] is the result of other operations: give state.detach(), or use "
+                    "lag_envs.torch.Step for gradients through it"
+                )
+        plain = {k: v.detach().numpy() if isinstance(v, Tensor) else v for k, v in given.items()}
+        observations, infos = self.envs.reset(seed=seed, options=plain or None)
+        mask = torch.from_numpy(plain["reset_mask"])[:, None] if "reset_mask" in plain else None
+        now = torch.from_numpy(self.envs.state)
+        if isinstance(state, Tensor) and state.requires_grad:
+            now = state.to(torch.float64) if mask is None else torch.where(mask, state.to(torch.float64), now)
+        self.state = now if mask is None else torch.where(mask, now, self.state)
+        return torch.from_numpy(observations), infos
+
+    def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Hold one control for one control interval in every environment.
+
+        Parameters
+        ----------
+        actions : Tensor, shape (num_envs, n_actions)
+            Actions, float32 or float64; finite values outside their space are clipped, and have no gradient.
+
+        Returns
+        -------
+        observations : Tensor of float32, shape (num_envs, n_observations)
+            The observations.
+        rewards : Tensor of float64, shape (num_envs,)
+            The rewards.
+        terminations, truncations : Tensor of bool, shape (num_envs,)
+            Whether episodes end.
+        infos : dict
+            As Gymnasium defines them, in NumPy's arrays.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For actions of another shape, type or device, or that are not finite; nothing is stepped then.
+        ResetNeeded, StepRefused
+            As `LagrangianVectorEnv.step` does.
+        """
+        _check("actions", actions, (self.num_envs, self.envs.task.formulas.actions))
+        if torch.is_grad_enabled() and (actions.requires_grad or self.state.requires_grad):
+            observations, rewards, self.state, *ends = _EnvStep.apply(self, self.state, actions)
+            return observations, rewards, *ends, self._infos
+        results = [torch.from_numpy(x) for x in self._advance(actions)]
+        self.state = torch.from_numpy(self.envs.state)
+        return *results, self._infos  # type: ignore[return-value]
+
+    def detach(self) -> None:
+        """Forget how the states came about: no gradient flows to steps before this call."""
+        self.state = self.state.detach()
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.envs.close()
+
+    def _advance(self, actions: Tensor) -> list[NDArray]:
+        *results, self._infos = self.envs.step(actions.detach().numpy())
+        return results
+
+
+class _Step(torch.autograd.Function):
+    """`Step` by rows."""
+
+    @staticmethod
+    def forward(model: Model, states: Tensor, actions: Tensor, targets: Tensor) -> tuple[Tensor, ...]:
+        y, a, g = _rows(model, states, actions, targets)
+        ends, rewards, ended = model(y, a, g)
+        seen = torch.from_numpy(np.ascontiguousarray(model.observe(ends, g)))
+        return (
+            torch.from_numpy(ends).to(states.dtype),
+            seen.to(actions.dtype),
+            torch.from_numpy(rewards).to(actions.dtype),
+            torch.from_numpy(ended),
+        )
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+        ctx.model, *given = inputs
+        ctx.save_for_backward(*given, output[0])
+        ctx.mark_non_differentiable(output[3])
+
+    @staticmethod
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+        return None, *_Back.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
+        return _over_batch(_Step, info, in_dims, given)
+
+
+class _Back(torch.autograd.Function):
+    """The derivatives of `_Step`."""
+
+    @staticmethod
+    def forward(
+        model: Model,
+        states: Tensor,
+        actions: Tensor,
+        targets: Tensor,
+        ends: Tensor,
+        by_states: Tensor,
+        by_observations: Tensor,
+        by_rewards: Tensor,
+    ) -> tuple[Tensor, ...]:
+        found = model.vjp(
+            *_rows(model, states, actions, targets),
+            by_states=_numbers(by_states),
+            by_observations=_numbers(by_observations),
+            by_rewards=_numbers(by_rewards),
+            ends=_numbers(ends),
+        )
+        slopes = found.states, found.actions.reshape(actions.shape), found.targets
+        given = states, actions, targets
+        return tuple(
+            torch.from_numpy(np.ascontiguousarray(slope)).to(x.dtype)
+            for slope, x in zip(slopes, given, strict=True)
+        )
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None: ...
+
+    @staticmethod
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+        raise NotImplementedError("a step has first derivatives only; leave out create_graph=True")
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple, *given: Any) -> tuple:
+        return _over_batch(_Back, info, in_dims, given)
+
+
+class _EnvStep(torch.autograd.Function):
+    """`TorchVectorEnv.step`."""
+
+    @staticmethod
+    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+        envs = env.envs
+        ctx.model, ctx.targets = env.model, envs.target
+        ctx.stepped = envs._read("n") >= 0.0
+        observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
+        # Those whose episode went on in the state that the step led to.
+        again = envs.autoreset_mode == AutoresetMode.SAME_STEP
+        ctx.kept = ctx.stepped & ~(terminated | truncated).numpy() if again else ctx.stepped
+        after = torch.from_numpy(envs.state)
+        ctx.save_for_backward(state, actions, after)
+        ctx.mark_non_differentiable(terminated, truncated)
+        return observations, rewards, after, terminated, truncated
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+        model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
+        state, actions, after = ctx.saved_tensors
+        y, ends = _numbers(state), _numbers(after)
+        a = _numbers(actions)
+        if not stepped.all():  # what was restarted had no step
+            y, ends = (np.where(stepped[:, None], x, model.task.centre) for x in (y, ends))
+            a = np.where(stepped[:, None], a, 0.0)
+        a = a[:, 0] if a.shape[1] == 1 else a
+        g = ctx.targets if model.task.fixed_target is None else None
+        kicks: Any = 0.0
+        if model.task.draws or not (kept | ~stepped).all():
+            moved, _, _ = model(y, a, g)
+            kicks, ends = np.where(kept[:, None], ends - moved, 0.0), moved
+        by_observations, by_rewards, by_states = (
+            np.where(mask if x.ndim == 1 else mask[:, None], _numbers(x), 0.0)
+            for mask, x in zip((kept, stepped, kept), seeds, strict=False)
+        )
+        found = model.vjp(
+            y,
+            a,
+            g,
+            by_states=by_states,
+            by_observations=by_observations,
+            by_rewards=by_rewards,
+            ends=ends,
+            kicks=kicks,
+        )
+        slopes = [
+            np.where(stepped[:, None], x.reshape(len(y), -1), 0.0) for x in (found.states, found.actions)
+        ]
+        return None, torch.from_numpy(slopes[0]), torch.from_numpy(slopes[1]).to(actions.dtype)
+
+
+def _numbers(x: Tensor) -> NDArray[np.float64]:
+    return x.detach().to(torch.float64).numpy()
+
+
+def _rows(model: Model, states: Tensor, actions: Tensor, targets: Tensor) -> tuple[Any, Any, Any]:
+    """Return states, actions and targets as `Model` takes them."""
+    y, a, g = map(_numbers, (states, actions, targets))
+    random = model.task.formulas.targets and model.task.fixed_target is None
+    return y, a[:, 0] if a.shape[1] == 1 else a, (g[:, 0] if g.shape[1] == 1 else g) if random else None
+
+
+def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> tuple[tuple, tuple]:
+    """Carry out a function of rows on batches of rows."""
+    model, *tensors = given
+    n = info.batch_size
+    flat = [
+        (x.expand(n, *x.shape) if dim is None else x.movedim(dim, 0)).flatten(0, 1)
+        for x, dim in zip(tensors, in_dims[1:], strict=True)
+    ]
+    found = function.apply(model, *flat)  # type: ignore[attr-defined]
+    return tuple(x.unflatten(0, (n, len(x) // n)) for x in found), (0,) * len(found)
+
+
+def _checked_task(task: Task) -> Task:
+    """Return a task whose steps have derivatives, or raise a ValueError."""
+    name = type(task).__name__
+    if task.formulas.choices:
+        raise ValueError(f"{name} has a list of actions to choose from, by which no step has derivatives")
+    if task.imperfections:
+        raise ValueError(
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there are "
+            "no derivatives; leave these keywords out, or take the id without them"
+        )
+    return task
+
+
+def _check(name: str, x: Any, shape: tuple[int, ...]) -> None:
+    """Raise an error unless x is a tensor of real numbers on the CPU whose shape ends like this one."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
+    if x.device.type != "cpu":
+        raise ValueError(f"{name} must be on the CPU, got a tensor on {x.device}; call .cpu()")
+    if x.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name} must be float32 or float64, got {x.dtype}")
+    ends = tuple(x.shape) if len(shape) != 1 else tuple(x.shape[-1:])
+    if ends != shape:
+        wanted = f"(..., {shape[0]})" if len(shape) == 1 else str(shape)
+        raise ValueError(f"{name} must have shape {wanted}, got {tuple(x.shape)}")

@@ -1,0 +1,256 @@
+"""Derivatives by parameters, and backwards, against differences in 40-digit arithmetic."""
+
+import math
+import zlib
+from types import SimpleNamespace
+
+import mpmath
+import numpy as np
+import pytest
+from covering import covering
+from test_jacobian import exact_step
+
+from lag_envs.envs.model import Model
+from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
+from lag_envs.tasks import TASKS
+
+
+def seeded(name):
+    return np.random.default_rng(zlib.crc32(name.encode()))
+
+
+def finite(scene):
+    """Return the names of the parameters that are not infinite."""
+    return [name for name in scene._numbers() if math.isfinite(getattr(scene, name))]
+
+
+def directional(scene, state, control, dt, names, direction):
+    """Return the derivative of a step along a direction of state, controls and parameters, exactly."""
+    n, m, h = len(state), len(control), mpmath.mpf(10) ** -12
+    ends = []
+    for side in (h, -h):
+        values = [mpmath.mpf(x) for x in (*state, *control, *(getattr(scene, p) for p in names))]
+        y = [x + side * d for x, d in zip(values, map(mpmath.mpf, direction), strict=True)]
+        ends.append(exact_step(scene, y[:n], y[n : n + m], dt, dict(zip(names, y[n + m :], strict=True))))
+    return np.array([float(x) for x in (ends[0] - ends[1]) / (2 * h)])
+
+
+def check_directions(scene, state, control, dt, directions):
+    """Compare the Jacobian along directions, which broadcast to rows of all entries."""
+    names = finite(scene)
+    found = np.concatenate(scene.jacobian(state, control, dt, parameters=names), axis=-1)
+    with mpmath.workdps(40):
+        for direction in np.broadcast_to(directions, (len(directions), found.shape[-1])):
+            expected = directional(scene, state, control, dt, names, direction)
+            size = np.maximum(np.abs(found) @ np.abs(direction), 1e-300)
+            assert (np.abs(found @ direction - expected) <= 1e-10 * size).all(), direction
+
+
+@pytest.mark.parametrize("env_id", covering())
+def test_jacobian_by_all_parameters(env_id):
+    """Along a random direction, so that two exact steps are enough."""
+    scene, rng = TASKS[env_id]().scene, seeded(env_id)
+    state = rng.uniform(-2.0, 2.0, len(scene.state_names))
+    control = rng.uniform(0.0, 2.0, len(scene.control_names))
+    width = len(state) + len(control) + len(finite(scene))
+    check_directions(scene, state, control, 0.02, rng.uniform(-1.0, 1.0, (1, width)))
+
+
+#: Parameters that are 0: their terms leave no code in the step, or they stand in a function.
+ZERO = {
+    "damping": (PivotedBar(damping=0.0), [0.1, 0.2, 2.0, -3.0], [1.0], "damping"),
+    "friction": (CartPole(friction=0.0), [0.1, 0.2, 2.0, -3.0], [1.0], "friction"),
+    "tilt": (Incline(control="damping", tilt=0.0), [0.1, 0.2], [0.1], "tilt"),
+    "a series that the step lacks": (Acrobot(), [0.5, 1.0, -1.0, 2.0], [0.3], "dry_friction"),
+}
+
+
+@pytest.mark.parametrize("case", ZERO)
+def test_parameters_that_are_zero(case):
+    scene, state, control, name = ZERO[case]
+    assert getattr(scene, name) == 0.0
+    ahead = len(state) + len(control) + finite(scene).index(name)
+    direction = np.zeros((1, len(state) + len(control) + len(finite(scene))))
+    direction[0, ahead] = 1.0
+    check_directions(scene, state, control, 0.02, direction)
+    alone = scene.jacobian(state, control, 0.02, parameters=[name])[2]
+    assert np.abs(alone).max() > 1e-4
+
+
+def test_rows_and_columns_by_parameters():
+    bar = PivotedBar()
+    states = np.array([[0.1, 0.2, 2.0, -3.0], [0.0, 0.0, 1.0, 9.0]])
+    a, b, p = bar.jacobian(states, [1.0, -2.0], parameters=["track", "mass", "damping"])
+    assert p.shape == (2, 4, 3)
+    np.testing.assert_array_equal(p[..., 0], 0.0)  # the track's length does not move the bar
+    for x, y in zip((a, b), bar.jacobian(states, [1.0, -2.0]), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(bar.jacobian(states[1], -2.0, parameters=("damping",))[2], p[1, :, 2:])
+    assert bar.jacobian(states, 0.0, parameters=())[2].shape == (2, 4, 0)
+
+
+class Spring(Scene):
+    """A spring whose softness stands in a denominator."""
+
+    softness: float = parameter(0.5, "m/N", least=0.0)
+    mass: float = parameter(1.0, "kg", above=0.0)
+    reach: float = parameter(math.inf, "m", above=0.0, endless=True)
+
+    coordinates = {"x": "m"}
+
+    def kinetic(self, q, v, xp):
+        return 0.5 * self.mass * v.x**2
+
+    def potential(self, q, xp):
+        return 0.5 * q.x**2 / self.softness
+
+
+def test_what_has_no_derivative():
+    with pytest.raises(ValueError, match="PivotedBar has no parameter 'lenght', only mass, com_distance"):
+        PivotedBar().jacobian([0.0] * 4, parameters=["lenght"])
+    with pytest.raises(ValueError, match=r"sequence of names, such as \['mass'\]"):
+        PivotedBar().jacobian([0.0] * 4, parameters="mass")
+    with pytest.raises(ValueError, match="'mass' is named twice"):
+        PivotedBar().jacobian([0.0] * 4, parameters=["mass", "mass"])
+    with pytest.raises(ValueError, match="reach=inf: by what is infinite"):
+        Spring().jacobian([1.0, 0.0], parameters=["reach"])
+    a, _, p = Spring().jacobian([1.0, 0.0], parameters=["mass", "softness"])
+    assert a.shape == (2, 2) and np.isfinite(p).all()
+
+
+@pytest.mark.parametrize("env_id", covering())
+def test_vjp_is_the_jacobian_transposed(env_id):
+    """At rest, at moderate and at high speeds, where the step is divided."""
+    scene, rng = TASKS[env_id]().scene, seeded(env_id)
+    n, names = len(scene.state_names), finite(scene)
+    states = rng.uniform(-1.0, 1.0, (3, 4, n)) * np.array([0.0, 2.0, 20.0])[:, None, None]
+    controls = rng.uniform(0.0, 2.0, (3, 4, len(scene.control_names)))
+    seeds = rng.uniform(-1.0, 1.0, states.shape)
+    jacobian = scene.jacobian(states, controls, 0.02, parameters=names)
+    found = scene.vjp(states, controls, 0.02, seeds, parameters=names)
+    for x, matrix in zip(found, jacobian, strict=True):
+        expected = np.einsum("...i,...ij->...j", seeds, matrix)
+        size = np.einsum("...i,...ij->...j", np.abs(seeds), np.abs(matrix))
+        np.testing.assert_array_less(np.abs(x - expected), 1e-12 * size + 1e-15)
+
+
+# --- whole steps --------------------------------------------------------------------------------------------
+
+#: Tasks whose actions are ranges.
+SMOOTH = [env_id for env_id, kind in TASKS.items() if not kind().formulas.choices]
+
+
+class Exactly:
+    """Functions of formulas on mpmath's numbers."""
+
+    pi = math.pi
+    where = staticmethod(lambda condition, a, b: a if condition else b)
+    minimum, maximum, abs = min, max, abs
+
+    def __getattr__(self, name):
+        return getattr(mpmath, name)
+
+
+def exact_results(task, state, action, target, parameters):
+    """Return state, observation and reward after a step, in mpmath's arithmetic."""
+    xp, f, scene = Exactly(), task.formulas, task.scene
+    constants = f.constants() | {f"self_{name}": value for name, value in parameters.items()}
+    k = SimpleNamespace(**{name: mpmath.mpf(value) for name, value in constants.items()})
+    angle = None if scene._form is None else scene._form.angle
+
+    def lifted(y):
+        return [*y] if angle is None else [*y, mpmath.cos(y[angle]), mpmath.sin(y[angle])]
+
+    top = f.largest
+    u = f.control(xp, [min(max(a, -top), top) for a in action], lifted(state), target, k)
+    end = list(exact_step(scene, state, u, task.dt, parameters))
+    reward, ended = f.outcome(xp, lifted(state), lifted(end), u, target, k)
+    if ended and f.has_last:
+        reward = f.last(xp, lifted(state), lifted(end), u, target, k)
+    return [*end, *f.observe(xp, lifted(end), target, k), reward]
+
+
+def starts(task, rng, n):
+    """Return states of episodes, the last ones at the edge of where guards act, and actions."""
+    model = Model(task)
+    centre = np.array([task.formulas.starts[name][0] for name in task.scene.state_names])
+    states = np.tile(centre, (n, 1)) + 0.2 * rng.uniform(-1.0, 1.0, (n, len(centre)))
+    given = {"targets": rng.uniform(-0.1, 0.1, (n, task.formulas.targets))} if task.formulas.targets else {}
+    if task.fixed_target is not None:
+        given = {}
+    if given and task.formulas.targets == 1:
+        given["targets"] = given["targets"][:, 0]
+    actions = rng.uniform(-1.0, 1.0, (n, task.formulas.actions)) * task.formulas.largest
+    for i in range(n):  # one way all the time, for longer and longer
+        for _ in range(12 * i):
+            row = {name: values[i : i + 1] for name, values in given.items()}
+            push = np.sign(actions[i : i + 1]) * task.formulas.largest
+            after, _, ended = model(states[i : i + 1], push if push.shape[1] > 1 else push[:, 0], **row)
+            if ended[0]:
+                break
+            states[i] = after[0]
+    return model, states, actions, given
+
+
+@pytest.mark.parametrize("env_id", covering(SMOOTH))
+def test_whole_step(env_id):
+    """Along a random direction of state, actions and parameters, at starts and where guards and clips act."""
+    task, rng, n = TASKS[env_id](), seeded(env_id), 3
+    scene, names = task.scene, finite(task.scene)
+    model, states, actions, given = starts(task, rng, n)
+    width = len(scene.state_names)
+    many = (states, actions if actions.shape[1] > 1 else actions[:, 0])
+    seeds = rng.uniform(-1.0, 1.0, (n, width + len(task.formulas.observation) + 1))
+    found = model.vjp(
+        *many,
+        **given,
+        by_states=seeds[:, :width],
+        by_observations=seeds[:, width:-1],
+        by_rewards=seeds[:, -1],
+        parameters=names,
+    )
+    for i in range(n):
+        slopes = np.concatenate([found.states[i], np.atleast_1d(found.actions[i]), found.parameters[i]])
+        direction = rng.uniform(-1.0, 1.0, len(slopes))
+        target = np.zeros(0) if task.fixed_target is None else np.atleast_1d(task.fixed_target)
+        target = np.atleast_1d(given["targets"][i]) if given else target
+        with mpmath.workdps(40):
+            h, ends = mpmath.mpf(10) ** -12, []
+            values = [*states[i], *actions[i], *(getattr(scene, name) for name in names)]
+            for side in (h, -h):
+                x = [mpmath.mpf(v) + side * mpmath.mpf(d) for v, d in zip(values, direction, strict=True)]
+                y, a = x[:width], x[width : width + actions.shape[1]]
+                p = dict(zip(names, x[width + len(a) :], strict=True))
+                results = exact_results(task, y, a, [mpmath.mpf(g) for g in target], p)
+                ends.append(sum(mpmath.mpf(s) * r for s, r in zip(seeds[i], results, strict=True)))
+            expected = float((ends[0] - ends[1]) / (2 * h))
+        assert abs(slopes @ direction - expected) <= 1e-10 * max(1.0, np.abs(slopes * direction).sum())
+
+
+def test_what_is_clipped_has_no_gradient():
+    model = Model(TASKS["PivotedBar-v0"]())
+    states, actions = [[0.0, 0.0, 3.0, 0.0]] * 4, [-1.5, -1.0, 1.0, 1.5]
+    found = model.vjp(states, actions, by_states=[0.0, 1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(found.actions[[0, 3]], 0.0)
+    assert (np.abs(found.actions[[1, 2]]) > 0.1).all()
+
+
+def test_kicks_are_constants():
+    task = TASKS["PivotedBarBalance-v0"]()
+    model, states, actions, _ = starts(task, seeded("kicks"), 2)
+    ends, _, _ = model(states, actions[:, 0])
+    seeds = np.ones((2, len(task.formulas.observation)))
+    kicks = np.array([[0.0, 0.0, 0.3, 0.0], [0.0, 0.0, 0.0, 0.7]])
+    found = model.vjp(states, actions[:, 0], by_observations=seeds, ends=ends, kicks=kicks)
+    # The observation of the kicked state, moved with the state before the kick.
+    h = 1e-6
+    for j in range(4):
+        sides = states + h * np.eye(4)[j], states - h * np.eye(4)[j]
+        above, below = (model.observe(model(side, actions[:, 0])[0] + kicks) for side in sides)
+        np.testing.assert_allclose(found.states[:, j], (above - below).sum(axis=1) / (2 * h), atol=1e-7)
+
+
+def test_choices_have_no_gradient():
+    task = TASKS["CartPoleExact-v0"]()
+    with pytest.raises(ValueError, match="list of actions to choose from"):
+        Model(task).vjp([[0.0] * 4], [1])

@@ -1,0 +1,47 @@
+"""Trainings for tests: they can be interrupted at a step that is chosen."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from agents import learners
+
+ROOT = Path(__file__).parents[1]
+
+
+def go(run, until=10**9):
+    """Train until so many steps are done; return whether the run is finished."""
+
+    def show(run):
+        if until <= run.trained < run.steps:
+            raise KeyboardInterrupt
+
+    try:
+        learners.train(run, show=show, tested=lambda run: None)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def kill_and_interrupt(*arguments):
+    """Kill a script that trains, start it again, interrupt it; return what it printed then."""
+    path = os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))
+    for number in (signal.SIGKILL, signal.SIGINT):
+        process = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            env=os.environ | {"PYTHONPATH": path},
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        for line in process.stdout:
+            if " steps, " in line and ":         0 steps" not in line:
+                break
+        process.send_signal(number)
+        output = process.communicate(timeout=60)[0]
+    assert process.returncode == 130, output
+    assert "To go on:" in output
+    return output
