@@ -46,17 +46,13 @@ class Settings(OwnSettings):
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
     n_envs: int = Field(ge=1, description="environments stepped together")
     n_steps: int = Field(ge=1, description="steps of a window")
-    learning_rate: float = Field(
-        ge=0, description="of the policy at the start; it falls linearly to 0"
-    )
+    learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
     reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
-    start_ranges: dict[str, NonNegativeFloat] = Field(
-        description="half widths of states about the usual"
-    )
+    start_ranges: dict[str, NonNegativeFloat] = Field(description="half widths of states about the usual")
     actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
     first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
     critic: list[PositiveInt] = Field(description="widths of the critic's hidden layers; empty: no critic")
@@ -200,9 +196,7 @@ class Learner:
         by_seen = np.zeros((kinds, *w.seen.shape))
         by_rewards = np.zeros((kinds, steps, n))
         by_states[np.arange(wide), :, :, np.arange(wide)] = 1.0
-        inside = np.moveaxis(
-            np.abs(w.actions) <= self.policy.largest, 2, 0
-        )  # else constant
+        inside = np.moveaxis(np.abs(w.actions) <= self.policy.largest, 2, 0)  # else constant
         by_seen[wide:-1, :-1] = (slopes(self.actor, w.observations) * inside[..., None])[:, 1:]
         by_rewards[-1] = self.settings.reward_scale
         if self.settings.critic:

@@ -246,7 +246,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -275,7 +275,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 5e5,
+            "n_timesteps": 5e6,
             "n_epochs": 5,
             "reward_scale": 1.0,
             "episode_share": 1.0,
@@ -407,7 +407,7 @@ class SwingUpAnywhere(SwingUp):
     id = "DoubleBarAnywhere-v0"
     draws = 2
     kick_chance, largest_kick = 0.005, 1.0
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
 
     controllers = {
         "LQR": Controller("lag_envs.controllers.tracking:hold"),
