@@ -51,6 +51,7 @@ class Settings(OwnSettings):
     )
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
+    max_slope: float = Field(gt=0, description="largest norm of derivatives that are passed back a step")
     reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
@@ -215,6 +216,9 @@ class Learner:
         for t in reversed(range(steps)):
             passed = np.einsum("nk,knj->nj", later * going[t][:, None], by_both[:-1, t])
             later = found[t] = by_both[-1, t] + gamma * passed
+            # What grows from step to step, as near an unstable balance or at a kink, would drown all else.
+            size = np.linalg.norm(later, axis=1, keepdims=True)
+            later = found[t] = later / np.maximum(1.0, size / self.settings.max_slope)
         return found[..., wide:]
 
     def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:

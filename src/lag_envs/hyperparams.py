@@ -116,6 +116,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "learning_rate": 3e-3,
         "gamma": 0.99,
         "max_grad_norm": 1.0,
+        "max_slope": 3.0,
         "reward_scale": 0.1,
         "episode_share": 0.5,
         "random_starts": 0.0,
