@@ -92,6 +92,12 @@ def network(widths: Sequence[int], scale: float) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+def shared_weights(layers: nn.Sequential) -> list[tuple[Array, Array]]:
+    """Return each layer's weights and biases as NumPy sees them; they change as the network learns."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    return [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
+
+
 class Policy:
     """What acts: a network's weights as NumPy sees them. For small batches that is faster than PyTorch.
 
@@ -258,8 +264,7 @@ class Learner:
         for p, (values, gradients) in zip(parts, places, strict=True):
             p.data, p.grad = values.view_as(p), gradients.view_as(p)
         self.adam = torch.optim.Adam([self.parameters], eps=1e-5, fused=True)
-        linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
-        self.policy.layers = [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
+        self.policy.layers = shared_weights(self.actor)
 
     def iterate(self) -> None:
         """Collect experience and learn from it."""

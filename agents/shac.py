@@ -27,7 +27,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torch import nn
 
 from agents.learners import OwnSettings, trainable
-from agents.ppo import Policy, network
+from agents.ppo import Policy, network, shared_weights
 from agents.run import FIRST_FRESH_SEED, UserError
 from lag_envs.torch import Step
 
@@ -49,6 +49,7 @@ class Settings(OwnSettings):
     learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
+    max_slope: float = Field(gt=0, description="largest norm of derivatives that are passed back a step")
     reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
@@ -135,9 +136,7 @@ class Learner:
             torch.optim.Adam(self.actor.parameters(), fused=True),
             torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, fused=True),
         ]
-        linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
-        layers = [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
-        self.policy = Policy(layers, (), formulas.largest)
+        self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
 
     def iterate(self) -> None:
         """Collect a window and learn from it."""
@@ -209,6 +208,9 @@ class Learner:
         for t in reversed(range(steps)):
             passed = np.einsum("nk,knj->nj", later * going[t][:, None], by_both[:-1, t])
             later = found[t] = by_both[-1, t] + gamma * passed
+            # What grows from step to step, as near an unstable balance and at kinks, would drown all else.
+            size = np.linalg.norm(later, axis=1, keepdims=True)
+            later /= np.maximum(1.0, size / self.settings.max_slope)
         return found[..., wide:]
 
     def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:

@@ -566,7 +566,9 @@ def _parsers(whole: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser
 
 def declare_hyperparams(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``hyperparams``."""
-    parser.add_argument("learner", metavar="LEARNER", help="ppo, sac, td3, tqc, dqn or fast_ppo")
+    parser.add_argument(
+        "learner", metavar="LEARNER", help="ppo, sac, td3, tqc, dqn, fast_ppo, shac or cloning"
+    )
 
 
 def run_hyperparams(args: argparse.Namespace) -> int:
@@ -778,7 +780,7 @@ examples:
         "print hyperparameters for the RL Zoo",
         """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the form of
 the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with. Those of
-fast_ppo are for `python -m agents.ppo`, in a clone.
+fast_ppo, shac and cloning are for `python -m agents.train`, in a clone.
 
 examples:
   lag-envs hyperparams ppo > ppo.yml

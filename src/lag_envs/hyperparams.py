@@ -107,15 +107,15 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "critic": [64, 32],
         "first_layer_scale": 2.0,
     },
-    # By gradients through the environment (agents/shac.py). Windows are short: a guard's kinks make gradients of
-    # longer ones useless.
+    # By gradients through the environment (agents/shac.py).
     "shac": {
         "n_timesteps": 1e6,
         "n_envs": 64,
         "n_steps": 16,
-        "learning_rate": 3e-3,
+        "learning_rate": 1e-2,
         "gamma": 0.99,
         "max_grad_norm": 1.0,
+        "max_slope": 3.0,
         "reward_scale": 0.1,
         "episode_share": 0.5,
         "random_starts": 0.0,
@@ -127,6 +127,18 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "critic_epochs": 4,
         "batch_size": 256,
         "td_lambda": 0.95,
+    },
+    # A controller cloned by a network (agents/cloning.py).
+    "cloning": {
+        "controller": "",
+        "n_timesteps": 1.6e5,
+        "n_envs": 64,
+        "n_steps": 100,
+        "n_updates": 100,
+        "batch_size": 512,
+        "learning_rate": 5e-3,
+        "actor": [64, 64],
+        "first_layer_scale": 2.0,
     },
 }
 

@@ -99,7 +99,7 @@ class Task:
         that this task's environments have on. An instance has them checked here, or None. Formulas, and so
         `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
-        For a learner ("fast_ppo", "ppo", "sac", "td3", "tqc", "dqn"): what differs from
+        For a learner, one of `lag_envs.hyperparams.learners`: what differs from
         `lag_envs.hyperparams.DEFAULTS`.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.

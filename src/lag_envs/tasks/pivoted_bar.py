@@ -138,6 +138,11 @@ class SwingUp(GuardedTrack, _Bar):
         "tqc": {"env_wrapper": [_SHORT]},
         # Random actions move the bar most where all are full.
         "dqn": {"env_wrapper": [_SHORT, {"gymnasium.wrappers.DiscretizeAction": {"bins": 3}}]},
+        # Hanging still, h² has no slope: half of the episodes start anywhere.
+        "shac": {
+            "random_starts": 0.5,
+            "start_ranges": {"s": 0.2, "s_dot": 1.5, "theta": math.pi, "theta_dot": 8.0},
+        },
     }
     value_iteration: ClassVar[ValueIteration | None] = ValueIteration(
         relaxed="PivotedBarFree-v0", keep=(2, 3)
@@ -212,7 +217,21 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
             tune={"catch": (0.1, 10.0), "lose": (6.0, 60.0), "pump": (0.1, 6.0)},
         ),
     }
-    hyperparameters = {**SwingUp.hyperparameters, "ppo": {**_SCALED, "env_wrapper": [_SHORT]}}
+    hyperparameters = {
+        **SwingUp.hyperparameters,
+        "ppo": {**_SCALED, "env_wrapper": [_SHORT]},
+        # Without a guard gradients of two seconds are of use, and a critic is not needed.
+        "shac": {
+            "n_timesteps": 8e5,
+            "n_steps": 100,
+            "episode_share": 0.2,
+            "learning_rate": 2e-2,
+            "gamma": 1.0,
+            "critic": [],
+            "random_starts": 0.5,
+            "start_ranges": {"theta": math.pi, "theta_dot": 8.0},
+        },
+    }
     value_iteration = ValueIteration(
         (
             Axis("θ [rad]", 0.0, 2.0 * math.pi, 80, periodic=True, level=4),

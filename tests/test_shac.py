@@ -1,0 +1,119 @@
+"""Learners that go by gradients and by a controller: they learn, repeat and resume bit for bit."""
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_ppo import learnt
+from trainings import go
+
+from agents import cloning, learners, shac, train
+from agents.learners import hyperparameters, load_policy
+from agents.run import RESULT, Run, UserError, fresh_seeds
+from lag_envs.evaluation.rollout import play
+from lag_envs.scores import score
+from lag_envs.tasks import cart_pole, pivoted_bar
+
+FREE, TRACK = pivoted_bar.SwingUpFree.id, pivoted_bar.SwingUp.id
+#: For trainings that take a fraction of a second.
+SHORT = {
+    "shac": {"n_envs": 8, "n_steps": 16, "critic": [8]},
+    "cloning": {"n_envs": 8, "n_steps": 16, "n_updates": 2, "batch_size": 8},
+}
+each_learner = pytest.mark.parametrize("algo", SHORT)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(learners, "EPISODES", 5)
+    monkeypatch.setattr(learners, "TEST_EPISODES", 2)
+    monkeypatch.setattr(learners, "TESTS", 3)
+
+
+def make_run(folder, algo, seed=3):
+    return Run(Path(folder), FREE, algo, seed, 768, hyperparameters(algo, FREE) | SHORT[algo])
+
+
+@each_learner
+def test_a_seed_decides_everything_with_interruptions_or_without(algo, tmp_path):
+    whole, other, cut = (make_run(tmp_path / name, algo) for name in ("a", "b", "c"))
+    other.seed = 4
+    assert go(whole) and go(other)
+    assert not go(cut, 384)  # a window after the last checkpoint
+    cut = make_run(tmp_path / "c", algo)
+    assert cut.load_checkpoint() is not None and 0 < cut.trained <= 384
+    torch.manual_seed(0)
+    assert go(cut)
+    assert learnt(cut) == learnt(whole) != learnt(other)
+    result = json.loads(whole.path(RESULT).read_text())
+    policy = load_policy(whole.folder)
+    assert play(FREE, policy, fresh_seeds(5)).tolist() == result["evaluation"]["returns"]
+
+
+@pytest.mark.parametrize(("env_id", "share"), [(FREE, 0.5), (TRACK, 0.01)])
+def test_gradients_are_slopes_of_what_is_earned(env_id, share):
+    """Against differences of one action: through policy, guard, critic, and ends of episodes."""
+    steps, n, gamma, first = 12, 4, 0.97, 3
+    settings = hyperparameters("shac", env_id) | {
+        "n_envs": n, "n_steps": steps, "critic": [8], "gamma": gamma, "episode_share": share, "max_slope": 1e9,
+    }  # fmt: skip
+    learner = shac.Learner(env_id, shac.Settings.of(settings), 0, 1000)
+    start, act = copy.deepcopy(learner.state()), learner.policy.outputs
+
+    def earned(push):
+        learner.restore(copy.deepcopy(start))
+        acted = iter(range(steps))
+        learner.policy.outputs = lambda seen: (None, act(seen)[1] + np.float32(push * (next(acted) == first)))
+        w = learner.collect()
+        total, alive = np.zeros(n), np.ones(n, bool)
+        values = learner.critic(torch.from_numpy(w.seen)).detach().numpy()[..., 0]
+        for k, t in enumerate(range(first, steps)):
+            total += alive * gamma**k * settings["reward_scale"] * w.rewards[t]
+            ends = alive & (w.over[t] | (t == steps - 1))
+            total += ends * gamma ** (k + 1) * values[t]
+            alive &= ~w.over[t]
+        return w, total
+
+    w, _ = earned(0.0)
+    assert w.over.any() == (share < 0.5)
+    slopes = (earned(0.01)[1] - earned(-0.01)[1]) / 0.02
+    np.testing.assert_allclose(learner.gradients(w)[first, :, 0], slopes, rtol=0.02, atol=1e-5)
+
+
+def test_it_swings_the_free_bar_up():
+    """In about a second of training, where back-propagation through time without bounds stays below .6."""
+    hyper = hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
+    learner = shac.Learner(FREE, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
+    while learner.trained < learner.steps:
+        learner.iterate()
+    assert score(FREE, play(FREE, learner.policy, fresh_seeds(100)).mean()) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "changes", "message"),
+    [
+        ("shac", FREE, {"gamma": 1.5}, "settings of shac: gamma: Input should be less than or equal to 1, got"),
+        ("shac", FREE, {"gama": 0.9}, "settings of shac: gama is an unknown key"),
+        ("shac", FREE, {"start_ranges": {}}, "random_starts=0.5 needs start_ranges, got none"),
+        ("shac", FREE, {"start_ranges": {"phi": 1.0}}, "has no state 'phi'; it has theta, theta_dot"),
+        ("shac", cart_pole.CartPoleExact.id, {}, "shac needs gradients: CartPoleExact has a list of actions"),
+        ("shac", pivoted_bar.Unknown.id, {}, "shac needs gradients: Unknown has imperfect sensors"),
+        ("cloning", cart_pole.CartPoleExact.id, {}, "has choices; try fast_ppo"),
+        ("cloning", FREE, {"controller": "LQG"}, "no controller 'LQG'"),
+        ("cloning", FREE, {"batch_size": 0}, "settings of cloning: batch_size: "),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named(algo, env_id, changes, message):
+    module = {"shac": shac, "cloning": cloning}[algo]
+    with pytest.raises(UserError, match=message):
+        module.Learner(env_id, module.Settings.of(hyperparameters(algo, env_id) | changes), 0, 1000)
+
+
+def test_commands_know_them(tmp_path, capsys):
+    given = [FREE, "--algo", *SHORT, "--steps", "6400", "--output", str(tmp_path)]
+    assert train.main([*given, "--jobs", "1"]) == 0
+    output = capsys.readouterr().out
+    assert all(f"{FREE}, {algo}, " in output for algo in SHORT)
