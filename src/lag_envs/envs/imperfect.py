@@ -547,7 +547,7 @@ class ImperfectProgram(DrawnProgram):
             *(f"work[{j}] = action[lane * {n} + {j}]" for j in range(n)),
             f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
             f"if over == {SLOW}:",
-            "    refused, over = np.uint64(lane + 1), 0",
+            "    refused, over = max(refused, np.uint64(lane + 1)), 0",
             *(f"    {self._at_lane(u)} = work[{held + j}]" for j, u in enumerate(self.u)),
             "if over > 0:",
             f"    {self._at_lane('n')} = -np.float64(over)",

@@ -363,7 +363,7 @@ class Program:
             *_indent([
                 *inputs, *again,
                 "if status < 0:",
-                "    refused = first + i + np.uint64(1)",
+                "    refused = max(refused, first + i + np.uint64(1))",
                 f"    {_at('over')} = 0.0",
                 "else:",
                 *_indent([
@@ -416,7 +416,7 @@ class Program:
         return self._batch("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
 
     def _claimed(self, body: Sequence[str]) -> list[str]:
-        """Return the loop over the blocks that a thread claims; the body counts `overs`, and sets `refused`."""
+        """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""
         claim = "block, tried = next_block(ids, at, turn, blocks, {}, share, shares)"
         return [
             "overs, refused, taken = np.uint64(0), np.uint64(0), np.uint64(0)",
@@ -432,9 +432,7 @@ class Program:
         n = len(self.a)
         # An environment that is to be restarted ignores its action, whatever it is.
         place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
-        found = (
-            f"if not (abs(action[i * {n} + {j}]) < math.inf) and f[{place}] >= 0.0:" for j in range(n)
-        )
+        found = (f"if not (abs(action[i * {n} + {j}]) < math.inf) and f[{place}] >= 0.0:" for j in range(n))
         body = [
             "bad = 0",
             f"for i in range(np.uint64(count) * np.uint64({n})):",

@@ -21,24 +21,23 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from lag_envs.host import usable_cores
 from lag_envs.stepping.compiling import BLOCK, compile_python
 
 #: Environments for each thread, by default: fewer are stepped before another thread is awake.
 SHARE = 4096
 #: How often a thread looks for what another is about to do, some 50 µs, before it sleeps.
 PATIENCE = 200_000
-#: Numbers that threads share: the turn, blocks that are not done, episodes that are over, the environment that
-#: was refused, where the step's arrays lie, bytes of a number of actions. Then, for each block, the turn in
-#: which it was claimed last.
+#: Numbers that threads share: the turn, blocks that are not done, episodes that are over, the environment
+#: that was refused, where the five arrays of a step lie, bytes of an action's number. Then, for each block,
+#: the turn in which it was claimed last.
 WORDS = 10
 
 
 # --- compiled ---
 
 
-def _step_all(
-    f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares
-):  # type: ignore[no-untyped-def]
+def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares):  # type: ignore[no-untyped-def]
     """Take part in a turn, see `compile_step_all`."""
     at, now = np.uint64(3 * count), np.uint64(turn)
     blocks = np.uint64((count + BLOCK - 1) // BLOCK)
@@ -137,22 +136,24 @@ def claiming() -> list[Callable]:
 
 
 def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
-    """Compile ``step_all(f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares)``.
+    """Compile ``step_all(f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
 
-    Steps every environment; one whose episode was over is restarted instead. `turn` is the number of the step,
-    from 1. Who has `share` 0 leads, and gets (status, over). The status is 0; or i + 1 where environment i was
-    refused and kept its state; or -(i + 1), before anything was stepped, where action i is not finite. ``over``
-    counts the environments whose episode is over now; it is -1 where helpers are still at it, and the same call
-    is to be made again. Helpers make that call with a number of their own below `shares`, and a `par` of their
-    own; what they get says nothing.
+    Steps every environment; one whose episode was over is restarted instead. `ended` and `cut` are the arrays
+    of terminations and truncations. `turn` is the number of the step, from 1.
+
+    Who has `share` 0 leads, and gets (status, over). The status is 0; or i + 1 where environment i was
+    refused and kept its state; or -(i + 1), before anything was stepped, where action i is not finite.
+    ``over`` counts the environments whose episode is over now; it is -1 where helpers are still at it, and
+    the same call is to be made again. Helpers make that call with a number of their own below `shares`, and a
+    `par` of their own; what they get says nothing.
 
     Parameters
     ----------
     bad_action : callable
         ``bad_action(f, action, count)`` to 0 or -(i + 1).
     step_blocks : callable
-        ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``, the loop over the blocks that
-        a thread can claim.
+        ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``, the loop over the blocks
+        that a thread can claim.
     """
     looks = _compiled(_opened, inline=True), _compiled(_done, inline=True)
     return _compiled(_step_all, bad_action, step_blocks, *looks)
@@ -169,9 +170,8 @@ def default_threads(count: int) -> int:
     """
     if count < 2 * SHARE or multiprocessing.parent_process() is not None:
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
-    return max(1, min(count // SHARE, cores, int(limit) if limit.isdecimal() else cores))
+    return max(1, min(count // SHARE, usable_cores(), int(limit) if limit.isdecimal() else count))
 
 
 def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:

@@ -339,7 +339,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._started:
             raise ResetNeeded("call reset() before get_state(): no episode has begun")
         rows = {name: self._read(name) for name in self._program.kept}
-        return snapshots.Snapshot(self._about, rows, self._keys.copy(), self._steps.copy(), self._totals.copy())
+        ids, steps, totals = self._keys.copy(), self._steps.copy(), self._totals.copy()
+        return snapshots.Snapshot(self._about, rows, ids, steps, totals)
 
     def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
         """Go back, or over, to where `get_state` was called; what follows has the same bits.

@@ -104,7 +104,11 @@ def compile_function(
 
 
 def compile_python(
-    name: str, function: Callable, *helpers: Callable, inline: bool = False, **constants: float | tuple[int, ...]
+    name: str,
+    function: Callable,
+    *helpers: Callable,
+    inline: bool = False,
+    **constants: float | tuple[int, ...],
 ) -> Callable:
     """Compile, under a name, a function that is written out in Python; otherwise like `compile_function`."""
     source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)

@@ -78,7 +78,7 @@ def select(typingctx, condition, a, b):  # type: ignore[no-untyped-def]
 
 
 def _atomic(instruction: Callable, arguments: int, result: Any) -> Callable:
-    """Return an instruction on one number of an array of uint64, ``(array, index, *arguments)``, for threads."""
+    """Return an instruction for threads, ``(array, index, *arguments)``, on a number of an array."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         array = context.make_array(signature.args[0])(context, builder, args[0])
@@ -121,7 +121,7 @@ def address(typingctx, array):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
-    """Return an array like this one whose numbers lie at another address (uint64); nothing keeps them there."""
+    """Return an array like this one whose numbers lie at an address (uint64), where nothing keeps them."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         made = context.make_array(signature.return_type)(context, builder, args[0])
