@@ -441,7 +441,7 @@ class Program:
             "    for i in range(count):",
             *_indent([line for test in found for line in (test, "    return -(i + 1)")], 2),
         ]  # fmt: skip
-        return _function("bad_action", "f, action, count", [*(body if n else []), "return 0"], inline=True)
+        return _function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
 
     def _action(self, j: int) -> str:
         """Return where action j of the environment at hand lies in the batch's array."""
@@ -547,8 +547,5 @@ def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
     return ["    " * levels + line for line in lines]
 
 
-def _function(
-    name: str, arguments: str, body: Sequence[str], *helpers: Callable, inline: bool = False
-) -> Callable:
-    source = "\n".join([f"def {name}({arguments}):", *_indent(body), ""])
-    return compile_function(name, source, *helpers, inline=inline)
+def _function(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
+    return compile_function(name, "\n".join([f"def {name}({arguments}):", *_indent(body), ""]), *helpers)
