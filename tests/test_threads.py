@@ -136,7 +136,7 @@ def room(blocks):
     count = blocks * BLOCK
     flags = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     arrays = np.zeros(count, np.float32), np.zeros((1, count), np.float32), np.zeros(count), *flags
-    return np.zeros(blocks), np.zeros(3 * count + sharing.WORDS + blocks, np.uint64), arrays, count
+    return np.zeros(blocks), np.zeros(3 * count + sharing.words(blocks), np.uint64), arrays, count
 
 
 def test_each_block_is_stepped_once_and_helpers_help(toy):
@@ -166,6 +166,25 @@ def test_who_comes_late_finds_nothing_to_do(toy):
     for turn in (1, 2, 3, 4):
         toy(f, ids, par, *arrays, count, turn, 1, 2)
     assert (f == 3.0).all()
+
+
+def test_no_two_helpers_have_one_share(toy):
+    """They would share the room in which a step is computed."""
+    f, ids, arrays, count = room(5)
+    par = np.array([0.0, 0.5])
+    taken = 3 * count + sharing.WORDS + 5 + 1
+    toy(f, ids, par, *arrays, count, 1, 0, 2)
+    toy(f, ids, par, *arrays, count, 1, 1, 2)
+    assert ids[taken] == 0  # given back
+    ids[taken] = 1
+    leader = threading.Thread(target=toy, args=(f, ids, par, *arrays, count, 2, 0, 2))
+    other = np.array([7.0, 0.5])
+    leader.start()
+    while leader.is_alive():
+        toy(f, ids, other, *arrays, count, 2, 1, 2)
+    assert ids[taken] == 1 and not (arrays[2] == 7.0).any() and (f == 2.0).all()
+    sharing.forget_helpers(ids, count)
+    assert ids[taken] == 0 and ids[taken - 2] == 2
 
 
 def test_a_step_waits_for_what_is_left_of_the_last_one():

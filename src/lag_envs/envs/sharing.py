@@ -20,6 +20,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lag_envs.host import usable_cores
 from lag_envs.stepping.compiling import BLOCK, compile_python
@@ -29,9 +30,19 @@ SHARE = 4096
 #: How often a thread looks for what another is about to do, some 50 µs, before it sleeps.
 PATIENCE = 200_000
 #: Numbers that threads share: the turn, blocks that are not done, episodes that are over, the environment
-#: that was refused, where the five arrays of a step lie, bytes of an action's number. Then, for each block,
-#: the turn in which it was claimed last.
+#: that was refused, where the five arrays of a step lie, bytes of an action's number. Behind them, for each
+#: block, the turn in which it was claimed last; and for each share whether a helper has it.
 WORDS = 10
+
+
+def words(blocks: int) -> int:
+    """Return how many numbers threads share."""
+    return WORDS + 2 * blocks
+
+
+def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
+    """Note, in a copy of a batch's keys, that no helper has a share of the copy."""
+    ids[3 * count + WORDS + -(-count // BLOCK) :] = 0
 
 
 # --- compiled ---
@@ -42,6 +53,9 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
     at, now = np.uint64(3 * count), np.uint64(turn)
     blocks = np.uint64((count + BLOCK - 1) // BLOCK)
     if share > 0:
+        mine = at + np.uint64(WORDS) + blocks + np.uint64(share)
+        if not atomic_replace(ids, mine, np.uint64(0), np.uint64(1)):
+            return 0, 0  # another helper still waits for the next turn, with this `par`
         # Waking costs much of a turn, so a helper takes part in those that soon follow too.
         while opened(ids, at, now):
             now = atomic_load(ids, at)
@@ -57,6 +71,7 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
                 count, at, blocks, now, np.uint64(share), np.uint64(shares),
             )  # fmt: skip
             now += np.uint64(1)
+        atomic_store(ids, mine, np.uint64(0))
         return 0, 0
     if atomic_load(ids, at) < now:
         if not done(ids, at):
@@ -144,8 +159,8 @@ def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
     Who has `share` 0 leads, and gets (status, over). The status is 0; or i + 1 where environment i was
     refused and kept its state; or -(i + 1), before anything was stepped, where action i is not finite.
     ``over`` counts the environments whose episode is over now; it is -1 where helpers are still at it, and
-    the same call is to be made again. Helpers make that call with a number of their own below `shares`, and a
-    `par` of their own; what they get says nothing.
+    the same call is to be made again. Helpers make that call with another number below `shares`, and the
+    `par` that belongs to it; they go on with the steps that soon follow. What they get says nothing.
 
     Parameters
     ----------
@@ -177,12 +192,17 @@ def default_threads(count: int) -> int:
 def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
     """Let `step_all` be called with each of these arguments by a helper that has nothing else to do.
 
-    Offers from before that nobody took are withdrawn. `kind` is the type of actions: the first step with one
-    compiles, and there is no help in it, as a thread might still be at that when the process ends.
+    Offers of others that nobody took are withdrawn; one's own from before are as good as new. `kind` is the
+    type of actions: the first step with one compiles, and there is no help in it, as a thread might still be
+    at that when the process ends.
     """
+    global _offered
     if (step_all, kind) not in _compiled_for:
         _compiled_for.add((step_all, kind))
         return
+    if id(calls) == _offered and _offers.qsize() >= len(calls):
+        return
+    _offered = id(calls)  # not the calls themselves, which keep a batch's memory
     with contextlib.suppress(queue.Empty):
         while _offers.get_nowait() is not None:
             pass
@@ -209,6 +229,7 @@ def _dismiss() -> None:
 
 
 _offers: queue.SimpleQueue[tuple[Callable, tuple] | None] = queue.SimpleQueue()
+_offered = 0
 _helpers: list[threading.Thread] = []
 _compiled_for: set[tuple[Callable, np.dtype]] = set()
 if hasattr(os, "register_at_fork"):

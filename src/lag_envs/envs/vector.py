@@ -152,7 +152,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         blocks = -(-self.num_envs // BLOCK)
         self._memory = np.zeros(blocks * len(program.kept) * BLOCK)
         #: Keys of the seeds, numbers of the episodes, keys of the episodes, and what threads share.
-        self._ids = np.zeros(3 * self.num_envs + sharing.WORDS + blocks, dtype=np.uint64)
+        self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
         #: Number of the step, counted over all episodes, and how many threads find something to do in one.
         self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
@@ -169,6 +169,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._program = program_of(self.task, self._constants)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
+        #: What helpers are asked to call, by their number and the type of actions.
+        self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
 
     # --- Gymnasium's interface -----------------------------------------------------------------------------
 
@@ -509,14 +511,15 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     def _get_help(self, actions: NDArray, *rest: Any) -> int:
         """Ask other threads to take part in a step; return how many may, this one included."""
-        shares = min(self.num_threads, self._most_threads)
-        while len(self._pars) < shares:
-            self._pars.append(self._pars[0].copy())
-        calls = [
-            (self._memory, self._ids, self._pars[i], actions, *rest, i, shares) for i in range(1, shares)
-        ]
+        shares, kind = min(self.num_threads, self._most_threads), actions.dtype
+        if (calls := self._calls.get((shares, kind))) is None:
+            while len(self._pars) < shares:
+                self._pars.append(self._pars[0].copy())
+            calls = self._calls[shares, kind] = [
+                (self._memory, self._ids, self._pars[i], actions, *rest, i, shares) for i in range(1, shares)
+            ]
         if calls:
-            sharing.offer(self._program.step_all, calls, actions.dtype)
+            sharing.offer(self._program.step_all, calls, kind)
         return shares
 
     def _restart(
@@ -594,14 +597,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return array
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out compiled functions and pictures."""
-        return {
-            k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_viewed", "_row")
-        }
+        """Leave out compiled functions, pictures, and what helpers know."""
+        without = ("_program", "_viewers", "_viewed", "_row", "_calls")
+        return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
         self.__dict__.update(state)
+        sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()
 
 
