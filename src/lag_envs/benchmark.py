@@ -635,8 +635,8 @@ def table(report: dict[str, Any]) -> list[str]:
             "",
         ]
     if found := report.get("speedups"):
-        head = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
-        lines += [*columns([head, *map(_compared, found)]), ""]
+        names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
+        lines += [*columns([names, *map(_compared, found)]), ""]
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]

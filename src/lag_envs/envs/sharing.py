@@ -140,14 +140,14 @@ def _done(ids, at):  # type: ignore[no-untyped-def]
     return False
 
 
-def _compiled(function: Callable, *helpers: Callable, inline: bool = False) -> Callable:
+def _compiled(function: Callable, *helpers: Callable) -> Callable:
     numbers = {"BLOCK": BLOCK, "WORDS": WORDS, "PATIENCE": PATIENCE}
-    return compile_python(function.__name__[1:], function, *helpers, inline=inline, **numbers)
+    return compile_python(function.__name__[1:], function, *helpers, **numbers)
 
 
 def claiming() -> list[Callable]:
     """Return `next_block` and `hand_in`, which the loop over blocks calls."""
-    return [_compiled(_next_block, inline=True), _compiled(_hand_in, inline=True)]
+    return [_compiled(_next_block), _compiled(_hand_in)]
 
 
 def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
@@ -170,7 +170,7 @@ def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
         ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``, the loop over the blocks
         that a thread can claim.
     """
-    looks = _compiled(_opened, inline=True), _compiled(_done, inline=True)
+    looks = _compiled(_opened), _compiled(_done)
     return _compiled(_step_all, bad_action, step_blocks, *looks)
 
 

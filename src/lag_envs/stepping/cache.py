@@ -109,7 +109,7 @@ def writable(place: Path) -> bool:
         return False
 
 
-def jit(function: Callable, key: str | None = None, *, inline: bool = False) -> Any:
+def jit(function: Callable, key: str | None = None) -> Any:
     """Compile a function on its first call for each combination of types, or take it from the cache.
 
     Parameters
@@ -120,8 +120,6 @@ def jit(function: Callable, key: str | None = None, *, inline: bool = False) -> 
         What the result depends on: its own source, and that of all it calls and names. By default the file
         that defines the function, and the numbers that it names. Types, machine, and the versions of Python
         and Numba are added.
-    inline : bool
-        Whether it becomes part of each function that calls it.
 
     Returns
     -------
@@ -130,7 +128,7 @@ def jit(function: Callable, key: str | None = None, *, inline: bool = False) -> 
     """
     import numba
 
-    dispatcher = numba.njit(function, error_model="numpy", nogil=True, forceinline=inline)
+    dispatcher = numba.njit(function, error_model="numpy", nogil=True)
     if key is None:
         with contextlib.suppress(OSError, TypeError):  # typed in, not in a file
             source = inspect.getsource(inspect.getmodule(function))  # type: ignore[arg-type]

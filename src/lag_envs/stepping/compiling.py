@@ -56,7 +56,7 @@ def count_operations(lines: Iterable[str]) -> int:
 
 @cache
 def compile_function(
-    name: str, source: str, /, *helpers: Callable, inline: bool = False, **constants: float | tuple[int, ...]
+    name: str, source: str, /, *helpers: Callable, **constants: float | tuple[int, ...]
 ) -> Callable:
     """Compile the function ``name`` that ``source`` defines.
 
@@ -69,8 +69,6 @@ def compile_function(
         and the constants.
     *helpers : callable
         What this function returned for the functions that the source calls, known there by their names.
-    inline : bool
-        Whether it becomes part of each function that calls it.
     **constants : float or tuple of int
         Numbers that the source names.
 
@@ -90,7 +88,7 @@ def compile_function(
     parts = [
         inspect.getsource(primitives),
         source,
-        repr((inline, sorted(constants.items()))),
+        repr(sorted(constants.items())),
         *(h.__name__ for h in helpers),
     ]
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -100,19 +98,15 @@ def compile_function(
     namespace |= {helper.__name__.rsplit("_", 1)[0]: helper for helper in helpers}
     namespace |= {block: primitives.block(*_blocks[block]) for block in re.findall(_BLOCK, source)}
     exec(code, namespace)
-    return jit(namespace[unique], unique, inline=inline)
+    return jit(namespace[unique], unique)
 
 
 def compile_python(
-    name: str,
-    function: Callable,
-    *helpers: Callable,
-    inline: bool = False,
-    **constants: float | tuple[int, ...],
+    name: str, function: Callable, *helpers: Callable, **constants: float | tuple[int, ...]
 ) -> Callable:
     """Compile, under a name, a function that is written out in Python; otherwise like `compile_function`."""
     source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)
-    return compile_function(name, source, *helpers, inline=inline, **constants)
+    return compile_function(name, source, *helpers, **constants)
 
 
 def compile_traced(
