@@ -106,6 +106,8 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--output", "no/such/folder.json"], "there is no folder"),
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
+        (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),
+        (["bench", "--threads", "10000"], "--threads 10000 needs as many cores, and this process may use"),
         (["bench", "--checkout", "nowhere"], "nowhere/README.md is not there"),
         (["fly"], "invalid choice: 'fly'"),
     ],
@@ -432,6 +434,20 @@ def test_episodes_are_spread_out():
     ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
     assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
     assert max(map(sum, ended)) == 1
+
+
+def test_threads_are_measured_beside_one(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(benchmark, "PEERS", [])
+    report = benchmark.bench(tiny(tmp_path, sizes=(3,), threads=2))
+    (found,) = report["speedups"]
+    one, two = (
+        next(r["rates"] for r in report["rows"] if r["library"] == library and r["kind"] == "vector")
+        for library in ("lag_envs", benchmark.THREADED)
+    )
+    assert (found["id"], found["num_envs"]) == (ID, 3)
+    assert found["ratio"] == benchmark.quartiles(benchmark.ratios(two, one))
+    assert "2 threads : 1" in capsys.readouterr().out
+    assert benchmark.bench(tiny(tmp_path, sizes=(3,)))["speedups"] == []
 
 
 def test_keywords_are_measured_beside_the_defaults():

@@ -3,7 +3,7 @@
 All contestants are measured in one process on one core, in turn, round after round, and compared within each
 round, so that a slow spell of the machine falls on all of them. A sample is a loop over actions made
 beforehand; it holds all that a step does: dynamics, observation, reward, endings, kicks, and the resets that
-follow.
+follow. Where batches are measured that several threads step, the process has a core for each of them.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ STAGES = (
 
 #: Whose rows scenes of energies are, and how many bars the longest chain has.
 ENERGIES, LONGEST = "lag_envs, energies", 6
-#: Whose rows environments with other keywords are.
-VARIED = "lag_envs, varied"
+#: Whose rows environments with other keywords are, and those that several threads step.
+VARIED, THREADED = "lag_envs, varied", "lag_envs, threads"
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -115,6 +115,7 @@ class Settings:
     jacobians: bool = False  #: what derivatives of a step cost beside it
     divisions: bool = False  #: how often the certificate divides steps
     sizes: tuple[int, ...] = SIZES
+    threads: int = 1  #: where more, batches that they step are measured too
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
     clock: str = "wall"  #: or "cpu", which leaves out what other programs take of the core
@@ -144,13 +145,18 @@ class Contestant:
 # --- the contestants ---
 
 
-def contestants(ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = ()) -> list[Contestant]:
-    """Return ours, with other keywords too, and the peers."""
+def contestants(
+    ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = (), threads: int = 1
+) -> list[Contestant]:
+    """Return ours, with other keywords and several threads too, and the peers."""
     rows = []
     for id in ids:
         rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
         rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
         rows += [Contestant("lag_envs", id, "vector", n, partial(ours, id, n)) for n in sizes]
+        if threads > 1:
+            shared = partial(ours, id, num_threads=threads)
+            rows += [Contestant(THREADED, id, "vector", n, partial(shared, n)) for n in sizes]
         for text in keywords:
             given, name = keywords_of(text), f"{id}, {text}"
             rows += [Contestant(VARIED, name, "unwrapped", 1, partial(unwrapped, id, **given))]
@@ -265,8 +271,8 @@ def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
 
 
 def ours(id: str, n: int, **keywords: Any) -> Run:
-    """Prepare a native vector environment."""
-    envs = gym.make_vec(id, num_envs=n, **keywords)
+    """Prepare a native vector environment, of one thread unless told otherwise."""
+    envs = gym.make_vec(id, num_envs=n, **{"num_threads": 1} | keywords)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)
@@ -368,7 +374,8 @@ def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
     for name in settings.files:
         registered(name)
-    rows = contestants(settings.ids, settings.sizes, settings.keywords) if settings.speed else []
+    ours = settings.ids, settings.sizes, settings.keywords, settings.threads
+    rows = contestants(*ours) if settings.speed else []
     if settings.speed and settings.energies:
         rows += of_energies(settings.sizes)
     stages: dict[str, list[list[float]]] = {}
@@ -399,6 +406,7 @@ def bench(settings: Settings) -> dict[str, Any]:
     }
     report["targets"] = verdicts(results, cold)
     report["chains"] = chains(results)
+    report["speedups"] = speedups(rows)
     if settings.jacobians and complete:
         report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
     if settings.divisions and complete:
@@ -562,6 +570,16 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     return results
 
 
+def speedups(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
+    """Return, for each batch that several threads step, the quartiles of the ratio to one thread."""
+    rates = {(row.library, row.id, row.num_envs): row.rates for row in rows if row.kind == "vector"}
+    return [
+        {"id": id, "num_envs": n, "ratio": quartiles(pairs)}
+        for (library, id, n), threaded in rates.items()
+        if library == THREADED and (pairs := ratios(threaded, rates["lag_envs", id, n]))
+    ]
+
+
 def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
 
@@ -604,7 +622,8 @@ def table(report: dict[str, Any]) -> list[str]:
     about, settings = report["machine"], report["settings"]
     lines = [
         f"{about['processor']}, {about['cores']} cores, {about['system']}, Python {about['python']}",
-        f"one core, {settings['clock']} time, {settings['rounds']} samples of {settings['seconds']:g} s each",
+        f"{'a core for each thread' if report.get('speedups') else 'one core'}, {settings['clock']} time, "
+        f"{settings['rounds']} samples of {settings['seconds']:g} s each",
         ", ".join(f"{name} {number}" for name, number in report["versions"].items()),
         "",
     ]
@@ -626,6 +645,9 @@ def table(report: dict[str, Any]) -> list[str]:
             "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
             "",
         ]
+    if found := report.get("speedups"):
+        names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
+        lines += [*columns([names, *map(_compared, found)]), ""]
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
@@ -783,6 +805,11 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     return (*cells, row["problem"]) if row["problem"] else cells
 
 
+def _compared(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["ratio"]
+    return row["id"], f"{row['num_envs']:,}", f"{middle:.2f}", f"({low:.2f} - {high:.2f})"
+
+
 def _worst(target: dict[str, Any]) -> str:
     measured = target["measured"]
     if not measured:
@@ -800,7 +827,7 @@ def _worst(target: dict[str, Any]) -> str:
 
 
 def in_own_process(settings: Settings) -> int:
-    """Run `bench` in a process of its own, on one core and without threads; return its exit status."""
+    """Run `bench` in a process of its own, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark", json.dumps(asdict(settings))]
     child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
 
@@ -827,9 +854,10 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _break_off)
     warnings.simplefilter("ignore")  # of the peers
+    settings = Settings(**json.loads(sys.argv[1]))
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    report = bench(Settings(**json.loads(sys.argv[1])))
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-settings.threads :])
+    report = bench(settings)
     return 0 if report["complete"] else 130
 
 
