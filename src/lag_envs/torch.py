@@ -79,10 +79,10 @@ class Step:
 
     Examples
     --------
-    >>> step = Step("PivotedBarFree-v0")
-    >>> state, action = torch.tensor([3.0, 0.1]), torch.tensor([0.5])
+    >>> step = Step("PivotedBar-v0")
+    >>> state, action = torch.tensor([0.0, 0.0, 3.0, 0.1]), torch.tensor([0.5])
     >>> torch.func.jacrev(lambda s: step(s, action).states)(state).shape
-    torch.Size([2, 2])
+    torch.Size([4, 4])
     """
 
     def __init__(self, task: str | Task, **options: Any) -> None:
