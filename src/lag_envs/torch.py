@@ -79,10 +79,10 @@ class Step:
 
     Examples
     --------
-    >>> step = Step("PivotedBarFree-v0")
-    >>> state, action = torch.tensor([3.0, 0.1]), torch.tensor([0.5])
+    >>> step = Step("PivotedBar-v0")
+    >>> state, action = torch.tensor([0.0, 0.0, 3.0, 0.1]), torch.tensor([0.5])
     >>> torch.func.jacrev(lambda s: step(s, action).states)(state).shape
-    torch.Size([2, 2])
+    torch.Size([4, 4])
     """
 
     def __init__(self, task: str | Task, **options: Any) -> None:
@@ -364,36 +364,27 @@ class _EnvStep(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *seeds: Tensor) -> tuple:
         model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
-        state, actions, after = ctx.saved_tensors
-        y, ends = _numbers(state), _numbers(after)
-        a = _numbers(actions)
+        y, a, ends = map(_numbers, ctx.saved_tensors)
+        by_observations, by_rewards, by_states = map(_numbers, seeds[:3])
         if not stepped.all():  # what was restarted had no step
             y, ends = (np.where(stepped[:, None], x, model.task.centre) for x in (y, ends))
-            a = np.where(stepped[:, None], a, 0.0)
-        a = a[:, 0] if a.shape[1] == 1 else a
-        g = ctx.targets if model.task.fixed_target is None else None
-        kicks: Any = 0.0
+            a, by_rewards = np.where(stepped[:, None], a, 0.0), np.where(stepped, by_rewards, 0.0)
+        if not kept.all():
+            by_observations, by_states = (
+                np.where(kept[:, None], x, 0.0) for x in (by_observations, by_states)
+            )
+        after = ends
         if model.task.draws or not (kept | ~stepped).all():
-            moved, _, _ = model(y, a, g)
-            kicks, ends = np.where(kept[:, None], ends - moved, 0.0), moved
-        by_observations, by_rewards, by_states = (
-            np.where(mask if x.ndim == 1 else mask[:, None], _numbers(x), 0.0)
-            for mask, x in zip((kept, stepped, kept), seeds, strict=False)
+            random = ctx.targets is not None and model.task.fixed_target is None
+            ends, _, _ = model(y, a[:, 0] if a.shape[1] == 1 else a, ctx.targets if random else None)
+            after = np.where(kept[:, None], after, ends)
+        g = np.zeros((len(y), 0)) if ctx.targets is None else ctx.targets.reshape(len(y), -1)
+        by_state, by_action, _, _ = model.reverse().pull(
+            y, a, g, ends, after, by_states, by_observations, by_rewards
         )
-        found = model.vjp(
-            y,
-            a,
-            g,
-            by_states=by_states,
-            by_observations=by_observations,
-            by_rewards=by_rewards,
-            ends=ends,
-            kicks=kicks,
-        )
-        slopes = [
-            np.where(stepped[:, None], x.reshape(len(y), -1), 0.0) for x in (found.states, found.actions)
-        ]
-        return None, torch.from_numpy(slopes[0]), torch.from_numpy(slopes[1]).to(actions.dtype)
+        if not stepped.all():
+            by_state, by_action = (np.where(stepped[:, None], x, 0.0) for x in (by_state, by_action))
+        return None, torch.from_numpy(by_state), torch.from_numpy(by_action).to(ctx.saved_tensors[1].dtype)
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:

@@ -157,7 +157,7 @@ class Model:
     def observe(self, states: ArrayLike, targets: ArrayLike | None = None) -> Array:
         """Return the observations of states, shape (n, n_observations)."""
         states = real_array("states", states)
-        return self._reverse(()).observations(states.T, self._targets(targets, len(states)).T).T
+        return self.reverse().observations(states, self._targets(targets, len(states)))
 
     def vjp(
         self,
@@ -203,32 +203,27 @@ class Model:
         ValueError, StepRefused
             As a step does; ValueError also for a task whose actions are choices, and for unknown parameters.
         """
-        by = check_parameters(self.task.scene, parameters)
-        reverse, scene = self._reverse(by), self.task.scene
+        reverse = self.reverse(check_parameters(self.task.scene, parameters))
         shape = np.shape(actions)
         if ends is None:
             ends, _, _ = self(states, actions, targets)
         states, actions, targets = self._checked(states, actions, targets)
         n, observations = len(states), len(self.task.formulas.observation)
-        seeds = [
+        slopes = reverse.pull(
+            states,
+            actions,
+            targets,
+            ends,
+            ends + _rows("kicks", kicks, ends.shape),
             _rows("by_states", by_states, (n, self._n_state)),
             _rows("by_observations", by_observations, (n, observations)),
-            _rows("by_rewards", by_rewards, (n,)).reshape(1, n),
-        ]
-        y, a, g, z = states.T, actions.T, targets.T, ends.T
-        u = reverse.controls(y, a, g)
-        after = z + _rows("kicks", kicks, ends.shape)
-        own_y, own_z, own_u, own_g, own_p = reverse.after(y, z, u, g, after, *seeds)
-        motion = scene.vjp(states, u.T, self.task.dt, own_z.T, parameters=by)
-        last_y, last_a, last_g, last_p = reverse.before(y, a, g, own_u + motion[1].T)
-        return Gradient(
-            (own_y + last_y).T + motion[0],
-            last_a.T.reshape(shape),
-            (own_g + last_g).T,
-            (own_p + last_p).T + motion[2],
+            _rows("by_rewards", by_rewards, (n,)),
         )
+        slopes[1] = slopes[1].reshape(shape)
+        return Gradient(*slopes)
 
-    def _reverse(self, parameters: tuple[str, ...]) -> Reverse:
+    def reverse(self, parameters: tuple[str, ...] = ()) -> Reverse:
+        """Return the step backwards, with gradients by these parameters too."""
         if parameters not in self._reversed:
             self._reversed[parameters] = Reverse(self.task, parameters)
         return self._reversed[parameters]
@@ -328,11 +323,11 @@ class Model:
 
 
 def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return values of a shape, or one for all, with the rows last; or raise a ValueError."""
+    """Return values of a shape, or one for all; or raise a ValueError."""
     array = real_array(name, values)
     if array.shape not in ((), shape):
         raise ValueError(f"{name} must be one number or have shape {shape}, got {array.shape}")
-    return np.broadcast_to(array, shape).T
+    return np.broadcast_to(array, shape)
 
 
 def _moves(m: int) -> Array:
