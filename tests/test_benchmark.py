@@ -16,7 +16,10 @@ import lag_envs
 from lag_envs import benchmark, cli
 from lag_envs.benchmark import Contestant, Settings
 from lag_envs.benchmark_jacobians import compile_steps
+from lag_envs.benchmark_peak import PRODUCTS
 from lag_envs.scenes import CartPole
+from lag_envs.stepping.compiling import count_operations, record_block
+from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
 
 ID = pivoted_bar.SwingUpFree.id
@@ -448,6 +451,25 @@ def test_threads_are_measured_beside_one(monkeypatch, tmp_path, capsys):
     assert found["ratio"] == benchmark.quartiles(benchmark.ratios(two, one))
     assert "2 threads : 1" in capsys.readouterr().out
     assert benchmark.bench(tiny(tmp_path, sizes=(3,)))["speedups"] == []
+
+
+def test_arithmetic_is_compared_with_what_the_core_can_do(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(benchmark, "PEERS", [])
+    report = benchmark.bench(tiny(tmp_path, sizes=(1, 3)))
+    (found,) = report["arithmetic"]
+    (core,) = [r for r in report["rows"] if r["library"] == benchmark.CORE]
+    assert "ratio" not in core
+    pairs = benchmark.ratios(row(report, ID, num_envs=3)["rates"], core["rates"])
+    assert (found["id"], found["num_envs"]) == (ID, 3)
+    assert found["share"] == pytest.approx(benchmark.quartiles([found["products"] * x for x in pairs]))
+    assert "of the core's peak" in capsys.readouterr().out
+
+
+def test_products_are_counted_with_and_without_a_sum():
+    trace = Trace()
+    a, b, c = trace.inputs("a", "b", "c")
+    lines, _ = record_block(trace, {"out": a * b + c * (a - b)})
+    assert count_operations(lines, PRODUCTS) == 2 and count_operations(lines) == 3
 
 
 def test_keywords_are_measured_beside_the_defaults():

@@ -36,6 +36,7 @@ import lag_envs
 from lag_envs import benchmark_divisions, benchmark_jacobians
 from lag_envs.benchmark_divisions import divisions
 from lag_envs.benchmark_jacobians import jacobians
+from lag_envs.benchmark_peak import NUMBERS, peak, products
 from lag_envs.host import ONE_THREAD, installed, machine
 from lag_envs.own_files import registered
 from lag_envs.progress import progress
@@ -75,6 +76,9 @@ STAGES = (
 ENERGIES, LONGEST = "lag_envs, energies", 6
 #: Whose rows environments with other keywords are, and those that several threads step.
 VARIED, THREADED = "lag_envs, varied", "lag_envs, threads"
+
+#: Whose row is what the core can do.
+CORE = "this core"
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -163,6 +167,7 @@ def contestants(
             rows += [Contestant(VARIED, name, "vector", n, partial(ours, id, n, **given)) for n in sizes]
     for id in ("CartPole-v1", "Pendulum-v1"):
         rows += [Contestant("gymnasium", id, "made", 1, partial(made, id))]
+    rows += [Contestant(CORE, "multiply-adds", "arithmetic", NUMBERS, peak)]
     for library, id, prepare in PEERS:
         rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
     return rows
@@ -407,6 +412,7 @@ def bench(settings: Settings) -> dict[str, Any]:
     report["targets"] = verdicts(results, cold)
     report["chains"] = chains(results)
     report["speedups"] = speedups(rows)
+    report["arithmetic"] = arithmetic(rows)
     if settings.jacobians and complete:
         report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
     if settings.divisions and complete:
@@ -580,6 +586,26 @@ def speedups(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
     ]
 
 
+def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
+    """Return, for our largest batch of each id, its products a step and its share of the core's peak.
+
+    The share has quartiles, over the rounds, of products a second to multiply-adds a second.
+    """
+    limits = next((row.rates for row in rows if row.library == CORE), [])
+    largest = {r.id: r for r in sorted(rows, key=lambda r: r.num_envs) if _is_batch(r)}
+    found = []
+    for id, row in largest.items():
+        count = products(gym.make_vec(id, num_envs=1)._program) if row.rates else None  # type: ignore[attr-defined]
+        if count and (pairs := ratios(row.rates, limits)):
+            share = quartiles([count * pair for pair in pairs])
+            found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})
+    return found
+
+
+def _is_batch(row: Contestant) -> bool:
+    return row.library == "lag_envs" and row.kind == "vector"
+
+
 def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
 
@@ -648,6 +674,9 @@ def table(report: dict[str, Any]) -> list[str]:
     if found := report.get("speedups"):
         names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
         lines += [*columns([names, *map(_compared, found)]), ""]
+    if found := report.get("arithmetic"):
+        titles = ("environment", "envs", "products a step", "of the core's peak", "(quartiles)")
+        lines += [*columns([titles, *map(_share, found)]), ""]
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
@@ -808,6 +837,12 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
 def _compared(row: dict[str, Any]) -> tuple[str, ...]:
     low, middle, high = row["ratio"]
     return row["id"], f"{row['num_envs']:,}", f"{middle:.2f}", f"({low:.2f} - {high:.2f})"
+
+
+def _share(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["share"]
+    numbers = f"{row['num_envs']:,}", f"{row['products']:,}"
+    return row["id"], *numbers, f"{middle:.0%}", f"({low:.0%} - {high:.0%})"
 
 
 def _worst(target: dict[str, Any]) -> str:

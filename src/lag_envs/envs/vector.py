@@ -64,8 +64,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     num_threads : int, optional
-        Number of threads that step the batch; by default see `sharing.default_threads`. The bits do not
-        depend on it.
+        Number of threads that step the batch; by default one for each 4,096 environments and each core, and
+        one in worker processes, see `sharing.default_threads`. The bits do not depend on it.
     show_arrows, show_trail, show_readout
         What pictures show besides, see `LagrangianEnv`.
     show_tiles : int, optional
@@ -148,9 +148,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
         #: The constants, then room for what a step needs; for each thread.
-        self._pars = [np.array(uniform + [0.0] * program.room_of_all)]
+        self._pars = [on_a_line(np.array(uniform + [0.0] * program.room_of_all), len(uniform))]
         blocks = -(-self.num_envs // BLOCK)
-        self._memory = np.zeros(blocks * len(program.kept) * BLOCK)
+        self._memory = on_a_line(np.zeros(blocks * len(program.kept) * BLOCK))
         #: Keys of the seeds, numbers of the episodes, keys of the episodes, and what threads share.
         self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
         #: Number of the step, counted over all episodes, and how many threads find something to do in one.
@@ -276,7 +276,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         # One row per entry is quicker to fill; the transpose is what the caller sees.
         observations = np.empty((len(program.o), n), FLOAT32)
         rewards, terminations, truncations = np.empty(n), np.empty(n, BOOL), np.empty(n, BOOL)
-        self._turn += 1
         turn = self._turn = self._turn + 1
         rest = (actions, observations, rewards, terminations, truncations, n, turn)
         shares = self._get_help(*rest) if self._most_threads > 1 else 1
@@ -514,7 +513,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         shares, kind = min(self.num_threads, self._most_threads), actions.dtype
         if (calls := self._calls.get((shares, kind))) is None:
             while len(self._pars) < shares:
-                self._pars.append(self._pars[0].copy())
+                self._pars.append(on_a_line(self._pars[0], len(self._program.uniform)))
             calls = self._calls[shares, kind] = [
                 (self._memory, self._ids, self._pars[i], actions, *rest, i, shares) for i in range(1, shares)
             ]
@@ -606,6 +605,15 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self.__dict__.update(state)
         sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()
+
+
+def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
+    """Return a copy in which number `first` begins a line of the cache: vectors then lie on one line each."""
+    room = np.empty(len(numbers) + 8)
+    start = (-(room.ctypes.data // 8) - first) % 8
+    copy = room[start : start + len(numbers)]
+    copy[:] = numbers
+    return copy
 
 
 def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
