@@ -12,12 +12,12 @@ import os
 import pickle
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +39,10 @@ from agents.run import (
 from lag_envs import __version__
 from lag_envs.evaluation.rollout import play
 from lag_envs.hyperparams import DISCRETISE
+from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write
+from lag_envs.tasks.base import Task
 from lag_envs.tasks.registration import make_task
 
 #: Where each learner's class is.
@@ -52,7 +54,11 @@ ALGORITHMS = {
     "tqc": ("sb3_contrib", "TQC"),
 }
 #: Learners of our own: the module that trains each, and what tables call it.
-OWN = {"fast_ppo": ("agents.ppo", "fast PPO")}
+OWN = {
+    "fast_ppo": ("agents.ppo", "fast PPO"),
+    "shac": ("agents.shac", "SHAC"),
+    "cloning": ("agents.cloning", "cloning"),
+}
 LEARNERS = (*ALGORITHMS, *OWN)
 #: Episodes of a test while training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
@@ -105,6 +111,36 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
     if "n_timesteps" not in entry:
         raise UserError(f"{file}: the entry for {env_id} lacks n_timesteps")
     return entry
+
+
+class OwnSettings(Strict):
+    """Settings of a learner of our own.
+
+    Attributes
+    ----------
+    learner : str
+        Its name.
+    """
+
+    learner: ClassVar[str]
+
+    @classmethod
+    def of(cls, hyperparameters: Mapping[str, Any]) -> Self:
+        """Return settings by name, or raise a UserError that says which is wrong."""
+        try:
+            return checked(cls, dict(hyperparameters))
+        except ValueError as error:
+            raise UserError(f"settings of {cls.learner}: {error}") from error
+
+
+def trainable(env_id: str) -> Task:
+    """Return the task of an environment in which something can be learnt, or raise a UserError."""
+    task = make_task(env_id)
+    if task.limit == math.inf:
+        raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
+    if not task.formulas.actions:
+        raise UserError(f"{env_id} has no control: there is nothing to learn")
+    return task
 
 
 # --- environments and learner -------------------------------------------------------------------------------
@@ -233,7 +269,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
         Called when the policy was tested and a checkpoint written.
     """
     if run.algo in OWN:
-        import_module(OWN[run.algo][0]).train(run, show=show, tested=tested)
+        _train_own(run, show, tested)
         return
     from stable_baselines3.common.callbacks import BaseCallback
 
@@ -283,6 +319,39 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
         )
         watch.keep()
     finish(run, model)
+
+
+def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
+    """Train with a learner of our own.
+
+    Tests on the way show how it goes. They neither stop the training nor choose what is kept of it.
+    """
+    content = run.load_checkpoint()
+    module = import_module(OWN[run.algo][0])
+    learner = module.Learner(run.env, module.Settings.of(run.hyperparameters), run.seed, run.steps)
+    if content is not None:
+        learner.restore(content["learner"])
+    every = run.steps / TESTS
+
+    def test() -> None:
+        seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
+        mean = float(play(run.env, learner.policy, seeds).mean())
+        run.curve.append((run.trained, round(run.seconds, 3), mean))
+        run.save_checkpoint({"learner": learner.state()})
+        tested(run)
+
+    if not run.curve:
+        test()
+    while learner.trained < run.steps:
+        run.start_clock()
+        learner.iterate()
+        run.stop_clock()
+        run.trained = learner.trained
+        show(run)
+        if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
+            test()
+    learner.policy.save(run.path(MODEL))
+    evaluate(run, learner.policy)
 
 
 def finish(run: Run, model: Any) -> None:

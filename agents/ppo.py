@@ -17,11 +17,10 @@ from __future__ import annotations
 
 import argparse
 import io
-import math
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -34,14 +33,11 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 
 import agents
-from agents import learners
-from agents.run import CHECKPOINT, FIRST_FRESH_SEED, MODEL, Run, UserError, reports_errors
+from agents.learners import OwnSettings, trainable
+from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
 from agents.train import command, follow, here, plan, summarise
 from lag_envs.envs.stagger import stagger
-from lag_envs.evaluation.rollout import play
-from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.store import write
-from lag_envs.tasks.registration import make_task
 
 NAME = "fast_ppo"  #: see `agents.learners.OWN`
 Array = NDArray[np.float32]
@@ -50,8 +46,10 @@ Array = NDArray[np.float32]
 # --- settings -----------------------------------------------------------------------------------------------
 
 
-class Settings(Strict):
+class Settings(OwnSettings):
     """What a training is made with; `lag_envs.hyperparams` has the values."""
+
+    learner = NAME
 
     n_timesteps: float = Field(ge=1, description="steps of all environments together")
     n_envs: int = Field(ge=1, description="environments stepped together")
@@ -79,14 +77,6 @@ class Settings(Strict):
         if (size := self.n_envs * self.n_steps) % self.batch_size:
             raise ValueError(f"batch_size must divide n_envs * n_steps = {size}, got {self.batch_size}")
         return self
-
-    @classmethod
-    def of(cls, hyperparameters: Mapping[str, Any]) -> Settings:
-        """Return settings by name, or raise a UserError that says which is wrong."""
-        try:
-            return checked(cls, dict(hyperparameters))
-        except ValueError as error:
-            raise UserError(f"settings of {NAME}: {error}") from error
 
 
 # --- the policy ---------------------------------------------------------------------------------------------
@@ -243,12 +233,8 @@ class Learner:
         torch.manual_seed(seed)
         self.settings, self.steps, self.trained = settings, steps, 0
         self.rng = np.random.default_rng(seed)
-        task = make_task(env_id)
+        task = trainable(env_id)
         formulas = task.formulas
-        if task.limit == math.inf:
-            raise UserError(f"the episodes of {env_id} have no end; give it a duration to train")
-        if not formulas.actions:
-            raise UserError(f"{env_id} has no control: there is nothing to learn")
         limit = max(1, round(settings.episode_share * task.limit))
         self.envs: Any = gym.make_vec(
             env_id, settings.n_envs, autoreset_mode="SameStep", max_episode_steps=limit
@@ -363,41 +349,6 @@ class Learner:
         self.envs.set_state(state["envs"])
         for name in ("trained", "rng", "observation"):
             setattr(self, name, state[name])
-
-
-# --- a training run -----------------------------------------------------------------------------------------
-
-
-def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
-    """Train a run as far as it has not been trained, and write its result; see `agents.learners.train`.
-
-    Tests on the way show how it goes. They neither stop the training nor choose what is kept of it.
-    """
-    content = run.load_checkpoint()
-    learner = Learner(run.env, Settings.of(run.hyperparameters), run.seed, run.steps)
-    if content is not None:
-        learner.restore(content["learner"])
-    every = run.steps / learners.TESTS
-
-    def test() -> None:
-        seeds = range(learners.FIRST_TEST_SEED, learners.FIRST_TEST_SEED + learners.TEST_EPISODES)
-        mean = float(play(run.env, learner.policy, seeds).mean())
-        run.curve.append((run.trained, round(run.seconds, 3), mean))
-        run.save_checkpoint({"learner": learner.state()})
-        tested(run)
-
-    if not run.curve:
-        test()
-    while learner.trained < run.steps:
-        run.start_clock()
-        learner.iterate()
-        run.stop_clock()
-        run.trained = learner.trained
-        show(run)
-        if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
-            test()
-    learner.policy.save(run.path(MODEL))
-    learners.evaluate(run, learner.policy)
 
 
 # --- the command --------------------------------------------------------------------------------------------

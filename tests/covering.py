@@ -50,7 +50,7 @@ def features(kind: type[Task]) -> frozenset[str]:
 def engine(kind: type[Task]) -> frozenset[str]:
     """Return what decides how a step is printed, whatever its formulas are."""
     form = kind().scene._form
-    return frozenset({f"{form.kind.__name__ if form else 'series'}, {len(kind.imperfections)} imperfections"})
+    return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
 
 def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:

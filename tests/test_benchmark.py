@@ -287,6 +287,7 @@ def test_how_often_steps_are_divided(tmp_path, capsys):
     assert text.splitlines()[2].endswith("| 100 ns |") and ID not in text
 
 
+@pytest.mark.slow
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "LONGEST", 2)
     report = benchmark.bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))

@@ -1,4 +1,4 @@
-"""Hyperparameters of learners: of Stable-Baselines3's in the form of the RL Zoo, and of our own PPO.
+"""Hyperparameters of learners: of Stable-Baselines3's in the form of the RL Zoo, and of our own.
 
 A task says what differs for it (`Task.hyperparameters`). Measured at these steps; see docs/agents.md.
 """
@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 DISCRETISE = "gymnasium.wrappers.DiscretizeAction"
-#: The learner that the Zoo does not know.
-OWN = "fast_ppo"
+#: Learners that the Zoo does not know.
+OWN = ("fast_ppo", "shac", "cloning")
 _OFF_POLICY: Mapping[str, Any] = {
     "n_envs": 4,
     "n_timesteps": 4e4,
@@ -85,7 +85,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     },
     # PPO in one file (agents/ppo.py), whose settings these are. Weights of the first layer are multiplied at
     # the start, for otherwise observations of order one hardly bend its tanh.
-    OWN: {
+    "fast_ppo": {
         "n_timesteps": 4e5,
         "n_envs": 64,
         "n_steps": 96,
@@ -107,6 +107,27 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "critic": [64, 32],
         "first_layer_scale": 2.0,
     },
+    # By gradients through the environment (agents/shac.py). Windows are short: a guard's kinks make gradients of
+    # longer ones useless.
+    "shac": {
+        "n_timesteps": 1e6,
+        "n_envs": 64,
+        "n_steps": 16,
+        "learning_rate": 3e-3,
+        "gamma": 0.99,
+        "max_grad_norm": 1.0,
+        "reward_scale": 0.1,
+        "episode_share": 0.5,
+        "random_starts": 0.0,
+        "start_ranges": {},
+        "actor": [64, 64],
+        "first_layer_scale": 2.0,
+        "critic": [64, 64],
+        "critic_rate": 3e-3,
+        "critic_epochs": 4,
+        "batch_size": 256,
+        "td_lambda": 0.95,
+    },
 }
 
 
@@ -123,11 +144,11 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
     learner : str
         One of `learners`.
     task : Task
-        The task. Where its actions are choices, none are numbered and none explored by gSDE; our own PPO
-        looks after that itself.
+        The task. Where its actions are choices, none are numbered and none explored by gSDE; our own learners
+        look after that themselves.
     """
     found = {**DEFAULTS[learner], **task.hyperparameters.get(learner, {})}
-    if task.formulas.choices and learner != OWN:
+    if task.formulas.choices and learner not in OWN:
         found = {name: value for name, value in found.items() if name not in ("use_sde", "sde_sample_freq")}
         wrappers = [wrapper for wrapper in found.pop("env_wrapper", []) if DISCRETISE not in wrapper]
         found |= {"env_wrapper": wrappers} if wrappers else {}
@@ -136,7 +157,7 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
 
 def as_yaml(learner: str, tasks: Mapping[str, Any]) -> str:
     """Return the hyperparameters of tasks, by id, as a file of the RL Zoo or for ``--config``."""
-    use = "for `python -m agents.train --config`" if learner == OWN else "in the form of the RL Zoo"
+    use = "for `python -m agents.train --config`" if learner in OWN else "in the form of the RL Zoo"
     lines = [f"# {learner.upper()}, {use}."]
     for env_id, task in tasks.items():
         lines.append(f"{env_id}:")

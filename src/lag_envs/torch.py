@@ -427,8 +427,8 @@ def _checked_task(task: Task) -> Task:
         raise ValueError(f"{name} has a list of actions to choose from, by which no step has derivatives")
     if task.imperfections:
         raise ValueError(
-            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there are "
-            "no derivatives; leave these keywords out, or take the id without them"
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there "
+            "are no derivatives; leave these keywords out, or take the id without them"
         )
     return task
 

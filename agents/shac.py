@@ -1,0 +1,312 @@
+"""Short-horizon actor-critic in one file: a policy improved by the exact gradient of what it earns.
+
+The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing need be tried out: an
+iteration lets the policy act for a window of some steps (`Learner.collect`), computes by how much each action
+changes all later rewards of its window (`Learner.gradients`), and moves the policy along (`Learner.update`).
+What comes after the window a critic estimates. The algorithm is that of [1]_. Without a critic, and with
+windows as long as episodes, it is back-propagation through time, also called analytic policy gradients.
+
+PyTorch sees a window as one batch. The derivatives of all its steps are computed at once, for the states are
+known by then; what is left to do backwards is a recursion of small matrices in NumPy.
+
+References
+----------
+.. [1] J. Xu et al., "Accelerated policy learning with parallel differentiable simulation", ICLR 2022.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from torch import nn
+
+from agents.learners import OwnSettings, trainable
+from agents.ppo import Policy, network
+from agents.run import FIRST_FRESH_SEED, UserError
+from lag_envs.torch import Step
+
+NAME = "shac"  #: see `agents.learners.OWN`
+Array = NDArray[np.float64]
+
+
+# --- settings -----------------------------------------------------------------------------------------------
+
+
+class Settings(OwnSettings):
+    """What a training is made with; `lag_envs.hyperparams` has the values."""
+
+    learner = NAME
+
+    n_timesteps: float = Field(ge=1, description="steps of all environments together")
+    n_envs: int = Field(ge=1, description="environments stepped together")
+    n_steps: int = Field(ge=1, description="steps of a window")
+    learning_rate: float = Field(
+        ge=0, description="of the policy at the start; it falls linearly to 0"
+    )
+    gamma: float = Field(ge=0, le=1, description="discount of a step")
+    max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
+    reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
+    episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
+    random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
+    start_ranges: dict[str, NonNegativeFloat] = Field(
+        description="half widths of states about the usual"
+    )
+    actor: list[PositiveInt] = Field(min_length=1, description="widths of the policy's hidden layers")
+    first_layer_scale: float = Field(gt=0, description="factor of the first layers' weights at the start")
+    critic: list[PositiveInt] = Field(description="widths of the critic's hidden layers; empty: no critic")
+    critic_rate: float = Field(ge=0, description="learning rate of the critic")
+    critic_epochs: int = Field(ge=1, description="passes over a window in which the critic learns")
+    batch_size: int = Field(ge=1, description="steps of a minibatch of these")
+    td_lambda: float = Field(ge=0, le=1, description="decay of the weights of later steps in what it learns")
+
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        if self.random_starts and not self.start_ranges:
+            raise ValueError(f"random_starts={self.random_starts:g} needs start_ranges, got none")
+        return self
+
+
+# --- learning -----------------------------------------------------------------------------------------------
+
+
+class Window(NamedTuple):
+    """What n environments did in T steps."""
+
+    observations: NDArray[np.float32]  #: (T, n, n_observations), before each step
+    seen: NDArray[np.float32]  #: (T, n, n_observations), after it
+    before: Array  #: (T, n, n_state)
+    after: Array  #: (T, n, n_state)
+    targets: Array  #: (T, n, n_targets)
+    actions: NDArray[np.float32]  #: (T, n, n_actions), as the policy has them, not clipped
+    rewards: Array  #: (T, n)
+    terminated: NDArray[np.bool_]  #: (T, n)
+    over: NDArray[np.bool_]  #: (T, n)
+
+
+class Learner:
+    """Environments, networks and optimisers.
+
+    Parameters
+    ----------
+    env_id : str
+        Id of the environment.
+    settings : Settings
+        The settings.
+    seed : int
+        Decides everything that is random.
+    steps : int
+        Steps to train for; with them the learning rate is 0.
+
+    Raises
+    ------
+    UserError
+        For an environment without derivatives, and for start ranges of states that it does not have.
+    """
+
+    def __init__(self, env_id: str, settings: Settings, seed: int, steps: int) -> None:
+        torch.set_num_threads(1)  # the networks are too small to share out
+        torch.manual_seed(seed)
+        self.settings, self.steps, self.trained = settings, steps, 0
+        self.rng = np.random.default_rng(seed)
+        self.task = trainable(env_id)
+        try:
+            self.model = Step(self.task).model
+        except ValueError as error:
+            raise UserError(f"{NAME} needs gradients: {error}") from error
+        names = self.task.scene.state_names
+        if unknown := [name for name in settings.start_ranges if name not in names]:
+            raise UserError(f"start_ranges: {env_id} has no state {unknown[0]!r}; it has {', '.join(names)}")
+        self.half_widths = np.array([settings.start_ranges.get(name, 0.0) for name in names])
+        self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="Disabled").unwrapped
+        # Another seed has other episodes from first to last. Where windows are shorter than episodes, first
+        # episodes end one after the other, for a window should see all phases.
+        self.observation, _ = self.envs.reset(seed=1_000_000 * seed % FIRST_FRESH_SEED)
+        self.limit = max(1, round(settings.episode_share * self.task.limit))
+        ages = np.arange(settings.n_envs) * self.limit // settings.n_envs
+        self.left = self.limit - ages * (self.limit > settings.n_steps)
+        self.start(np.ones(settings.n_envs, np.bool_))
+
+        formulas, inputs = self.task.formulas, self.observation.shape[1]
+        self.actor = network([inputs, *settings.actor, formulas.actions], settings.first_layer_scale)
+        self.critic = network([inputs, *settings.critic, 1], settings.first_layer_scale)
+        self.adams = [
+            torch.optim.Adam(self.actor.parameters(), fused=True),
+            torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, fused=True),
+        ]
+        linear = [layer for layer in self.actor if isinstance(layer, nn.Linear)]
+        layers = [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in linear]
+        self.policy = Policy(layers, (), formulas.largest)
+
+    def iterate(self) -> None:
+        """Collect a window and learn from it."""
+        window = self.collect()
+        slopes = self.gradients(window)
+        self.update(window, slopes)
+        if self.settings.critic:
+            self.learn_values(window)
+        self.trained += window.rewards.size
+
+    def start(self, which: NDArray[np.bool_]) -> None:
+        """Begin episodes in some environments, a share of them in random states."""
+        self.observation, _ = self.envs.reset(options={"reset_mask": which})
+        chosen = which & (self.rng.random(len(which)) < self.settings.random_starts)
+        if chosen.any():
+            away = self.half_widths * self.rng.uniform(-1.0, 1.0, (len(which), len(self.half_widths)))
+            state = np.where(self.half_widths > 0.0, self.task.centre + away, self.envs.state)
+            self.observation, _ = self.envs.reset(options={"reset_mask": chosen, "state": state})
+
+    def collect(self) -> Window:
+        """Let the policy act for a window."""
+        steps = []
+        for _ in range(self.settings.n_steps):
+            observation, before = self.observation, self.envs.state
+            target = np.zeros(0) if self.envs.target is None else self.envs.target
+            _, action = self.policy.outputs(observation)
+            seen, reward, terminated, truncated, _ = self.envs.step(action)
+            self.left -= 1
+            over = terminated | truncated | (self.left == 0)
+            states = before, self.envs.state, target.reshape(len(over), -1)
+            steps.append((observation, seen, *states, action, reward, terminated, over))
+            self.observation = seen
+            if over.any():
+                self.left[over] = self.limit
+                self.start(over)
+        return Window(*(np.stack(x) for x in zip(*steps, strict=True)))
+
+    def gradients(self, w: Window) -> Array:
+        """Return the derivatives by each action of the discounted rewards that follow it, (T, n, n_actions).
+
+        They are by actions as the environment takes them, clipped. An episode that is cut goes on in the
+        critic. Backwards in time, the derivatives by x and a, a step's state and action, follow from those by
+        x' and a', the next ones, of which a' depends on o'(x'), what is seen:
+
+            d/d(x, a) = ∂r/∂(x, a) + γ (d/dx' · ∂x'/∂(x, a) + d/da' · ∂a'/∂o' · ∂o'/∂(x, a))
+
+        What is multiplied here is known for all steps beforehand, and computed at once.
+        """
+        (steps, n, wide), many, gamma = w.before.shape, w.actions.shape[2], self.settings.gamma
+        going = ~w.over  # where the next step is one of the window
+        going[-1] = False
+        # A step's results of which derivatives are taken: each entry of the next state, each next action, and
+        # the reward, together with the critic's value where no step follows.
+        kinds = wide + many + 1
+        by_states = np.zeros((kinds, steps, n, wide))
+        by_seen = np.zeros((kinds, *w.seen.shape))
+        by_rewards = np.zeros((kinds, steps, n))
+        by_states[np.arange(wide), :, :, np.arange(wide)] = 1.0
+        inside = np.moveaxis(
+            np.abs(w.actions) <= self.policy.largest, 2, 0
+        )  # else constant
+        by_seen[wide:-1, :-1] = (slopes(self.actor, w.observations) * inside[..., None])[:, 1:]
+        by_rewards[-1] = self.settings.reward_scale
+        if self.settings.critic:
+            cut = ~going & ~w.terminated
+            by_seen[-1, cut] = gamma * slopes(self.critic, w.seen[cut])[0]
+
+        by_both = self.through_step(w, by_states, by_seen, by_rewards)
+        found = np.empty((steps, n, wide + many))
+        later = np.zeros((n, wide + many))
+        for t in reversed(range(steps)):
+            passed = np.einsum("nk,knj->nj", later * going[t][:, None], by_both[:-1, t])
+            later = found[t] = by_both[-1, t] + gamma * passed
+        return found[..., wide:]
+
+    def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:
+        """Return gradients by the steps' results as those by their states and actions.
+
+        Of each step several are given, (kinds, T, n, ...), and returned, (kinds, T, n, n_state + n_actions).
+        """
+        kinds, task = len(by_rewards), self.task
+
+        def rows(x: NDArray) -> Array:
+            """Return all steps' rows, once for each kind."""
+            return np.broadcast_to(x, (kinds, *w.rewards.shape, x.shape[-1])).reshape(-1, x.shape[-1])
+
+        before, after, actions = rows(w.before), rows(w.after), rows(self.clipped(w.actions))
+        targets = rows(w.targets) if task.formulas.targets and task.fixed_target is None else None
+        given = before, one_axis(actions), one_axis(targets)
+        moved = self.model(*given)[0] if task.draws else after  # kicks are constants
+        found = self.model.vjp(
+            *given, by_states=rows(by_states), by_observations=rows(by_seen), by_rewards=by_rewards.ravel(),
+            ends=moved, kicks=after - moved,
+        )  # fmt: skip
+        both = np.concatenate([found.states, found.actions.reshape(actions.shape)], axis=1)
+        return both.reshape(kinds, *w.rewards.shape, -1)
+
+    def clipped(self, actions: NDArray) -> Array:
+        """Return actions as the environment takes them."""
+        return np.clip(actions, -self.policy.largest, self.policy.largest).astype(np.float64)
+
+    def update(self, w: Window, by_actions: Array) -> None:
+        """Move the policy along the gradient.
+
+        What is beyond the largest action it moves back, but never further out.
+        """
+        outwards = (w.actions != self.clipped(w.actions)) & (by_actions * w.actions > 0.0)
+        wanted = np.where(outwards, 0.0, by_actions / w.rewards.size).astype(np.float32)
+        adam = self.adams[0]
+        adam.param_groups[0]["lr"] = self.settings.learning_rate * max(0.0, 1.0 - self.trained / self.steps)
+        adam.zero_grad()
+        self.actor(torch.from_numpy(w.observations)).backward(-torch.from_numpy(wanted))
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.settings.max_grad_norm)
+        adam.step()
+
+    def learn_values(self, w: Window) -> None:
+        """Let the critic learn the discounted rewards that follow what is seen, TD(λ)."""
+        s = self.settings
+        with torch.no_grad():
+            following = self.critic(torch.from_numpy(w.seen)).numpy()[..., 0] * ~w.terminated
+        target = np.empty_like(following)
+        later = following[-1]
+        for t in reversed(range(len(target))):
+            ahead = np.where(
+                w.over[t], following[t], (1.0 - s.td_lambda) * following[t] + s.td_lambda * later
+            )
+            later = target[t] = s.reward_scale * w.rewards[t] + s.gamma * ahead
+        observations, targets = w.observations.reshape(target.size, -1), target.reshape(-1, 1)
+        for _ in range(s.critic_epochs):
+            order = self.rng.permutation(target.size)
+            for first in range(0, target.size, s.batch_size):
+                batch = order[first : first + s.batch_size]
+                off = self.critic(torch.from_numpy(observations[batch])) - torch.from_numpy(targets[batch])
+                self.adams[1].zero_grad()
+                off.square().mean().backward()
+                self.adams[1].step()
+
+    def state(self) -> dict[str, Any]:
+        """Return everything that changes, for a checkpoint."""
+        return {
+            "networks": [net.state_dict() for net in (self.actor, self.critic)],
+            "adams": [adam.state_dict() for adam in self.adams],
+            "trained": self.trained, "rng": self.rng, "left": self.left,
+            "envs": self.envs.get_state(), "observation": self.observation,
+        }  # fmt: skip
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` returned; the same will follow, bit for bit."""
+        for net, values in zip((self.actor, self.critic), state["networks"], strict=True):
+            net.load_state_dict(values)
+        for adam, values in zip(self.adams, state["adams"], strict=True):
+            adam.load_state_dict(values)
+        self.envs.set_state(state["envs"])
+        for name in ("trained", "rng", "left", "observation"):
+            setattr(self, name, state[name])
+
+
+def slopes(network: nn.Module, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the derivatives of a network's outputs by its inputs, (n_outputs, ..., n_inputs)."""
+    inputs = torch.from_numpy(seen).requires_grad_()
+    outputs = network(inputs).unbind(-1)
+    found = [torch.autograd.grad(x.sum(), inputs, retain_graph=True)[0].numpy() for x in outputs]
+    return np.stack(found)
+
+
+def one_axis(rows: Array | None) -> Array | None:
+    """Return single numbers without an axis of their own, as `Model` takes them."""
+    return rows[:, 0] if rows is not None and rows.shape[1] == 1 else rows
