@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -48,6 +49,8 @@ def fit(
     level: float = 0.95,
 ) -> Fit:
     """See `Scene.fit`."""
+    if importlib.util.find_spec("scipy") is None:
+        raise ModuleNotFoundError('to fit needs SciPy: pip install "lag-envs[fit]"', name="scipy")
     try:
         names = check_parameters(scene, free)
     except ValueError as error:
@@ -183,7 +186,7 @@ def _result(
         level=level,
         correlation=known.covariance / np.outer(errors, errors),
         noise={name: sigma for name, sigma, seen in measured if seen},
-        recordings=shooting.recordings,
+        recordings=list(shooting.recordings),
         simulated=simulated,
     )
     texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]
