@@ -119,6 +119,14 @@ def test_several_recordings_angles_within_one_turn_and_controls_of_both_lengths(
     assert [len(x) for x in found.simulated] == [51, 51]
 
 
+def test_few_samples_on_a_finer_grid():
+    states, torques = swings()
+    data = np.full((401, 2), np.nan)
+    data[::4] = noisy(states, [0.02, 0.1], 10)
+    found = Pendulum().fit([(data, np.repeat(torques, 4), DT / 4)], list(ROD))
+    assert agrees(found, ROD) and found.warnings == ()
+
+
 def test_chaos():
     """A change of the start grows a million times within the recording."""
     truth = Chain(bars=2, damping=0.002)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ from lag_envs.scenes.fitting.shooting import Shooting, cut
 
 Array = NDArray[np.float64]
 
-#: Lengths of pieces [steps] by which parameters are sought first, with starts from the smoothed data.
+#: Lengths of pieces [measured samples] by which parameters are sought first, from the smoothed data.
 SHORT = (3, 10)
 #: The most unknowns for starts, unless there are more recordings: the time of a step grows as their square.
 MOST_STARTS = 200
@@ -48,6 +49,8 @@ def fit(
     level: float = 0.95,
 ) -> Fit:
     """See `Scene.fit`."""
+    if importlib.util.find_spec("scipy") is None:
+        raise ModuleNotFoundError('to fit needs SciPy: pip install "lag-envs[fit]"', name="scipy")
     try:
         names = check_parameters(scene, free)
     except ValueError as error:
@@ -140,9 +143,12 @@ class _Sizes:
 def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) -> tuple[Shooting, Array]:
     """Return a problem of short pieces and its solution: first for parameters alone, then for starts too."""
     n, p = len(sizes.noise), len(parameters.names)
-    long = max(SHORT[-1], math.ceil(sum(len(r.states) for r in data) * n / MOST_STARTS))
+    samples = sum(len(r.states) for r in data)
+    spacing = samples // sum(int(r.measured.any(axis=1).sum()) for r in data)
+    short = [spacing * length for length in SHORT]
+    long = max(short[-1], math.ceil(samples * n / MOST_STARTS))
     z = parameters.start
-    for length in sorted({*SHORT, long}):
+    for length in sorted({*short, long}):
         pieces = cut(data, length)
         starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
         shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
@@ -183,7 +189,7 @@ def _result(
         level=level,
         correlation=known.covariance / np.outer(errors, errors),
         noise={name: sigma for name, sigma, seen in measured if seen},
-        recordings=shooting.recordings,
+        recordings=list(shooting.recordings),
         simulated=simulated,
     )
     texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]

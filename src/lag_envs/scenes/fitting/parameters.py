@@ -83,8 +83,8 @@ class FreeParameters:
             ends = [self.scene(scaled + sign * step) for sign in (1.0, -1.0)]
             above, below = ([getattr(end, name) for name in self._followers] for end in ends)
             rows[:, i] = (np.array(above) - below) / (2.0 * step[i])
-        moving = rows.any(axis=1)
-        names = [*self.names, *(name for name, moves in zip(self._followers, moving, strict=True) if moves)]
+        moving = np.flatnonzero(rows.any(axis=1)).tolist()
+        names = [*self.names, *(self._followers[i] for i in moving)]
         return names, np.concatenate([np.diag(self.slopes(scaled)), rows[moving]])
 
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+#: 2π, and what rounding may add to it.
+ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recording:
@@ -102,7 +105,8 @@ def _unwrapped(scene: Scene, states: Array) -> Array:
     for i, entry in enumerate(scene._layout.state):
         seen = np.isfinite(states[:, i])
         angles = states[seen, i]
-        if entry.kind == "place" and entry.unit == "rad" and len(angles) and np.ptp(angles) <= 2.0 * np.pi:
+        angle = entry.kind == "place" and entry.unit == "rad"
+        if angle and len(angles) and np.ptp(angles) <= ONE_TURN:
             states[seen, i] = np.unwrap(angles)
     return states
 
