@@ -34,25 +34,26 @@ EPISODES = 1_000
 # --- what is measured ---------------------------------------------------------------------------------------
 
 
-def arrival(what: str, played: Episodes) -> dict[str, float]:
+def arrival(what: str, played: Episodes) -> dict[str, float | None]:
     """Measure when the board's goal is reached for good, and what is lost by then and afterwards.
 
-    Lost is what a step's reward lacks to 1, the most that it may be. Means are over the episodes in which the
-    goal holds at the end; the others are counted.
+    Lost is what a step's reward lacks to 1. Means are over the episodes in which the goal holds at the end,
+    None where it never does; the others are counted.
     """
     seconds = played.settled()
     well = np.isfinite(seconds)
     before = np.arange(len(played.rewards))[:, None] * played.task.dt < seconds - 1e-9
     lost = 1.0 - played.rewards
-    return {
-        f"{what} after [s]": float(seconds[well].mean()),
-        "lost by then": float(np.where(before, lost, 0.0).sum(axis=0)[well].mean()),
-        "lost afterwards": float(np.where(before, 0.0, lost).sum(axis=0)[well].mean()),
-        "episodes without": float((~well).sum()),
+    sums = {
+        f"{what} after [s]": seconds,
+        "lost by then": np.where(before, lost, 0.0).sum(axis=0),
+        "lost afterwards": np.where(before, 0.0, lost).sum(axis=0),
     }
+    means = {name: float(values[well].mean()) if well.any() else None for name, values in sums.items()}
+    return means | {"episodes without": float((~well).sum())}
 
 
-def measures(played: Episodes) -> dict[str, float]:
+def measures(played: Episodes) -> dict[str, float | None]:
     """Return what is told of episodes: the arrival at the goal, and what the task itself adds."""
     task = played.task
     found = arrival(task.goal.arrival, played) if task.goal and task.goal.arrival else {}
@@ -73,9 +74,9 @@ def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, 
             yield names[found.name], [policy.agent() for _, policy in found.policies]
 
 
-def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float]]]:
+def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
     """Return what is measured of an environment's agents: by agent and measure a number for each policy."""
-    found: dict[str, dict[str, list[float]]] = {}
+    found: dict[str, dict[str, list[float | None]]] = {}
     for name, policies in agents(env_id):
         rows = [measures(record(Rollout(env_id, policy, fresh_seeds(episodes)))) for policy in policies]
         found[name] = {key: [row[key] for row in rows] for key in rows[0]}

@@ -37,9 +37,12 @@ def find(env_id: str, folder: Path | None = None, seeds: Iterable[int] = SEEDS) 
     """Find an environment's plans, and write them where controllers read them, or into a folder.
 
     One is for following from any start, and the one with the best mean over fresh starts is kept. The other
-    is the best to begin from where each episode is planned anew.
+    is the best to begin from where each episode is planned anew. A task that follows another's plans has none
+    of its own.
     """
     task, began = TASKS[env_id](), time.monotonic()
+    if task.plans.of:
+        return
     found = []
     for agent in candidates(env_id, seeds):
         mean, error = mean_and_error(play(env_id, agent, range(FIRST_SEED, FIRST_SEED + EPISODES)))

@@ -184,15 +184,16 @@ def _behaviour(env_id: str) -> list[str]:
         return []
     found = json.loads(BEHAVIOUR.read_text(encoding="utf-8"))
     agents = found["envs"].get(env_id)
-    if not agents:
+    if not agents or not any(agents.values()):
         return []
 
-    def cell(values: Sequence[float]) -> str:
+    def cell(values: Sequence[float | None]) -> str:
+        there = [value for value in values if value is not None]
         ends = (
             f"{value:.3g}" if value >= 1e-3 or value == 0.0 else "< 0.001"
-            for value in (min(values), max(values))
+            for value in ((min(there), max(there)) if there else ())
         )
-        return " to ".join(dict.fromkeys(ends))
+        return " to ".join(dict.fromkeys(ends)) or "never"
 
     head = ["how they act", *next(iter(agents.values()))]
     rows = [

@@ -122,13 +122,16 @@ def measured(
     dict
         The same anew: ``scale`` and ``reference`` as they are, or from this measurement where they are
         missing; ``measured`` by policy ``mean``, standard ``error`` and the ``episodes`` that it played;
-        "reference" is the board's, and "optimum", where it is known, what no policy exceeds.
+        "reference" is the board's, "optimum", where it is known, what no policy exceeds, and "privileged"
+        the reference of a task that is open.
     """
     kept, task = dict(kept or {}), TASKS[env_id]()
     scale, used = kept.get("scale"), kept.get("reference", {}).get("mean")
     known, learners = controllers(task), trained(env_id, runs)
     slow = {name: planned for name, found in known.items() if found.plans} | {"optimal": OPTIMAL}
-    names = ["random", "zero", *([scale["policy"]] if scale else [*task.controllers, *learners])]
+    names = ["random", "zero", *([scale["policy"]] if scale else [])]
+    if not scale or task.open:
+        names += [*task.controllers, *learners]
     if not scale and env_id in played():
         names.append("optimal")
     found: dict[str, Any] = {}
@@ -161,6 +164,10 @@ def measured(
     if task.optimum:
         best = np.concatenate([optima(env_id, FIRST_SEED + k * BATCH, size) for k in range(batches)])
         show("optimum", *mean_and_error(best), len(best), (scale or {}).get("optimum"))
+    if task.open:
+        agent = make_controller(env_id, task.open.controller, **task.open.options)
+        returns = many(env_id, agent, batches, size, **task.open.options)
+        show("privileged", *mean_and_error(returns), len(returns))
     if not scale:
         first = max((name for name in names if name in found), key=lambda name: found[name]["mean"])
         scale = {"random": found["random"]["mean"], "best": found[first]["mean"]}
@@ -181,10 +188,10 @@ def trained(env_id: str, runs: Path) -> dict[str, Entrant]:
     return found
 
 
-def many(env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED) -> Array:
-    """Return a quick policy's returns."""
+def many(env_id: str, agent: Any, batches: int, size: int, first: int = FIRST_SEED, **options: Any) -> Array:
+    """Return a quick policy's returns, in the environment with these keywords."""
     firsts = (first + k * BATCH for k in range(batches))
-    return np.concatenate([play(env_id, agent, range(first, first + size)) for first in firsts])
+    return np.concatenate([play(env_id, agent, range(first, first + size), **options) for first in firsts])
 
 
 def optima(env_id: str, first: int, size: int) -> Array:

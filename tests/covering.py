@@ -22,7 +22,7 @@ from lag_envs.tasks.base import Task
 WORDS_AND_NUMBERS = frozenset(
     "id scene defaults interval steps action start target usable usable_ranges check check_start fastest "
     "edges observe bounds reward reached behaviour controllers reference hyperparameters goal "
-    "value_iteration examples difficulty note quantities".split()
+    "value_iteration examples difficulty note open quantities".split()
 )
 #: What a covering set covers.
 Features = Callable[[type[Task]], frozenset[str]]
@@ -50,7 +50,7 @@ def features(kind: type[Task]) -> frozenset[str]:
 def engine(kind: type[Task]) -> frozenset[str]:
     """Return what decides how a step is printed, whatever its formulas are."""
     form = kind().scene._form
-    return frozenset({f"{form.kind.__name__ if form else 'series'}, {len(kind.imperfections)} imperfections"})
+    return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
 
 def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:

@@ -16,8 +16,11 @@ import lag_envs
 from lag_envs import benchmark, cli
 from lag_envs.benchmark import Contestant, Settings
 from lag_envs.benchmark_jacobians import compile_steps
+from lag_envs.benchmark_peak import PRODUCTS
 from lag_envs.scenes import CartPole
-from lag_envs.tasks import TASKS, incline, pivoted_bar
+from lag_envs.stepping.compiling import count_operations, record_block
+from lag_envs.stepping.tracing import Trace
+from lag_envs.tasks import TASKS, chain, incline, pivoted_bar
 
 ID = pivoted_bar.SwingUpFree.id
 
@@ -106,6 +109,8 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--output", "no/such/folder.json"], "there is no folder"),
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
+        (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),
+        (["bench", "--threads", "10000"], "--threads 10000 needs as many cores, and this process may use"),
         (["bench", "--checkout", "nowhere"], "nowhere/README.md is not there"),
         (["fly"], "invalid choice: 'fly'"),
     ],
@@ -275,6 +280,20 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     assert steps == pytest.approx(sum(ends), rel=1e-14)
 
 
+@pytest.mark.slow
+def test_how_often_steps_are_divided(tmp_path, capsys):
+    ids = (ID, chain.SwingUp.id, pivoted_bar.SwingUpUnknown.id)
+    report = benchmark.bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, divisions=True, ids=ids))
+    one, two = report["divisions"]  # nothing of the imperfect one
+    assert (one["id"], one["mean"], one["most"], one["divided"]) == (ID, 1.0, 1, 0.0)
+    assert two["most"] > 5 and 1.5 < two["mean"] < two["most"] and 0.5 < two["divided"] < 1.0
+    assert two["fastest"] > 20.0
+    assert "series a step" in capsys.readouterr().out
+    text = benchmark.benchmark_divisions.markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
+    assert text.splitlines()[2].endswith("| 100 ns |") and ID not in text
+
+
+@pytest.mark.slow
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "LONGEST", 2)
     report = benchmark.bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))
@@ -418,6 +437,39 @@ def test_episodes_are_spread_out():
     ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
     assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
     assert max(map(sum, ended)) == 1
+
+
+def test_threads_are_measured_beside_one(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(benchmark, "PEERS", [])
+    report = benchmark.bench(tiny(tmp_path, sizes=(3,), threads=2))
+    (found,) = report["speedups"]
+    one, two = (
+        next(r["rates"] for r in report["rows"] if r["library"] == library and r["kind"] == "vector")
+        for library in ("lag_envs", benchmark.THREADED)
+    )
+    assert (found["id"], found["num_envs"]) == (ID, 3)
+    assert found["ratio"] == benchmark.quartiles(benchmark.ratios(two, one))
+    assert "2 threads : 1" in capsys.readouterr().out
+    assert benchmark.bench(tiny(tmp_path, sizes=(3,)))["speedups"] == []
+
+
+def test_arithmetic_is_compared_with_what_the_core_can_do(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(benchmark, "PEERS", [])
+    report = benchmark.bench(tiny(tmp_path, sizes=(1, 3)))
+    (found,) = report["arithmetic"]
+    (core,) = [r for r in report["rows"] if r["library"] == benchmark.CORE]
+    assert "ratio" not in core
+    pairs = benchmark.ratios(row(report, ID, num_envs=3)["rates"], core["rates"])
+    assert (found["id"], found["num_envs"]) == (ID, 3)
+    assert found["share"] == pytest.approx(benchmark.quartiles([found["products"] * x for x in pairs]))
+    assert "of the core's peak" in capsys.readouterr().out
+
+
+def test_products_are_counted_with_and_without_a_sum():
+    trace = Trace()
+    a, b, c = trace.inputs("a", "b", "c")
+    lines, _ = record_block(trace, {"out": a * b + c * (a - b)})
+    assert count_operations(lines, PRODUCTS) == 2 and count_operations(lines) == 3
 
 
 def test_keywords_are_measured_beside_the_defaults():

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from lag_envs.controllers import Constant
-from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition, Sensor, conditions, disturbances, often
+from lag_envs.evaluation.conditions import (
+    NOMINAL,
+    OFTEN,
+    Condition,
+    Sensor,
+    conditions,
+    disturbances,
+    imperfections,
+    often,
+    on_board,
+)
 from lag_envs.tasks import TASKS
 
 
@@ -22,6 +32,28 @@ def test_conditions_make_environments(env_id):
     scene = TASKS[env_id]().scene
     numbers = [name for name in scene._numbers() if 0.0 < getattr(scene, name) < math.inf]
     assert disturbed == [f"{name} {sign}20 %" for name in numbers for sign in "-+"] and len(numbers) >= 3
+
+
+@pytest.mark.parametrize("env_id", TASKS)
+def test_imperfections_are_possible_and_new(env_id):
+    task, names = TASKS[env_id], set()
+    for condition in imperfections(env_id):
+        (keyword,) = condition.options
+        assert keyword not in task.imperfections
+        made = task(**condition.options)
+        assert made.imperfections != task().imperfections
+        assert not made.imperfections.drawn or made.drawn  # all corners of the ranges are tasks
+        names.add(keyword)
+    assert names | set(task.imperfections) >= {"observation_noise", "action_delay", "lag", "randomize"}
+    assert ("push" in names) == bool(task.examples.reach) or "push" in task.imperfections
+
+
+def test_boards_that_began_without_imperfections_stay_without():
+    first = [env_id for env_id in TASKS if (goal := TASKS[env_id].goal) and goal.rules == 1]
+    assert first[0] == "PivotedBar-v0" and len(first) == 8
+    for env_id in TASKS:
+        more = [] if env_id in first else imperfections(env_id)
+        assert TASKS[env_id].goal is None or on_board(env_id) == disturbances(env_id) + more
 
 
 def test_who_plans_for_one_interval_keeps_it():

@@ -81,7 +81,7 @@ def test_plan_reaches(env_id, name):
         slow(INCLINE, "PD", 175.0, {"control": "tilt"}),
         slow(BAR, "energy shaping + LQR", 400.0, {"com_distance": 0.2, "track": math.inf}),
         (BRAKE, "switching line", -2.0, {"tilt": 0.2, "dt": 0.01}),
-        (SHELL, "LQR", 195.0, {"damping": 0.3, "dt": 0.02}),
+        slow(SHELL, "LQR", 195.0, {"damping": 0.3, "dt": 0.02}),
         (DAMPING, "switching line", 320.0, {"mass": 1.3}),
     ],
 )

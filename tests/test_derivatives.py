@@ -2,6 +2,7 @@
 
 import math
 import zlib
+from types import SimpleNamespace
 
 import mpmath
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from covering import covering
 from test_jacobian import exact_step
 
+from lag_envs.envs.model import Model
 from lag_envs.scenes import Acrobot, CartPole, Incline, PivotedBar, Scene, parameter
 from lag_envs.tasks import TASKS
 
@@ -130,3 +132,134 @@ def test_vjp_is_the_jacobian_transposed(env_id):
         expected = np.einsum("...i,...ij->...j", seeds, matrix)
         size = np.einsum("...i,...ij->...j", np.abs(seeds), np.abs(matrix))
         np.testing.assert_array_less(np.abs(x - expected), 1e-12 * size + 1e-15)
+
+
+# --- whole steps --------------------------------------------------------------------------------------------
+
+#: Tasks whose actions are ranges.
+SMOOTH = [env_id for env_id, kind in TASKS.items() if not kind().formulas.choices]
+
+
+class Exactly:
+    """Functions of formulas on mpmath's numbers."""
+
+    pi = math.pi
+    where = staticmethod(lambda condition, a, b: a if condition else b)
+    minimum, maximum, abs = min, max, abs
+
+    def __getattr__(self, name):
+        return getattr(mpmath, name)
+
+
+def exact_results(task, state, action, target, parameters):
+    """Return state, observation and reward after a step, in mpmath's arithmetic."""
+    xp, f, scene = Exactly(), task.formulas, task.scene
+    constants = f.constants() | {f"self_{name}": value for name, value in parameters.items()}
+    k = SimpleNamespace(**{name: mpmath.mpf(value) for name, value in constants.items()})
+    angle = None if scene._form is None else scene._form.angle
+
+    def lifted(y):
+        return [*y] if angle is None else [*y, mpmath.cos(y[angle]), mpmath.sin(y[angle])]
+
+    top = f.largest
+    u = f.control(xp, [min(max(a, -top), top) for a in action], lifted(state), target, k)
+    end = list(exact_step(scene, state, u, task.dt, parameters))
+    reward, ended = f.outcome(xp, lifted(state), lifted(end), u, target, k)
+    if ended and f.has_last:
+        reward = f.last(xp, lifted(state), lifted(end), u, target, k)
+    return [*end, *f.observe(xp, lifted(end), target, k), reward]
+
+
+def starts(task, rng, n):
+    """Return states of episodes, the last ones at the edge of where guards act, and actions."""
+    model = Model(task)
+    centre = np.array([task.formulas.starts[name][0] for name in task.scene.state_names])
+    states = np.tile(centre, (n, 1)) + 0.2 * rng.uniform(-1.0, 1.0, (n, len(centre)))
+    given = {"targets": rng.uniform(-0.1, 0.1, (n, task.formulas.targets))} if task.formulas.targets else {}
+    if task.fixed_target is not None:
+        given = {}
+    if given and task.formulas.targets == 1:
+        given["targets"] = given["targets"][:, 0]
+    actions = rng.uniform(-1.0, 1.0, (n, task.formulas.actions)) * task.formulas.largest
+    for i in range(n):  # one way all the time, for longer and longer
+        for _ in range(12 * i):
+            row = {name: values[i : i + 1] for name, values in given.items()}
+            push = np.sign(actions[i : i + 1]) * task.formulas.largest
+            after, _, ended = model(states[i : i + 1], push if push.shape[1] > 1 else push[:, 0], **row)
+            if ended[0]:
+                break
+            states[i] = after[0]
+    # A guard leads exactly to where it begins to act: there two derivatives meet.
+    return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
+
+
+@pytest.mark.parametrize("env_id", covering(SMOOTH))
+def test_whole_step(env_id):
+    """Along a random direction of state, actions and parameters, at starts and where guards and clips act."""
+    task, rng, n = TASKS[env_id](), seeded(env_id), 3
+    scene, names = task.scene, finite(task.scene)
+    model, states, actions, given = starts(task, rng, n)
+    width = len(scene.state_names)
+    many = (states, actions if actions.shape[1] > 1 else actions[:, 0])
+    seeds = rng.uniform(-1.0, 1.0, (n, width + len(task.formulas.observation) + 1))
+    found = model.vjp(
+        *many,
+        **given,
+        by_states=seeds[:, :width],
+        by_observations=seeds[:, width:-1],
+        by_rewards=seeds[:, -1],
+        parameters=names,
+    )
+    for i in range(n):
+        slopes = np.concatenate([found.states[i], np.atleast_1d(found.actions[i]), found.parameters[i]])
+        direction = rng.uniform(-1.0, 1.0, len(slopes))
+        target = np.zeros(0) if task.fixed_target is None else np.atleast_1d(task.fixed_target)
+        target = np.atleast_1d(given["targets"][i]) if given else target
+        with mpmath.workdps(40):
+            h, ends = mpmath.mpf(10) ** -12, []
+            values = [*states[i], *actions[i], *(getattr(scene, name) for name in names)]
+            for side in (h, -h):
+                x = [mpmath.mpf(v) + side * mpmath.mpf(d) for v, d in zip(values, direction, strict=True)]
+                y, a = x[:width], x[width : width + actions.shape[1]]
+                p = dict(zip(names, x[width + len(a) :], strict=True))
+                results = exact_results(task, y, a, [mpmath.mpf(g) for g in target], p)
+                ends.append(sum(mpmath.mpf(s) * r for s, r in zip(seeds[i], results, strict=True)))
+            expected = float((ends[0] - ends[1]) / (2 * h))
+        assert abs(slopes @ direction - expected) <= 1e-10 * max(1.0, np.abs(slopes * direction).sum())
+
+
+def test_what_is_clipped_has_no_gradient():
+    model = Model(TASKS["PivotedBar-v0"]())
+    states, actions = [[0.0, 0.0, 3.0, 0.0]] * 4, [-1.5, -0.99, 0.99, 1.5]
+    found = model.vjp(states, actions, by_states=[[0.0, 1.0, 0.0, 1.0]] * 4)
+    np.testing.assert_array_equal(found.actions[[0, 3]], 0.0)
+    assert (np.abs(found.actions[[1, 2]]) > 0.1).all()
+
+
+def test_kicks_are_constants():
+    task = TASKS["PivotedBarBalance-v0"]()
+    model, states, actions, _ = starts(task, seeded("kicks"), 2)
+    ends, _, _ = model(states, actions[:, 0])
+    seeds = np.ones((2, len(task.formulas.observation)))
+    kicks = np.array([[0.0, 0.0, 0.3, 0.0], [0.0, 0.0, 0.0, 0.7]])
+    found = model.vjp(states, actions[:, 0], by_observations=seeds, ends=ends, kicks=kicks)
+    # The observation of the kicked state, moved with the state before the kick.
+    h = 1e-6
+    for j in range(4):
+        sides = states + h * np.eye(4)[j], states - h * np.eye(4)[j]
+        above, below = (model.observe(model(side, actions[:, 0])[0] + kicks) for side in sides)
+        np.testing.assert_allclose(found.states[:, j], (above - below).sum(axis=1) / (2 * h), atol=1e-7)
+
+
+def test_choices_have_no_gradient():
+    task = TASKS["CartPoleExact-v0"]()
+    with pytest.raises(ValueError, match="list of actions to choose from"):
+        Model(task).vjp([[0.0] * 4], [1])
+
+
+def test_shapes_of_gradients():
+    model, bar = Model(TASKS["PivotedBar-v0"]()), PivotedBar()
+    with pytest.raises(ValueError, match=r"by_states must be one number or have shape \(2, 4\), got \(4,\)"):
+        model.vjp(np.zeros((2, 4)), [0.0, 0.0], by_states=np.ones(4))
+    with pytest.raises(ValueError, match=r"cotangent must have the shape .* \(2, 4\), got \(4,\)"):
+        bar.vjp(np.zeros((2, 4)), 0.0, 0.02, np.ones(4))

@@ -23,6 +23,7 @@ LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "vide
 NAMED = {"canonical", "next", "prev", "alternate"}
 
 pytestmark = [
+    pytest.mark.slow,  # it builds the whole site
     pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM"),
     # MkDocs and its plugins are others' code.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),

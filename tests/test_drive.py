@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import serious, until
-from covering import PERFECT, covering
+from covering import PERFECT, covering, quick
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -124,7 +124,7 @@ def test_so_it_has_on_users_tasks(browsing, bare, kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("id", sorted(PERFECT))
+@pytest.mark.parametrize("id", quick(PERFECT))
 def test_all_bits_in_a_hundred_episodes(browsing, alone, id):
     task = TASKS[id]()
     page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())

@@ -19,17 +19,18 @@ IDS = dict.fromkeys(name.partition("/")[0] for name in RUNS)
 
 
 def each(ids):
-    """Return the runs of some ids as parameters; quick are those of a covering set, and one of every id."""
-    chosen = quick(ids)
-    runs = {name: name.partition("/")[::2] for name in RUNS}
-    return pytest.mark.parametrize(
-        "name",
-        [
-            pytest.param(name, marks=() if env_id in chosen or kind == "defaults" else pytest.mark.slow)
-            for name, (env_id, kind) in runs.items()
-            if env_id in ids
-        ],
-    )
+    """Return the runs of some ids as parameters.
+
+    Quick are single environments of a covering set, and one run of every id; a batch has the bits of single
+    ones (test_vector.py), and programs of its own to compile.
+    """
+    chosen, found = quick(ids), []
+    for name, run in RUNS.items():
+        env_id, _, kind = name.partition("/")
+        if env_id in ids:
+            fast = kind == "defaults" or (env_id in chosen and not run.mode)
+            found.append(pytest.param(name, marks=() if fast else pytest.mark.slow))
+    return pytest.mark.parametrize("name", found)
 
 
 each_run = each(IDS)

@@ -79,6 +79,7 @@ def test_optional_packages_are_not_loaded(script, allowed, tmp_path):
     assert set(loaded) <= allowed
 
 
+@pytest.mark.slow
 def test_core_alone_can_be_installed_and_stepped(tmp_path):
     home = tmp_path / "venv"
     venv.create(home)  # without pip, which takes seconds to install: ours installs from outside

@@ -72,6 +72,7 @@ def test_simulate_is_step():
     assert np.shape(controls) == (5, 2)
 
 
+@pytest.mark.slow
 def test_numbers_of_a_batch_may_differ_zero_among_them():
     drags = [0.0, 0.3, 2.0]
     native = gym.make_vec("OwnCrane-v0", num_envs=3, rope_drag=drags, load_mass=[0.5, 1.0, 2.0])

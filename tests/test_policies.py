@@ -29,6 +29,7 @@ ABOUT = {"name": "An agent", "authors": ["A. Nobody"], "license": "MIT"}
 TRAINING = {"env_steps": 1000, "seconds": 2.5, "hardware": "abacus"}
 NET = {"architecture": "mlp", "hidden": [3], "squash": "clip"}
 PLAN = {"architecture": "plan"}
+AHEAD = {"architecture": "mpc", "horizon": 25, "guesses": 4, "budget": 2_000}
 UNIT = {"architecture": "gru", "memory": 5, "squash": "tanh"}
 
 
@@ -105,7 +106,7 @@ def submission(folder, env, policy, **changed):
 
 def seen(env, n, steps=6):
     """Return observations of random actions, shape (steps, n, n_observation)."""
-    envs = gym.make_vec(env, n)
+    envs = gym.make_vec(env, n, vectorization_mode="sync")  # single ones are quicker to compile
     envs.action_space.seed(3)
     first, _ = envs.reset(seed=5)
     return np.array([first, *(envs.step(envs.action_space.sample())[0] for _ in range(steps - 1))])
@@ -219,7 +220,7 @@ def test_a_plan_does_what_the_controller_of_such_numbers_does(tmp_path):
 def test_listed_actions_go_through_the_board(env, tmp_path):
     """They are verified, replayed, and compared: one choice differs from another, however near."""
     policy = {"architecture": "mlp", "hidden": [4]}
-    made = submission(tmp_path / "a", env, policy)
+    made = submission(tmp_path / "a", env, policy, arrays=None)
     result = verify(made, "nonce", 3)
     assert result["often"] and len(result["policies"][0]["returns"]) == 3
     told, episodes = replay(made, result, 1, [2])
@@ -258,6 +259,15 @@ def test_one_who_remembers_acts_at_one_interval(tmp_path):
     assert not often(few["env"]).suits(agent(few["env"], UNIT), plans=False)
 
 
+def test_one_who_plans_ahead_is_the_same_again(tmp_path):
+    env = pivoted_bar.Balance.id
+    policy = AHEAD | {"every": 5, "weights": {"theta": 100.0, "s": 10.0}, "rest": {"theta": math.pi}}
+    made = submission(tmp_path / "a", env, policy, arrays=None)
+    assert made.kind == "controller" and made.architecture.plans and made.architecture.schema == 2
+    returns = [play(env, made.policies[0][1].agent(), range(4), duration=2.0) for _ in range(2)]
+    assert (returns[0] == returns[1]).all() and returns[0].mean() > 80.0  # of 100
+
+
 # --- hostile ------------------------------------------------------------------------------------------------
 
 
@@ -284,10 +294,17 @@ def test_one_who_remembers_acts_at_one_interval(tmp_path):
         (LISTED, NET, "squash means nothing where actions are listed"),
         (LISTED, {"architecture": "mlp", "hidden": [], "bins": 3}, "bins means nothing where actions"),
         (LISTED, {"architecture": "plan"}, "plans are for actions in a range"),
+        (LISTED, AHEAD, "planning ahead is for tasks with one action, in a range"),
+        (RANGES, AHEAD, "planning ahead is for tasks with one action"),
+        (incline.Tilt.id, AHEAD | {"horizon": 251}, "horizon: Input should be less"),
+        (incline.Tilt.id, AHEAD | {"budget": 10**7}, "budget: Input should be less"),
+        (incline.Tilt.id, AHEAD | {"weights": {"x": -1.0}}, "weights.x: Input should be greater"),
+        (incline.Tilt.id, AHEAD | {"rest": {"depth": 1.0}}, "rest must name entries of the state, x, "),
+        (incline.Tilt.id, AHEAD | {"horizon": 250, "iterations": 20}, "at most 10000 are allowed; plan less"),
         (LISTED, {"architecture": "table", "kind": "action", "axes": ["s"]}, 'kind must be "value"'),
         (LISTED, {"architecture": "table", "kind": "value", "axes": ["s"], "actions": 5}, "without actions"),
         (LISTS, {"architecture": "table", "kind": "value", "axes": ["theta_1"]}, "tasks with one control"),
-        (RANGES, {"architecture": "lstm"}, "architecture must be one of controller, gru, linear, mlp, plan"),
+        (RANGES, {"architecture": "lstm"}, "must be one of controller, gru, linear, mlp, mpc, plan"),
     ],
 )  # fmt: skip
 def test_tables_with_something_wrong(env, policy, reason):

@@ -10,6 +10,7 @@ import pytest
 from lag_envs import scenes
 from lag_envs.controllers import build, controllers
 from lag_envs.hyperparams import DEFAULTS, learners
+from lag_envs.scores import share_of_privileged
 from lag_envs.tasks import TASKS, find
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
@@ -92,6 +93,19 @@ def test_records_are_whole(env_id):
         assert all(low < high for low, high in found.tune.values())
 
 
+@pytest.mark.parametrize("env_id", [env_id for env_id, task in TASKS.items() if task.open])
+def test_what_is_open_is_far_from_solved(env_id):
+    task = TASKS[env_id]
+    assert task.open.controller in task.controllers
+    assert len(task.open.tried) >= 3 and set(task.controllers) <= set(task.open.tried)
+    share = share_of_privileged(env_id)
+    assert share is None or 0.0 < share <= 0.8
+
+
+def test_there_is_a_task_that_nobody_has_solved():
+    assert any(task.open for task in TASKS.values())
+
+
 @pytest.mark.slow
 @each_task
 def test_nothing_lacks(env_id):
@@ -120,6 +134,7 @@ def test_what_was_measured_is_there(env_id):
     assert {"random", "zero", found["scale"]["policy"]} <= set(found["measured"])
     assert ("reference" in found) == bool(TASKS[env_id].reference)
     assert ("optimum" in found["scale"]) == ("optimum" in found["measured"]) == bool(TASKS[env_id].optimum)
+    assert ("privileged" in found["measured"]) == bool(TASKS[env_id].open)
     plans = {name for name, controller in TASKS[env_id].controllers.items() if controller.plans}
     for name, row in found["measured"].items():
         assert row["episodes"] >= (20 if name in plans else 1000) and row["error"] >= 0.0

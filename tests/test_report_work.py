@@ -46,7 +46,11 @@ def worst(rival, name, together, steps=1, count=6):
     return max(t.error(end) for t, end in zip(some, sample.end(), strict=True))
 
 
-@pytest.mark.parametrize("method", SERIES, ids=lambda method: method.method)
+@pytest.mark.parametrize(
+    "method",
+    [*SERIES[:2], *(pytest.param(method, marks=pytest.mark.slow) for method in SERIES[2:])],
+    ids=lambda method: method.method,
+)
 def test_order_of_convergence(method):
     """The error of one step of length h grows like h^(order + 1), however cosine and sine are come by."""
     assert work_precision.measured_order(method, single_steps()) == pytest.approx(method.order, abs=0.2)

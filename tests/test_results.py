@@ -304,6 +304,33 @@ def test_committed_results_of_learners_come_out_again(env_id):
         assert_reproduced(env_id, name, policies)
 
 
+def test_fewer_episodes_where_something_is_changed(tmp_path):
+    evaluation = measure.Evaluation(pivoted_bar.SwingUpFree.id, tmp_path)
+
+    def counts(*numbers):
+        found = {job.entrant.plans: set() for job in evaluation.jobs(["zero", "iLQR"], *numbers)}
+        for job in evaluation.jobs(["zero", "iLQR"], *numbers):
+            found[job.entrant.plans].add((job.condition.name == NOMINAL, job.episodes))
+        return found[False], found[True]
+
+    assert counts(1000) == ({(True, 1000), (False, 1000)}, {(True, 1000), (False, measure.PLANNED)})
+    assert counts(1000, 50) == ({(True, 1000), (False, 50)},) * 2
+
+
+def test_fewer_episodes_are_told():
+    def agent(nominal, late):
+        return {"conditions": {NOMINAL: {"episodes": nominal}, "late": {"episodes": late}}}
+
+    envs = {
+        "A": {"agents": {"slow": agent(9, 2), "quick": agent(9, 9)}},
+        "B": {"agents": {"slow": agent(9, 3), "quick": agent(9, 3)}},
+        "C": {"agents": {"quick": agent(9, 9)}},
+    }
+    (line,) = report._fewer({"envs": envs})
+    assert "conditions slow in 2 episodes only, all of B in 3 episodes only. Returns" in line
+    assert report._fewer({"envs": {"C": envs["C"]}}) == []
+
+
 def test_how_agents_act_is_what_is_committed():
     """One learner and one controller of it, played anew."""
     kept = json.loads(behaviour.OUTPUT.read_text())

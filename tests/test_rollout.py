@@ -14,13 +14,16 @@ ENV = incline.Brake.id
 
 @pytest.mark.parametrize("env_id", covering())
 def test_together_as_one_by_one(env_id):
-    """Also where episodes end at different times, and seeds are anyhow."""
-    seeds = [5, 99, 7]
+    """Also where episodes end at different times, and seeds are anyhow.
+
+    Agents round differently for one and for many, which an unstable motion multiplies: so for 200 steps only.
+    """
+    seeds, short = [5, 99, 7], {"duration": 200 * TASKS[env_id].interval}
     for name, found in controllers(TASKS[env_id]).items():
         if not found.plans and name != "random":  # which draws for all together
             agent = make_controller(env_id, name)
-            together = play(env_id, agent, seeds)
-            np.testing.assert_allclose(one_by_one(env_id, agent, seeds), together, rtol=1e-12)
+            together = play(env_id, agent, seeds, **short)
+            np.testing.assert_allclose(one_by_one(env_id, agent, seeds, **short), together, rtol=1e-12)
 
 
 def test_agents_with_a_clock_are_told_its_pace():

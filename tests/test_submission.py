@@ -559,7 +559,7 @@ def test_controller_with_something_wrong(tmp_path, policy, reason):
 def test_controller_with_arrays(tmp_path):
     built_in(tmp_path / "a")
     (tmp_path / "a" / "policy_0.safetensors").write_bytes(save(LINEAR))
-    refused(tmp_path / "a", "a built-in controller has no arrays")
+    refused(tmp_path / "a", "such a policy has no arrays")
 
 
 def test_kind_follows_from_the_architecture(tmp_path):

@@ -244,6 +244,7 @@ def test_seeds_side_by_side(command, config, tmp_path):
     assert status == 2 and "result.json cannot be read" in output
 
 
+@pytest.mark.slow
 def test_killed_and_interrupted_runs_go_on(config, tmp_path):
     output = kill_and_interrupt(
         "agents.train", ENV, "--steps", "30000", "--config", str(config), "--jobs", "1",
@@ -397,7 +398,8 @@ def beside_the_example(monkeypatch):
         pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
         # It chooses among three actions.
         pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),
-        (f"{SEVERAL}:Deliver", "OwnCrane-v0"),  # two controls, two targets
+        # It has two controls and two targets. Quick is the training in test_add_task.py.
+        pytest.param(f"{SEVERAL}:Deliver", "OwnCrane-v0", marks=pytest.mark.slow),
     ],
 )
 def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_example, tmp_path):

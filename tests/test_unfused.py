@@ -34,7 +34,11 @@ def test_unfused_is_the_environments_step_to_rounding(id):
     check_against_fused(gym.make(id).unwrapped, range(2))
 
 
-@pytest.mark.parametrize("task", OWN, ids=lambda task: task.__name__)
+@pytest.mark.parametrize(
+    "task",
+    [OWN[0], *(pytest.param(task, marks=pytest.mark.slow) for task in OWN[1:])],
+    ids=lambda task: task.__name__,
+)
 def test_users_tasks_too(task):
     check_against_fused(made(task), range(2))
 
@@ -83,7 +87,9 @@ def check_against_fused(env, seeds):
         assert np.max(error / condition) <= 1e-15
 
 
-@pytest.mark.parametrize("task", [*OWN, Six], ids=lambda task: task.__name__)
+@pytest.mark.parametrize(
+    "task", [*OWN, pytest.param(Six, marks=pytest.mark.slow)], ids=lambda task: task.__name__
+)
 def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     outer = made(task)
     scene = outer.scene

@@ -41,7 +41,7 @@ def kill_and_interrupt(*arguments):
             if " steps, " in line and ":         0 steps" not in line:
                 break
         process.send_signal(number)
-        output = process.communicate(timeout=60)[0]
+        output = process.communicate(timeout=300)[0]
     assert process.returncode == 130, output
     assert "To go on:" in output
     return output

@@ -3,7 +3,7 @@
 All contestants are measured in one process on one core, in turn, round after round, and compared within each
 round, so that a slow spell of the machine falls on all of them. A sample is a loop over actions made
 beforehand; it holds all that a step does: dynamics, observation, reward, endings, kicks, and the resets that
-follow.
+follow. Where batches are measured that several threads step, the process has a core for each of them.
 """
 
 from __future__ import annotations
@@ -33,8 +33,10 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 import lag_envs
-from lag_envs import benchmark_jacobians
+from lag_envs import benchmark_divisions, benchmark_jacobians
+from lag_envs.benchmark_divisions import divisions
 from lag_envs.benchmark_jacobians import jacobians
+from lag_envs.benchmark_peak import NUMBERS, peak, products
 from lag_envs.host import ONE_THREAD, installed, machine
 from lag_envs.own_files import registered
 from lag_envs.progress import progress
@@ -72,8 +74,11 @@ STAGES = (
 
 #: Whose rows scenes of energies are, and how many bars the longest chain has.
 ENERGIES, LONGEST = "lag_envs, energies", 6
-#: Whose rows environments with other keywords are.
-VARIED = "lag_envs, varied"
+#: Whose rows environments with other keywords are, and those that several threads step.
+VARIED, THREADED = "lag_envs, varied", "lag_envs, threads"
+
+#: Whose row is what the core can do.
+CORE = "this core"
 
 #: Takes at least that many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
@@ -112,7 +117,9 @@ class Settings:
     keywords: tuple[str, ...] = ()  #: each as a call takes them: measured beside the defaults
     energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
     jacobians: bool = False  #: what derivatives of a step cost beside it
+    divisions: bool = False  #: how often the certificate divides steps
     sizes: tuple[int, ...] = SIZES
+    threads: int = 1  #: where more, batches that they step are measured too
     rounds: int = 31
     seconds: float = 0.05  #: aimed length of one sample
     clock: str = "wall"  #: or "cpu", which leaves out what other programs take of the core
@@ -142,19 +149,25 @@ class Contestant:
 # --- the contestants ---
 
 
-def contestants(ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = ()) -> list[Contestant]:
-    """Return ours, with other keywords too, and the peers."""
+def contestants(
+    ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = (), threads: int = 1
+) -> list[Contestant]:
+    """Return ours, with other keywords and several threads too, and the peers."""
     rows = []
     for id in ids:
         rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
         rows += [Contestant("lag_envs", id, "unwrapped", 1, partial(unwrapped, id))]
         rows += [Contestant("lag_envs", id, "vector", n, partial(ours, id, n)) for n in sizes]
+        if threads > 1:
+            shared = partial(ours, id, num_threads=threads)
+            rows += [Contestant(THREADED, id, "vector", n, partial(shared, n)) for n in sizes]
         for text in keywords:
             given, name = keywords_of(text), f"{id}, {text}"
             rows += [Contestant(VARIED, name, "unwrapped", 1, partial(unwrapped, id, **given))]
             rows += [Contestant(VARIED, name, "vector", n, partial(ours, id, n, **given)) for n in sizes]
     for id in ("CartPole-v1", "Pendulum-v1"):
         rows += [Contestant("gymnasium", id, "made", 1, partial(made, id))]
+    rows += [Contestant(CORE, "multiply-adds", "arithmetic", NUMBERS, peak)]
     for library, id, prepare in PEERS:
         rows += [Contestant(library, id, "vector", n, partial(prepare, n)) for n in sizes]
     return rows
@@ -263,8 +276,8 @@ def batch(step: Callable[[Any], Any], actions: Sequence[Any]) -> Run:
 
 
 def ours(id: str, n: int, **keywords: Any) -> Run:
-    """Prepare a native vector environment."""
-    envs = gym.make_vec(id, num_envs=n, **keywords)
+    """Prepare a native vector environment, of one thread unless told otherwise."""
+    envs = gym.make_vec(id, num_envs=n, **{"num_threads": 1} | keywords)
     actions = actions_of(envs.single_action_space, n)
     envs.reset(seed=0)
     stagger_episodes(envs, actions)
@@ -366,7 +379,8 @@ def bench(settings: Settings) -> dict[str, Any]:
     """Measure, print the tables, write the file if one is named, and return what it holds."""
     for name in settings.files:
         registered(name)
-    rows = contestants(settings.ids, settings.sizes, settings.keywords) if settings.speed else []
+    ours = settings.ids, settings.sizes, settings.keywords, settings.threads
+    rows = contestants(*ours) if settings.speed else []
     if settings.speed and settings.energies:
         rows += of_energies(settings.sizes)
     stages: dict[str, list[list[float]]] = {}
@@ -397,8 +411,12 @@ def bench(settings: Settings) -> dict[str, Any]:
     }
     report["targets"] = verdicts(results, cold)
     report["chains"] = chains(results)
+    report["speedups"] = speedups(rows)
+    report["arithmetic"] = arithmetic(rows)
     if settings.jacobians and complete:
         report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
+    if settings.divisions and complete:
+        report["divisions"] = divisions(settings.ids)
     print("\n".join(table(report)))
     if settings.output:
         Path(settings.output).write_text(to_json(report), encoding="utf-8")
@@ -558,6 +576,36 @@ def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> li
     return results
 
 
+def speedups(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
+    """Return, for each batch that several threads step, the quartiles of the ratio to one thread."""
+    rates = {(row.library, row.id, row.num_envs): row.rates for row in rows if row.kind == "vector"}
+    return [
+        {"id": id, "num_envs": n, "ratio": quartiles(pairs)}
+        for (library, id, n), threaded in rates.items()
+        if library == THREADED and (pairs := ratios(threaded, rates["lag_envs", id, n]))
+    ]
+
+
+def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
+    """Return, for our largest batch of each id, its products a step and its share of the core's peak.
+
+    The share has quartiles, over the rounds, of products a second to multiply-adds a second.
+    """
+    limits = next((row.rates for row in rows if row.library == CORE), [])
+    largest = {r.id: r for r in sorted(rows, key=lambda r: r.num_envs) if _is_batch(r)}
+    found = []
+    for id, row in largest.items():
+        count = products(gym.make_vec(id, num_envs=1)._program) if row.rates else None  # type: ignore[attr-defined]
+        if count and (pairs := ratios(row.rates, limits)):
+            share = quartiles([count * pair for pair in pairs])
+            found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})
+    return found
+
+
+def _is_batch(row: Contestant) -> bool:
+    return row.library == "lag_envs" and row.kind == "vector"
+
+
 def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
 
@@ -585,6 +633,13 @@ def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     return {"bars": bars, "ns": [round(times[n], 1) for n in bars], "exponent": round(float(slope), 2)}
 
 
+def times_of(report: dict[str, Any]) -> dict[str, float]:
+    """Return the time of a step of each environment [ns], in the largest batch."""
+    found = [r for r in report["rows"] if r["library"] == "lag_envs" and "steps_per_second" in r]
+    most = max((r["num_envs"] for r in found), default=0)
+    return {r["id"]: 1e9 / r["steps_per_second"][1] for r in found if r["num_envs"] == most}
+
+
 # --- printing ---
 
 
@@ -593,7 +648,8 @@ def table(report: dict[str, Any]) -> list[str]:
     about, settings = report["machine"], report["settings"]
     lines = [
         f"{about['processor']}, {about['cores']} cores, {about['system']}, Python {about['python']}",
-        f"one core, {settings['clock']} time, {settings['rounds']} samples of {settings['seconds']:g} s each",
+        f"{'a core for each thread' if report.get('speedups') else 'one core'}, {settings['clock']} time, "
+        f"{settings['rounds']} samples of {settings['seconds']:g} s each",
         ", ".join(f"{name} {number}" for name, number in report["versions"].items()),
         "",
     ]
@@ -615,11 +671,20 @@ def table(report: dict[str, Any]) -> list[str]:
             "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
             "",
         ]
+    if found := report.get("speedups"):
+        names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
+        lines += [*columns([names, *map(_compared, found)]), ""]
+    if found := report.get("arithmetic"):
+        titles = ("environment", "envs", "products a step", "of the core's peak", "(quartiles)")
+        lines += [*columns([titles, *map(_share, found)]), ""]
     if found := report.get("chains"):
         times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     if costs := report.get("jacobians"):
         lines += [*columns(benchmark_jacobians.table(costs)), ""]
+    if found := report.get("divisions"):
+        rows = [benchmark_divisions.cells(row, times_of(report).get(row["id"])) for row in found]
+        lines += [*columns([benchmark_divisions.HEAD, *rows]), ""]
     for name, cold in report["cold_start"].items():
         low, middle, high = quartiles(cold["seconds"])
         spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
@@ -681,6 +746,12 @@ def markdown(report: dict[str, Any]) -> str:
             f"Scenes that are only energies, {size:,} at once, beside the same `CartPole-v1`: "
             f"{'; '.join(told)}."
         )
+    if found := report.get("divisions"):
+        parts.append(
+            "Into how many series the certificate divides steps under random actions, and the time of one, "
+            "many at once. Others never needed more than one; those with imperfections were left out."
+        )
+        parts.append(benchmark_divisions.markdown(found, times_of(report)))
     if cold := report["cold_start"]:
         starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
         parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
@@ -763,6 +834,17 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     return (*cells, row["problem"]) if row["problem"] else cells
 
 
+def _compared(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["ratio"]
+    return row["id"], f"{row['num_envs']:,}", f"{middle:.2f}", f"({low:.2f} - {high:.2f})"
+
+
+def _share(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["share"]
+    numbers = f"{row['num_envs']:,}", f"{row['products']:,}"
+    return row["id"], *numbers, f"{middle:.0%}", f"({low:.0%} - {high:.0%})"
+
+
 def _worst(target: dict[str, Any]) -> str:
     measured = target["measured"]
     if not measured:
@@ -780,7 +862,7 @@ def _worst(target: dict[str, Any]) -> str:
 
 
 def in_own_process(settings: Settings) -> int:
-    """Run `bench` in a process of its own, on one core and without threads; return its exit status."""
+    """Run `bench` in a process of its own, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark", json.dumps(asdict(settings))]
     child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
 
@@ -807,9 +889,10 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _break_off)
     warnings.simplefilter("ignore")  # of the peers
+    settings = Settings(**json.loads(sys.argv[1]))
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    report = bench(Settings(**json.loads(sys.argv[1])))
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-settings.threads :])
+    report = bench(settings)
     return 0 if report["complete"] else 130
 
 

@@ -1,4 +1,4 @@
-"""What the Jacobian of a control step costs beside the step: a section of ``lag-envs bench``.
+"""What derivatives of a control step cost beside the step: a section of ``lag-envs bench``.
 
 Both start from the same states. The step is the compiled one, state after state; `Scene.simulate` would have
 the states of one motion.
@@ -63,7 +63,7 @@ def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
 
 
 def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """Measure the cost of `Scene.jacobian`, in a batch and one by one.
+    """Measure the cost of `Scene.jacobian`, in a batch and one by one, and that of `Scene.vjp`.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
     list of dict
         For each scene its ``name``; ``columns`` K, by states and controls; ``step_ns`` and ``jacobian_ns`` of
         a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio`` to one
-        of `Scene.simulate`.
+        of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which is to be 4 at most.
     """
     found = []
     for name in names or CASES:
@@ -104,8 +104,12 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
             for i in range(CALLS):
                 scene.jacobian(states[i], controls[i], DT)
 
-        times = _least((run_steps, run_batch, simulate, call), rounds, clock)
+        def run_back(scene: Scene = scene, states: Any = states, controls: Any = controls) -> None:
+            scene.vjp(states, controls, DT, states)
+
+        times = _least((run_steps, run_batch, simulate, call, run_back), rounds, clock)
         step, batch, one, single = times[0] / CALLS / BATCH, times[1] / BATCH, times[2], times[3]
+        back = times[4] / BATCH
         columns = states.shape[1] + controls.shape[1]
         found.append(
             {
@@ -117,6 +121,8 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
                 "aim": 1 + 2 * columns,
                 "call_us": round(1e6 * single / CALLS, 1),
                 "call_ratio": round(single / one, 2),
+                "vjp_ns": round(1e9 * back, 1),
+                "vjp_ratio": round(back / step, 2),
             }
         )
     return found
@@ -137,7 +143,18 @@ def _least(runs: Sequence[Callable[[], None]], rounds: int, clock: Callable[[], 
 
 def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return the rows of a table, the first with the columns' names."""
-    head = ("Jacobian of a step", "columns", "step, ns", "row, ns", "steps", "aim", "call, µs", "of a step's")
+    head = (
+        "Jacobian of a step",
+        "columns",
+        "step, ns",
+        "row, ns",
+        "steps",
+        "aim",
+        "call, µs",
+        "of a step's",
+        "backwards, ns",
+        "steps",
+    )
     return [
         head,
         *(
@@ -150,6 +167,8 @@ def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
                 f"{row['aim']}",
                 f"{row['call_us']:.0f}",
                 f"{row['call_ratio']:.1f}",
+                f"{row['vjp_ns']:,.0f}" if "vjp_ns" in row else "–",
+                f"{row['vjp_ratio']:.1f}" if "vjp_ratio" in row else "–",
             )
             for row in rows
         ),

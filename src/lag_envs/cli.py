@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lag_envs import TASKS, __version__
 from lag_envs.errors import UserError, hint
+from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
 from lag_envs.tables import columns
 
@@ -155,6 +156,13 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
     )
     parser.add_argument(
+        "--threads",
+        metavar="N",
+        type=_count,
+        default=1,
+        help="measure also how much quicker N threads step a batch, on N cores",
+    )
+    parser.add_argument(
         "--rounds", metavar="N", type=_count, help="samples of each row (default: 31, or 9 with --quick)"
     )
     parser.add_argument(
@@ -183,16 +191,20 @@ def run_bench(args: argparse.Namespace) -> int:
     if args.output:
         _check_writable(Path(args.output))
     if args.checkout is not None:
-        for option in ("ids", "quick", "cold", "sizes", "keywords"):
-            if getattr(args, option):
-                raise UserError(
-                    "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with"
-                )
+        if args.threads > 1 or any(getattr(args, o) for o in ("ids", "quick", "cold", "sizes", "keywords")):
+            raise UserError(
+                "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with, "
+                "--threads"
+            )
         for name in ("README.md", "docs/speed.json", "docs/speed.md"):
             if not os.access(Path(args.checkout, name), os.W_OK):
                 raise UserError(
                     f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
                 )
+    if args.threads > (cores := usable_cores()):
+        raise UserError(f"--threads {args.threads} needs as many cores, and this process may use {cores}")
+    if args.threads > 1 and args.clock == "cpu":
+        raise UserError("--threads needs --clock wall: the other adds up the time of all threads")
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
     given = {
         name: getattr(args, name)
@@ -205,7 +217,9 @@ def run_bench(args: argparse.Namespace) -> int:
         "keywords": tuple(args.keywords or ()),
         "energies": not (args.quick or args.ids),
         "jacobians": not (args.quick or args.ids or args.cold),
+        "divisions": not (args.quick or args.cold),
         "speed": not args.cold,
+        "threads": args.threads,
         "clock": args.clock,
         "date": args.date,
         "output": args.output,
@@ -684,6 +698,7 @@ examples:
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --quick --with action_delay=0.013   what keywords cost
+  lag-envs bench --quick --threads 2                 what a second thread brings
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
         declare_bench,

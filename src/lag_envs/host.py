@@ -35,6 +35,11 @@ def machine() -> dict[str, Any]:
     }
 
 
+def usable_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def installed(libraries: Iterable[str]) -> dict[str, str]:
     """Return the versions of those libraries that are installed."""
     found = {}

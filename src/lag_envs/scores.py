@@ -97,6 +97,22 @@ def score(env_id: str, mean_return: float) -> float | None:
     return None if known is None else float(normalised(known, mean_return))
 
 
+def share_of_privileged(env_id: str) -> float | None:
+    """Return the best policy's mean return as a share of that of the reference with privileged knowledge.
+
+    None for an environment that is not open (`lag_envs.tasks.record.Open`), or was not measured.
+
+    Examples
+    --------
+    >>> share_of_privileged("PivotedBar-v0") is None
+    True
+    """
+    found = measured(env_id).get("measured", {})
+    if "privileged" not in found:
+        return None
+    return float(found[measured(env_id)["scale"]["policy"]]["mean"] / found["privileged"]["mean"])
+
+
 def in_words(env_id: str, total: float, whole: bool = True) -> str:
     """Return what an episode's return says, in words.
 

@@ -79,20 +79,19 @@ class Step:
 
     Examples
     --------
-    >>> step = Step("PivotedBarFree-v0")
-    >>> state, action = torch.tensor([3.0, 0.1]), torch.tensor([0.5])
+    >>> step = Step("PivotedBar-v0")
+    >>> state, action = torch.tensor([0.0, 0.0, 3.0, 0.1]), torch.tensor([0.5])
     >>> torch.func.jacrev(lambda s: step(s, action).states)(state).shape
-    torch.Size([2, 2])
+    torch.Size([4, 4])
     """
 
     def __init__(self, task: str | Task, **options: Any) -> None:
-        if isinstance(task, str):
-            task = gym.make(task, **options).unwrapped.task  # type: ignore[attr-defined]
-        elif options:
+        if options and not isinstance(task, str):
             raise ValueError(f"options go with an id; the given task has its own, got {sorted(options)}")
-        self.task = _checked_task(task)
-        self.model = Model(task)
-        formulas = task.formulas
+        made: Any = gym.make(task, **options).unwrapped if isinstance(task, str) else None
+        self.task = _checked_task(task if made is None else made.task)
+        self.model = Model(self.task)
+        formulas = self.task.formulas
         self._sizes = len(formulas.state), formulas.actions, formulas.targets
 
     def __call__(self, states: Tensor, actions: Tensor, targets: Tensor | None = None) -> StepResult:
@@ -199,8 +198,8 @@ class TorchVectorEnv:
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every environment, or in those of a mask; see `LagrangianVectorEnv.reset`.
 
-        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of what
-        follows reach it, but not through the observations that are returned here.
+        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of
+        what follows reach it, but not through the observations that are returned here.
 
         Returns
         -------
@@ -269,9 +268,9 @@ class TorchVectorEnv:
         """Close the environments."""
         self.envs.close()
 
-    def _advance(self, actions: Tensor) -> list[NDArray]:
+    def _advance(self, actions: Tensor) -> list[Any]:
         *results, self._infos = self.envs.step(actions.detach().numpy())
-        return results
+        return list(results)
 
 
 class _Step(torch.autograd.Function):
@@ -296,7 +295,7 @@ class _Step(torch.autograd.Function):
         ctx.mark_non_differentiable(output[3])
 
     @staticmethod
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         return None, *_Back.apply(ctx.model, *ctx.saved_tensors, *seeds[:3])
 
     @staticmethod
@@ -336,7 +335,7 @@ class _Back(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple, output: tuple) -> None: ...
 
     @staticmethod
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         raise NotImplementedError("a step has first derivatives only; leave out create_graph=True")
 
     @staticmethod
@@ -348,7 +347,7 @@ class _EnvStep(torch.autograd.Function):
     """`TorchVectorEnv.step`."""
 
     @staticmethod
-    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
         envs = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.stepped = envs._read("n") >= 0.0
@@ -363,38 +362,29 @@ class _EnvStep(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:  # type: ignore[override]
+    def backward(ctx: Any, *seeds: Tensor) -> tuple:
         model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
-        state, actions, after = ctx.saved_tensors
-        y, ends = _numbers(state), _numbers(after)
-        a = _numbers(actions)
+        y, a, ends = map(_numbers, ctx.saved_tensors)
+        by_observations, by_rewards, by_states = map(_numbers, seeds[:3])
         if not stepped.all():  # what was restarted had no step
             y, ends = (np.where(stepped[:, None], x, model.task.centre) for x in (y, ends))
-            a = np.where(stepped[:, None], a, 0.0)
-        a = a[:, 0] if a.shape[1] == 1 else a
-        g = ctx.targets if model.task.fixed_target is None else None
-        kicks: Any = 0.0
+            a, by_rewards = np.where(stepped[:, None], a, 0.0), np.where(stepped, by_rewards, 0.0)
+        if not kept.all():
+            by_observations, by_states = (
+                np.where(kept[:, None], x, 0.0) for x in (by_observations, by_states)
+            )
+        after = ends
         if model.task.draws or not (kept | ~stepped).all():
-            moved, _, _ = model(y, a, g)
-            kicks, ends = np.where(kept[:, None], ends - moved, 0.0), moved
-        by_observations, by_rewards, by_states = (
-            np.where(mask if x.ndim == 1 else mask[:, None], _numbers(x), 0.0)
-            for mask, x in zip((kept, stepped, kept), seeds, strict=False)
+            random = ctx.targets is not None and model.task.fixed_target is None
+            ends, _, _ = model(y, a[:, 0] if a.shape[1] == 1 else a, ctx.targets if random else None)
+            after = np.where(kept[:, None], after, ends)
+        g = np.zeros((len(y), 0)) if ctx.targets is None else ctx.targets.reshape(len(y), -1)
+        by_state, by_action, _, _ = model.reverse().pull(
+            y, a, g, ends, after, by_states, by_observations, by_rewards
         )
-        found = model.vjp(
-            y,
-            a,
-            g,
-            by_states=by_states,
-            by_observations=by_observations,
-            by_rewards=by_rewards,
-            ends=ends,
-            kicks=kicks,
-        )
-        slopes = [
-            np.where(stepped[:, None], x.reshape(len(y), -1), 0.0) for x in (found.states, found.actions)
-        ]
-        return None, torch.from_numpy(slopes[0]), torch.from_numpy(slopes[1]).to(actions.dtype)
+        if not stepped.all():
+            by_state, by_action = (np.where(stepped[:, None], x, 0.0) for x in (by_state, by_action))
+        return None, torch.from_numpy(by_state), torch.from_numpy(by_action).to(ctx.saved_tensors[1].dtype)
 
 
 def _numbers(x: Tensor) -> NDArray[np.float64]:
@@ -420,15 +410,15 @@ def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> 
     return tuple(x.unflatten(0, (n, len(x) // n)) for x in found), (0,) * len(found)
 
 
-def _checked_task(task: Task) -> Task:
+def _checked_task(task: Any) -> Task:
     """Return a task whose steps have derivatives, or raise a ValueError."""
     name = type(task).__name__
     if task.formulas.choices:
         raise ValueError(f"{name} has a list of actions to choose from, by which no step has derivatives")
     if task.imperfections:
         raise ValueError(
-            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there are "
-            "no derivatives; leave these keywords out, or take the id without them"
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there "
+            "are no derivatives; leave these keywords out, or take the id without them"
         )
     return task
 

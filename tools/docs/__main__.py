@@ -1,7 +1,7 @@
 """Write what is generated from the environments' records into README and docs: ``python -m tools.docs``.
 
 ``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
-leaderboard's best learned agents.
+leaderboard's best learned agents; with ids, those of these environments.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tools.docs", description="Write what follows from records."
     )
-    parser.add_argument("--pictures", action="store_true", help="draw the moving pictures too")
+    parser.add_argument(
+        "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; by default all"
+    )
     args = parser.parse_args(arguments)
     for path, text in generated(ROOT).items():
         write(path, text)
-    if args.pictures:
+    if args.pictures is not None:
         from tools.docs.pictures import draw
 
-        draw(ROOT / "leaderboard", ROOT / "docs" / "images" / "moving")
+        draw(ROOT / "leaderboard", ROOT / "docs" / "images" / "moving", args.pictures or TASKS)
     return 0
 
 

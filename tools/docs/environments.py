@@ -23,6 +23,7 @@ from lag_envs.envs.single import observation_space
 from lag_envs.leaderboard.docs import plain
 from lag_envs.scenes import Scene
 from lag_envs.scenes.declaring import complete
+from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
@@ -77,7 +78,7 @@ def page(
     parts["Equations"].insert(0, _equations(task))
     parts["Signs and Units"].append(_state(task))
     parts["Numerical Accuracy"].append(_accuracy(env_id, task, accuracy))
-    parts["Known Returns"].append(_returns(env_id))
+    parts["Known Returns"] += [_returns(env_id), _open(env_id)]
     parts["Agents"].append(_agents(env_id, task, board))
     lines = [f"# {env_id}", prose[""], _picture(env_id), _summary(env_id, task)]
     for heading, texts in parts.items():
@@ -358,6 +359,7 @@ def _returns(env_id: str) -> str:
     best = found["scale"]["policy"]
     names = {"random": "random actions", "zero": "zero control", best: f"{best}, the best policy known"}
     names["optimum"] = f"the optimum: {TASKS[env_id].optimum.text}" if TASKS[env_id].optimum else ""
+    names["privileged"] = f"a reference that {TASKS[env_id].open.knows}" if TASKS[env_id].open else ""
     rows = [
         [text, plus_minus(row["mean"], row["error"]), f"{row['episodes']:,}" if "episodes" in row else ""]
         for name, text in names.items()
@@ -365,6 +367,25 @@ def _returns(env_id: str) -> str:
     ]
     text = "Mean return ± standard error, as `python -m agents.scale` measured them:"
     return f"{text}\n\n{table(['Policy', 'Return', 'Episodes'], rows)}"
+
+
+def _open(env_id: str) -> str:
+    """Return that nobody has solved it, and what was tried."""
+    task = TASKS[env_id]
+    if task.open is None:
+        return ""
+    share, found = share_of_privileged(env_id), measured(env_id).get("measured", {})
+    text = "**This task is open.** "
+    if share is not None:
+        text += (
+            f"The best policy known gets {100.0 * share:.0f} % of the return of a reference that "
+            f"{task.open.knows}. "
+        )
+    rows = [
+        [name, budget, plus_minus(row["mean"], row["error"]) if (row := found.get(name)) else ""]
+        for name, budget in task.open.tried.items()
+    ]
+    return f"{text}What was tried:\n\n{table(['Method', 'Budget', 'Return'], rows)}"
 
 
 def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:

@@ -1,8 +1,8 @@
-"""Moving pictures of the environments: a recorded episode of the board's best learned agent, as WebP."""
+"""Moving pictures of the environments: a recorded episode of the board's best agent, as WebP."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,19 @@ from lag_envs.tasks import TASKS
 
 #: Pictures a second, and the largest file [bytes].
 RATE, LARGEST = 15, 300_000
+#: Score from which on a learned agent is shown, and not the best of all.
+GOOD = 0.8
 #: Widths [pixels], qualities, and which pictures are kept; the first that makes a file small enough is taken.
 CHOICES = ((480, 60, 1), (480, 40, 1), (400, 40, 1), (360, 30, 1), (360, 30, 2), (320, 20, 3))
 
 
-def draw(board: Path, folder: Path) -> None:
-    """Draw every environment of a board that has a learned agent, or else its best one."""
+def draw(board: Path, folder: Path, envs: Collection[str]) -> None:
+    """Draw environments of a board: the best learned agent if it is good, else the best of all."""
     folder.mkdir(parents=True, exist_ok=True)
     for found in board_data(Board(board))["environments"]:
         rows = [row for row in found["rows"] if row["replays"] and row["rank"] is not None]
-        learned = [row for row in rows if row["kind"] == "learned"]
-        if not found["frozen"] and rows and found["id"] in TASKS:
+        learned = [row for row in rows if row["kind"] == "learned" and row["score"] >= GOOD]
+        if not found["frozen"] and rows and found["id"] in envs:
             row = (learned or rows)[0]
             path = folder / f"{found['id']}.webp"
             write(path, *frames(found["id"], row["replays"][0]))

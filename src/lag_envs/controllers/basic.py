@@ -258,6 +258,7 @@ class ObservationDecoder:
         while not np.allclose(risen(size), 2.0 * risen(0.5 * size)):
             size *= 0.5
         slopes = risen(size) / size
+        self._slopes, self._angles = slopes, angles
         self._inverse = np.linalg.pinv(slopes)
         #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
@@ -281,6 +282,17 @@ class ObservationDecoder:
             state[..., i] = np.arctan2(lifted[..., j + 1], lifted[..., j])
         targets = lifted[..., self._width :]
         return state, targets[..., 0] if targets.shape[-1] == 1 else targets
+
+    def expected(self, states: Array) -> tuple[Array, Array]:
+        """Return what states (n, n_state) look like without targets, and its derivatives by them."""
+        turned = states[:, self._angles]
+        circles = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        lifted = np.concatenate([states, circles.reshape(len(states), -1)], axis=1)
+        slopes = np.tile(self._slopes[: self._n].T, (len(states), 1, 1))
+        for j, i in enumerate(self._angles):
+            by_cos, by_sin = self._slopes[self._n + 2 * j : self._n + 2 * j + 2]
+            slopes[:, :, i] += np.outer(-circles[:, j, 1], by_cos) + np.outer(circles[:, j, 0], by_sin)
+        return self._zero + lifted @ self._slopes[: self._width], slopes
 
     def difference(self, states: Array, others: Array) -> Array:
         """Return states (..., n_state) minus others, the shorter way around where only that is seen."""

@@ -44,8 +44,6 @@ def easier(
     kind: Any = type(task)
     (name,) = kind.action
     most = share * float(task.limit_control)
-    names, units = task.scene.state_names, task.scene.state_units
-    rest = dict(zip(names, task.plans.rest, strict=True))
 
     class Easier(kind):
         id = ""
@@ -63,11 +61,29 @@ def easier(
                 cost = cost + 300.0 * over * over
             return -cost
 
+    rest = dict(zip(task.scene.state_names, task.plans.rest, strict=True))
+    return remade(task, Easier, dt=every * task.dt), away(task, end, rest)
+
+
+def away(task: Task, weights: Mapping[str, float], rest: Mapping[str, float]) -> Callable[[Array], Array]:
+    """Return what states (n, n_state) cost by their distance from a rest.
+
+    Parameters
+    ----------
+    task : Task
+        The task.
+    weights : mapping
+        For entries of the state, what the square of the distance costs, for angles twice 1 less its cosine.
+    rest : mapping
+        Where the entries are at rest; 0 where it has none.
+    """
+    names, units = task.scene.state_names, task.scene.state_units
+
     def lost(states: Array) -> Array:
         total = np.zeros(len(states))
         for i, (entry, unit) in enumerate(zip(names, units, strict=True)):
-            off = states[:, i] - rest[entry]
-            total += end.get(entry, 0.0) * (2.0 * (1.0 - np.cos(off)) if unit == "rad" else off * off)
+            off = states[:, i] - rest.get(entry, 0.0)
+            total += weights.get(entry, 0.0) * (2.0 * (1.0 - np.cos(off)) if unit == "rad" else off * off)
         return total
 
-    return remade(task, Easier, dt=every * task.dt), lost
+    return lost

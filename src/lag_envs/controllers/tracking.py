@@ -125,7 +125,7 @@ class Tracking(Clocked):
 
 def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
     """Return where a task's plan is kept: the one to follow, or the "quick" one to begin planning from."""
-    return (folder or FOLDER) / f"{task.id}-{kind}.npz"
+    return (folder or FOLDER) / f"{task.plans.of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from lag_envs.scenes.checks import is_masked, shown
 from lag_envs.tasks.base import TaskFormulas
 
+#: Types of actions that compiled steps take.
+AS_THEY_ARE = np.dtype(np.float32), np.dtype(np.float64)
+
 
 class Actions:
     """The actions of one task.
@@ -55,11 +58,9 @@ class Actions:
         array = self._array(actions, "actions", (n, *self.shape))
         if self.values:
             self._check_choices(array, "actions")
-        if (
-            array.dtype.char not in "fd" or not array.dtype.isnative or not array.flags.writeable
-        ):  # what the compiled step takes as it is
-            array = array.astype(np.float64)
-        return array.reshape(-1)
+        if array.dtype not in AS_THEY_ARE or not array.flags.carray:
+            array = array.astype(np.float64, order="C")
+        return array.ravel()
 
     def _array(self, given: Any, what: str, shape: tuple[int, ...]) -> NDArray:
         """Return real or whole numbers of this shape as an array, or raise a ValueError."""

@@ -20,9 +20,11 @@ from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
 
+from lag_envs.envs import sharing
 from lag_envs.envs.program import (
     DRAWS,
     SLOW,
+    STEP_BLOCKS,
     Program,
     _indent,
     _lines,
@@ -518,11 +520,12 @@ class ImperfectProgram(DrawnProgram):
         ]  # fmt: skip
         return _compiled("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
 
-    @property
-    def _each(self) -> list[str]:
+    def _each(self, body: Sequence[str]) -> list[str]:
+        """Return the loop over the environments of a block."""
         return [
-            "for lane in range(count):",
+            "for lane in range(np.int64(first), np.int64(first + size)):",
             f"    base = (lane // {BLOCK}) * {BLOCK * len(self.kept)} + lane % {BLOCK}",
+            *_indent(body),
         ]
 
     @property
@@ -536,20 +539,19 @@ class ImperfectProgram(DrawnProgram):
         return len(self.scratch) + self.room
 
     @cached_property
-    def step_all(self) -> Callable:
-        """See `Program.step_all`."""
+    def step_blocks(self) -> Callable:
+        """See `Program.step_blocks`."""
         n, stride = len(self.a), f"np.int64({BLOCK})"
-        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
         held = n + len(self.o)
         step = [
             *(f"work[{j}] = action[lane * {n} + {j}]" for j in range(n)),
             f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
             f"if over == {SLOW}:",
-            "    refused, over = lane + 1, 0",
+            "    refused, over = max(refused, np.uint64(lane + 1)), 0",
             *(f"    {self._at_lane(u)} = work[{held + j}]" for j, u in enumerate(self.u)),
             "if over > 0:",
             f"    {self._at_lane('n')} = -np.float64(over)",
-            "    overs += 1",
+            "    overs += np.uint64(1)",
         ]
         restart = [
             *_next_episode("lane", "count + lane", "2 * count + lane"),
@@ -557,20 +559,15 @@ class ImperfectProgram(DrawnProgram):
             "r, over = 0.0, 0",
         ]
         body = [
-            "memory = par", *self._slices(0, len(self.uniform)), "second = np.uint64(count)",
-            *(self._check_finite(f"f[{place}] >= 0.0") if self.a else []),
-            "overs, refused = 0, 0",
-            *self._each,
-            *_indent([
+            "memory = par", *self._slices(0, len(self.uniform)),
+            *self._claimed(self._each([
                 f"if {self._at_lane('n')} < 0.0:", *_indent(restart), "else:", *_indent(step),
                 "reward[lane] = r",
                 "terminated[lane] = (over == 1) | (over == 3)", "truncated[lane] = over >= 2",
                 *self._show,
-            ]),
-            "return refused, overs",
+            ])),
         ]  # fmt: skip
-        arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
-        return _compiled("step_all", arguments, body, self.take, self.launch)
+        return _compiled("step_blocks", STEP_BLOCKS, body, self.take, self.launch, *sharing.claiming())
 
     def _at_lane(self, row: str) -> str:
         return f"f[base + {self.kept.index(row) * BLOCK}]"
@@ -583,10 +580,13 @@ class ImperfectProgram(DrawnProgram):
             f"launch(f, base, np.int64({BLOCK}), par, key, state_given, target_given)",
         ]
         body = [
-            *self._each,
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
             *_indent([
-                "if mask[lane]:", *_indent(begin),
-                "if mask[lane] or whole:", *_indent(self._show),
+                *self._place,
+                *self._each([
+                    "if mask[lane]:", *_indent(begin),
+                    "if mask[lane] or whole:", *_indent(self._show),
+                ]),
             ]),
         ]  # fmt: skip
         arguments = "f, ids, par, obs, mask, whole, state_given, target_given, count"

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.program import constants_of, program_for
-from lag_envs.envs.single import absent
 from lag_envs.envs.reverse import Reverse
+from lag_envs.envs.single import absent
 from lag_envs.scenes.checks import check_parameters, real_array
 from lag_envs.tasks.base import Task
 
@@ -157,7 +157,7 @@ class Model:
     def observe(self, states: ArrayLike, targets: ArrayLike | None = None) -> Array:
         """Return the observations of states, shape (n, n_observations)."""
         states = real_array("states", states)
-        return self._reverse(()).observations(states.T, self._targets(targets, len(states)).T).T
+        return self.reverse().observations(states, self._targets(targets, len(states)))
 
     def vjp(
         self,
@@ -203,35 +203,27 @@ class Model:
         ValueError, StepRefused
             As a step does; ValueError also for a task whose actions are choices, and for unknown parameters.
         """
-        by = check_parameters(self.task.scene, parameters)
-        reverse, scene = self._reverse(by), self.task.scene
+        reverse = self.reverse(check_parameters(self.task.scene, parameters))
         shape = np.shape(actions)
         if ends is None:
             ends, _, _ = self(states, actions, targets)
         states, actions, targets = self._checked(states, actions, targets)
         n, observations = len(states), len(self.task.formulas.observation)
-        seeds = [
-            np.broadcast_to(np.asarray(x, np.float64).T, wanted)
-            for x, wanted in (
-                (by_states, (self._n_state, n)),
-                (by_observations, (observations, n)),
-                (by_rewards, (1, n)),
-            )
-        ]
-        y, a, g, z = states.T, actions.T, targets.T, ends.T
-        u = reverse.controls(y, a, g)
-        after = z + np.broadcast_to(np.asarray(kicks, np.float64).T, z.shape)
-        own_y, own_z, own_u, own_g, own_p = reverse.after(y, z, u, g, after, *seeds)
-        motion = scene.vjp(states, u.T, self.task.dt, own_z.T, parameters=by)
-        last_y, last_a, last_g, last_p = reverse.before(y, a, g, own_u + motion[1].T)
-        return Gradient(
-            (own_y + last_y).T + motion[0],
-            last_a.T.reshape(shape),
-            (own_g + last_g).T,
-            (own_p + last_p).T + motion[2],
+        slopes = reverse.pull(
+            states,
+            actions,
+            targets,
+            ends,
+            ends + _rows("kicks", kicks, ends.shape),
+            _rows("by_states", by_states, (n, self._n_state)),
+            _rows("by_observations", by_observations, (n, observations)),
+            _rows("by_rewards", by_rewards, (n,)),
         )
+        slopes[1] = slopes[1].reshape(shape)
+        return Gradient(*slopes)
 
-    def _reverse(self, parameters: tuple[str, ...]) -> Reverse:
+    def reverse(self, parameters: tuple[str, ...] = ()) -> Reverse:
+        """Return the step backwards, with gradients by these parameters too."""
         if parameters not in self._reversed:
             self._reversed[parameters] = Reverse(self.task, parameters)
         return self._reversed[parameters]
@@ -328,6 +320,14 @@ class Model:
             wanted = f"({n},) or ()" if count == 1 else f"({n}, {count}) or ({count},)"
             raise ValueError(f"targets must have shape {wanted}, got {array.shape}")
         return np.ascontiguousarray(np.broadcast_to(array.reshape(-1, count), (n, count)))
+
+
+def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return values of a shape, or one for all; or raise a ValueError."""
+    array = real_array(name, values)
+    if array.shape not in ((), shape):
+        raise ValueError(f"{name} must be one number or have shape {shape}, got {array.shape}")
+    return np.broadcast_to(array, shape)
 
 
 def _moves(m: int) -> Array:

@@ -23,12 +23,17 @@ from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
 
+from lag_envs.envs import sharing
 from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.flows import section, split
 from lag_envs.stepping.tracing import Trace
 
 DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
 SLOW = -3  #: status of a step that the fast formula does not cover
+#: The arguments of `step_blocks`.
+STEP_BLOCKS = (
+    "f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, turn, share, shares"
+)
 
 
 def constants_of(task: Any) -> dict[str, float]:
@@ -311,12 +316,12 @@ class Program:
 
     @cached_property
     def step_all(self) -> Callable:
-        """``step_all(f, ids, par, action, obs, reward, terminated, truncated, count)``.
+        """A step of all environments, see `sharing.compile_step_all`."""
+        return sharing.compile_step_all(self.bad_action, self.step_blocks)
 
-        Steps every environment; one whose episode was over is restarted instead. Returns (status, over). The
-        status is 0; or i + 1 where environment i was refused and kept its state; or -(i + 1), before anything
-        was stepped, where action i is not finite. ``over`` counts the environments whose episode is over now.
-        """
+    @cached_property
+    def step_blocks(self) -> Callable:
+        """A step of the environments of the blocks that a thread claims, see `sharing.compile_step_all`."""
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
         inputs = _load(_at, [*varying, *y, *self.g, "n"])
@@ -358,7 +363,7 @@ class Program:
             *_indent([
                 *inputs, *again,
                 "if status < 0:",
-                "    refused = first + i + np.uint64(1)",
+                "    refused = max(refused, first + i + np.uint64(1))",
                 f"    {_at('over')} = 0.0",
                 "else:",
                 *_indent([
@@ -384,19 +389,14 @@ class Program:
         output = [
             f"reward[first + i] = {_at('r')}", f"over = {_at('over')}",
             "terminated[first + i] = (over == 1.0) | (over == 3.0)", "truncated[first + i] = over >= 2.0",
-            "overs += over > 0.0",
+            "overs += np.uint64(over > 0.0)",
         ]  # fmt: skip
-        # An environment that is to be restarted ignores its action, whatever it is.
-        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
-        running = f"f[{place}] >= 0.0"
         body = [
             "wide_vectors()",
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            *(self._check_finite(running) if self.a else []),
-            "overs, refused = 0, np.uint64(0)",
-            *self._each_block,
-            *_indent([
+            *self._claimed([
+                self._base,
                 "slow, restarts = 0, 0",
                 *(
                     line
@@ -412,22 +412,36 @@ class Program:
                 # One loop per entry: one that writes to many arrays would have to check them for overlap.
                 *(line for entry in _observations(self.o) for line in _block(lane, [entry])),
             ]),
-            "return np.int64(refused), overs",
         ]  # fmt: skip
-        arguments = "f, ids, par, action, obs, reward, terminated, truncated, count"
-        return self._batch("step_all", arguments, body, *helpers)
+        return self._batch("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
 
-    def _check_finite(self, running: str) -> list[str]:
-        """Return the lines that look for actions that are not finite, before anything is stepped."""
-        n = len(self.a)
-        found = (f"        if not (abs(action[i * {n} + {j}]) < math.inf) and {running}:" for j in range(n))
+    def _claimed(self, body: Sequence[str]) -> list[str]:
+        """Return the loop over the blocks that a thread claims; the body counts `overs`, sets `refused`."""
+        claim = "block, tried = next_block(ids, at, turn, blocks, {}, share, shares)"
         return [
+            "overs, refused, taken = np.uint64(0), np.uint64(0), np.uint64(0)",
+            claim.format("np.uint64(0)"),
+            "while block < blocks:",
+            *_indent([*self._place, *body, "taken += np.uint64(1)", claim.format("tried")]),
+            "hand_in(ids, at, taken, overs, refused)",
+        ]  # fmt: skip
+
+    @cached_property
+    def bad_action(self) -> Callable:
+        """``bad_action(f, action, count)`` to -(i + 1) where action i is not finite, or 0."""
+        n = len(self.a)
+        # An environment that is to be restarted ignores its action, whatever it is.
+        place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
+        found = (f"if not (abs(action[i * {n} + {j}]) < math.inf) and f[{place}] >= 0.0:" for j in range(n))
+        body = [
             "bad = 0",
-            f"for i in range(second * np.uint64({n})):", "    bad += not (abs(action[i]) < math.inf)",
+            f"for i in range(np.uint64(count) * np.uint64({n})):",
+            "    bad += not (abs(action[i]) < math.inf)",
             "if bad > 0:",
             "    for i in range(count):",
-            *(line for test in found for line in (test, "            return -(i + 1), 0")),
+            *_indent([line for test in found for line in (test, "    return -(i + 1)")], 2),
         ]  # fmt: skip
+        return _function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
 
     def _action(self, j: int) -> str:
         """Return where action j of the environment at hand lies in the batch's array."""
@@ -456,8 +470,8 @@ class Program:
         body = [
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
-            *self._each_block,
-            *_indent(_block("for i in range(size):", start)),
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            *_indent([*self._place, self._base, *_block("for i in range(size):", start)]),
         ]  # fmt: skip
         return self._batch(
             "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
@@ -472,17 +486,21 @@ class Program:
             return f"par[np.uint64({len(self.uniform) + self.scratch.index(match[1]) * BLOCK}) + i]"
 
         # Indices are unsigned: a signed one might be negative, which by NumPy's rules makes a branch.
-        return _function(name, arguments, [re.sub(r"row_(\w+)\[i\]", place, line) for line in body], *helpers)
+        lines = [re.sub(r"row_(\w+)\[i\]", place, line) for line in body]
+        return _function(name, arguments, lines, *helpers)
 
     @property
-    def _each_block(self) -> list[str]:
-        """The head of the loop over blocks."""
+    def _place(self) -> list[str]:
+        """The lines that say which environments a block has."""
         return [
-            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            f"    first = block * np.uint64({BLOCK})",
-            f"    size = min(np.uint64({BLOCK}), second - first)",
-            f"    base = block * np.uint64({BLOCK * len(self.kept)})",
+            f"first = block * np.uint64({BLOCK})",
+            f"size = min(np.uint64({BLOCK}), np.uint64(count) - first)",
         ]
+
+    @property
+    def _base(self) -> str:
+        """The line that says where the rows of a block lie."""
+        return f"base = block * np.uint64({BLOCK * len(self.kept)})"
 
 
 def _at(row: str) -> str:

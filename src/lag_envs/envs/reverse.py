@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lag_envs.envs.program import constants_of
+from lag_envs.scenes.steps import pulled
 from lag_envs.stepping.adjoint import compile_lanes
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
@@ -24,9 +25,6 @@ Array = NDArray[np.float64]
 
 class Reverse:
     """What a task computes before and after the motion, and its derivatives, for many rows.
-
-    All arrays have a row per quantity: states (n_state, n), actions (n_actions, n), controls (n_controls, n),
-    targets (n_targets, n), observations (n_observations, n).
 
     Parameters
     ----------
@@ -43,6 +41,7 @@ class Reverse:
 
     def __init__(self, task: Task, parameters: tuple[str, ...] = ()) -> None:
         formulas = self._formulas = task.formulas
+        self._task, self._parameters = task, parameters
         if formulas.choices:
             raise ValueError(
                 f"{type(task).__name__} has a list of actions to choose from, by which no step has "
@@ -59,33 +58,43 @@ class Reverse:
         form = task.scene._form
         self._angle = None if form is None else form.angle
 
-    def controls(self, states: Array, actions: Array, targets: Array) -> Array:
-        """Return the controls that are applied."""
-        return self._run(self._control, states, actions, targets)
-
     def observations(self, states: Array, targets: Array) -> Array:
-        """Return the observations of states."""
-        return self._run(self._observe, states, targets)
+        """Return the observations of states (n, n_state) with targets (n, n_targets)."""
+        return self._run(self._observe, states.T, targets.T).T
 
-    def outcome(self, states: Array, ends: Array, controls: Array, targets: Array) -> tuple[Array, Any]:
-        """Return rewards, and whether episodes terminate."""
-        rewards, ended = self._run(self._outcome, states, ends, controls, targets)
-        return rewards, ended > 0.0
+    def pull(
+        self,
+        states: Array,
+        actions: Array,
+        targets: Array,
+        ends: Array,
+        after: Array,
+        by_states: Array,
+        by_observations: Array,
+        by_rewards: Array,
+    ) -> list[Array]:
+        """Return a gradient by states, actions, targets and parameters from one by a step's results.
 
-    def after(self, *given: Array) -> list[Array]:
-        """Return gradients by what follows the motion as those by states, ends, controls, targets, parameters.
-
-        Given are states before and after the motion, controls, targets and states after the kick; then the
-        gradients by the last ones, by the observations and by the reward.
+        Parameters
+        ----------
+        states, actions, targets : ndarray, shape (n, ...)
+            Where steps begin, all with two axes. What is given here is not checked.
+        ends, after : ndarray, shape (n, n_state)
+            The states after the motion, and after the kick too.
+        by_states, by_observations, by_rewards : ndarray, shape (n, n_state), (n, n_observations), (n,)
+            The gradient by `after`, by its observations, and by the rewards.
         """
-        return self._split(self._run(self._after, *given), "yzug")
-
-    def before(self, *given: Array) -> list[Array]:
-        """Return gradients by controls as gradients by states, actions, targets and parameters.
-
-        Given are states, actions, targets and the gradients.
-        """
-        return self._split(self._run(self._before, *given), "yag")
+        y, a, g, z = states.T, actions.T, targets.T, ends.T
+        u = self._run(self._control, y, a, g)
+        seeds = by_states.T, by_observations.T, by_rewards[None]
+        own_y, own_z, own_u, own_g, own_p = self._split(
+            self._run(self._after, y, z, u, g, after.T, *seeds), "yzug"
+        )
+        dt, scene = self._task.dt, self._task.scene
+        moved = pulled(scene, np.ascontiguousarray(states), u.T.copy(), dt, own_z.T, self._parameters)
+        by_y, by_u, by_p = np.split(moved.T, [len(y), len(y) + len(u)])
+        last_y, last_a, last_g, last_p = self._split(self._run(self._before, y, a, g, own_u + by_u), "yag")
+        return [(own_y + by_y + last_y).T, last_a.T, (own_g + last_g).T, (own_p + by_p + last_p).T]
 
     # --- formulas ------------------------------------------------------------------------------------------
 
@@ -123,13 +132,19 @@ class Reverse:
         y, k = self._lifted(xp, numbers, "y"), self._constants(numbers)
         return self._formulas.control(xp, a, y, self._of(numbers, "g"), k)
 
-    def _outcome_of(self, xp: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any]:
+    def _reward_of(self, xp: Any, numbers: Mapping[str, Any]) -> Any:
         y, z = (self._lifted(xp, numbers, letter) for letter in "yz")
-        u, g, k = self._of(numbers, "u"), self._of(numbers, "g"), self._constants(numbers)
-        reward, ended = self._formulas.outcome(xp, y, z, u, g, k)
-        if self._formulas.has_last:
-            reward = xp.where(ended, self._formulas.last(xp, y, z, u, g, k), reward)
-        return reward, ended
+        given: tuple[Any, ...] = (
+            y,
+            z,
+            self._of(numbers, "u"),
+            self._of(numbers, "g"),
+            self._constants(numbers),
+        )
+        if not self._formulas.has_last:
+            return self._formulas.reward(xp, *given)
+        reward, ended = self._formulas.outcome(xp, *given)
+        return xp.where(ended, self._formulas.last(xp, *given), reward)
 
     def _observe_of(self, xp: Any, numbers: Mapping[str, Any], letter: str) -> list:
         y, g = self._lifted(xp, numbers, letter), self._of(numbers, "g")
@@ -146,19 +161,11 @@ class Reverse:
         )
 
     @cached_property
-    def _outcome(self) -> tuple[Callable, int]:
-        def outcome(xp: Any, numbers: Mapping[str, Any]) -> list:
-            reward, ended = self._outcome_of(xp, numbers)
-            return [reward, xp.where(ended, 1.0, 0.0)]
-
-        return self._compile("outcome", "yzug", outcome, 2)
-
-    @cached_property
     def _after(self) -> tuple[Callable, int]:
         seeds = {"o": [f"seed_{row}" for row in self._rows["o"]], "e": [f"seed_{r}" for r in self._rows["e"]]}
 
         def after(xp: Any, numbers: Mapping[str, Any]) -> list:
-            reward, _ = self._outcome_of(xp, numbers)
+            reward = self._reward_of(xp, numbers)
             seen = self._observe_of(xp, numbers, "e")
             by = [numbers[row] for letter in "yzug" for row in self._rows[letter]]
             kicked = self._of(numbers, "e")
@@ -180,9 +187,7 @@ class Reverse:
 
         def before(xp: Any, numbers: Mapping[str, Any]) -> list:
             by = [numbers[row] for letter in "yag" for row in self._rows[letter]]
-            seeds = self._of(numbers, "c")
-            return xp.adjoint(
-                self._control_of(xp, numbers), seeds, [*by, *(numbers[name] for name in self._by)]
-            )
+            by += [numbers[name] for name in self._by]
+            return xp.adjoint(self._control_of(xp, numbers), self._of(numbers, "c"), by)
 
         return self._compile("before", "yagc", before, self._count("yag") + len(self._by))

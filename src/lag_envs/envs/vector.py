@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from lag_envs.envs import snapshots
+from lag_envs.envs import sharing, snapshots
 from lag_envs.envs.actions import Actions, single_number
 from lag_envs.envs.imperfect import numbers_of, program_of
 from lag_envs.envs.program import BLOCK
@@ -62,6 +63,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         `show_tiles` one of them all.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
+    num_threads : int, optional
+        Number of threads that step the batch; by default one for each 4,096 environments and each core, and
+        one in worker processes, see `sharing.default_threads`. The bits do not depend on it.
     show_arrows, show_trail, show_readout
         What pictures show besides, see `LagrangianEnv`.
     show_tiles : int, optional
@@ -97,6 +101,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         diagnostics: bool = False,
+        num_threads: int | None = None,
         show_arrows: bool = False,
         show_trail: float = 0.0,
         show_readout: bool = False,
@@ -109,6 +114,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         check_flag("diagnostics", diagnostics)
         self._look = check_look(show_arrows, show_trail, show_readout)
         self.num_envs = check_count("num_envs", num_envs)
+        self._num_threads = None if num_threads is None else check_count("num_threads", num_threads)
         self._tiles = (
             None if show_tiles is None else min(check_count("show_tiles", show_tiles), self.num_envs)
         )
@@ -141,12 +147,14 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._compile()
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
-        #: The constants, then room for what a step needs.
-        self._par = np.array(uniform + [0.0] * program.room_of_all)
+        #: The constants, then room for what a step needs; for each thread.
+        self._pars = [on_a_line(np.array(uniform + [0.0] * program.room_of_all), len(uniform))]
         blocks = -(-self.num_envs // BLOCK)
-        self._memory = np.zeros(blocks * len(program.kept) * BLOCK)
-        #: Keys of the seeds, numbers of the episodes, keys of the episodes.
-        self._ids = np.zeros(3 * self.num_envs, dtype=np.uint64)
+        self._memory = on_a_line(np.zeros(blocks * len(program.kept) * BLOCK))
+        #: Keys of the seeds, numbers of the episodes, keys of the episodes, and what threads share.
+        self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
+        #: Number of the step, counted over all episodes, and how many threads find something to do in one.
+        self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
         for name in program.varying:  # those that are drawn are written when an episode begins
             values = [constants[name] for constants in self._constants]
@@ -161,6 +169,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._program = program_of(self.task, self._constants)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
+        #: What helpers are asked to call, by their number and the type of actions.
+        self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
 
     # --- Gymnasium's interface -----------------------------------------------------------------------------
 
@@ -264,19 +274,16 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             )
         n, program = self.num_envs, self._program
         # One row per entry is quicker to fill; the transpose is what the caller sees.
-        observations = np.empty((len(program.o), n), dtype=FLOAT32)
-        rewards, terminations, truncations = np.empty(n), np.empty(n, dtype=BOOL), np.empty(n, dtype=BOOL)
-        status, over = program.step_all(
-            self._memory,
-            self._ids,
-            self._par,
-            actions,
-            observations,
-            rewards,
-            terminations,
-            truncations,
-            n,
-        )
+        observations = np.empty((len(program.o), n), FLOAT32)
+        rewards, terminations, truncations = np.empty(n), np.empty(n, BOOL), np.empty(n, BOOL)
+        turn = self._turn = self._turn + 1
+        rest = (actions, observations, rewards, terminations, truncations, n, turn)
+        shares = self._get_help(*rest) if self._most_threads > 1 else 1
+        call = (self._memory, self._ids, self._pars[0], *rest, 0, shares)
+        status, over = program.step_all(*call)
+        while over < 0:  # a helper had to let another program have its core
+            time.sleep(1e-5)
+            status, over = program.step_all(*call)
         if status < 0:
             raise ValueError(
                 f"actions must be finite, got {actions.reshape(n, -1)[-status - 1]} "
@@ -306,7 +313,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._use_drawn()
         targets = self.target if self.target is not None else [None] * self.num_envs
         of_each = (self.state, self.control, targets, self._steps.tolist(), self._totals.tolist())
-        episodes = self._ids[2 * self.num_envs :].tolist()
+        episodes = self._keys[2].tolist()
         pictures = tuple(
             viewer.draw(*now) for viewer, *now in zip(self._viewers, *of_each, episodes, strict=False)
         )
@@ -333,8 +340,8 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         if not self._started:
             raise ResetNeeded("call reset() before get_state(): no episode has begun")
         rows = {name: self._read(name) for name in self._program.kept}
-        ids = self._ids.reshape(3, self.num_envs).copy()
-        return snapshots.Snapshot(self._about, rows, ids, self._steps.copy(), self._totals.copy())
+        ids, steps, totals = self._keys.copy(), self._steps.copy(), self._totals.copy()
+        return snapshots.Snapshot(self._about, rows, ids, steps, totals)
 
     def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
         """Go back, or over, to where `get_state` was called; what follows has the same bits.
@@ -361,7 +368,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         lanes = self._lanes[mask]
         for name, values in snapshot.rows.items():
             self._write(name, lanes, values[lanes])
-        self._ids.reshape(3, self.num_envs)[:, lanes] = snapshot.ids[:, lanes]
+        self._keys[:, lanes] = snapshot.ids[:, lanes]
         self._steps[lanes], self._totals[lanes] = snapshot.steps[lanes], snapshot.totals[lanes]
         self._started = True
         self._over = int(np.count_nonzero(self._read("n") < 0.0))
@@ -404,16 +411,22 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return {name: self._read(f"p_{name}") for name in drawn}
 
     @property
+    def num_threads(self) -> int:
+        """Number of threads that may step the batch."""
+        return self._num_threads or sharing.default_threads(self.num_envs)
+
+    @property
     def order(self) -> int | None:
         """Order of the series by which steps are taken; None where a closed form takes them.
 
         Another order takes another time; each step is certified to the same tolerance with any.
         """
-        return None if self.scene._form else int(self._par[self._program.uniform.index("x")])
+        return None if self.scene._form else int(self._pars[0][self._program.uniform.index("x")])
 
     @order.setter
     def order(self, value: int) -> None:
-        self._par[self._program.uniform.index("x")] = check_order("order", value)
+        for par in self._pars:
+            par[self._program.uniform.index("x")] = check_order("order", value)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -477,6 +490,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._blocks[lanes // BLOCK, self._row[row], lanes % BLOCK] = values
 
     @property
+    def _keys(self) -> NDArray[np.uint64]:
+        """Keys of the seeds, numbers of the episodes, keys of the episodes, shape (3, num_envs)."""
+        return self._ids[: 3 * self.num_envs].reshape(3, self.num_envs)
+
+    @property
     def _blocks(self) -> NDArray[np.float64]:
         """The rows that are kept, as (block, row, lane)."""
         return self._memory.reshape(-1, len(self._row), BLOCK)
@@ -487,8 +505,21 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ``given``: whether to write all observations, whether states are given, whether targets are.
         """
         self._program.start_all(
-            self._memory, self._ids, self._par, observations.T, mask, *given, self.num_envs
+            self._memory, self._ids, self._pars[0], observations.T, mask, *given, self.num_envs
         )
+
+    def _get_help(self, actions: NDArray, *rest: Any) -> int:
+        """Ask other threads to take part in a step; return how many may, this one included."""
+        shares, kind = min(self.num_threads, self._most_threads), actions.dtype
+        if (calls := self._calls.get((shares, kind))) is None:
+            while len(self._pars) < shares:
+                self._pars.append(on_a_line(self._pars[0], len(self._program.uniform)))
+            calls = self._calls[shares, kind] = [
+                (self._memory, self._ids, self._pars[i], actions, *rest, i, shares) for i in range(1, shares)
+            ]
+        if calls:
+            sharing.offer(self._program.step_all, calls, kind)
+        return shares
 
     def _restart(
         self, observations: NDArray[np.float32], over: NDArray[np.bool_], infos: dict[str, Any]
@@ -565,15 +596,24 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return array
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out compiled functions and pictures."""
-        return {
-            k: v for k, v in self.__dict__.items() if k not in ("_program", "_viewers", "_viewed", "_row")
-        }
+        """Leave out compiled functions, pictures, and what helpers know."""
+        without = ("_program", "_viewers", "_viewed", "_row", "_calls")
+        return {k: v for k, v in self.__dict__.items() if k not in without}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore, and compile anew (from the cache)."""
         self.__dict__.update(state)
+        sharing.forget_helpers(self._ids, self.num_envs)
         self._compile()
+
+
+def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
+    """Return a copy in which number `first` begins a line of the cache: vectors then lie on one line each."""
+    room = np.empty(len(numbers) + 8)
+    start = (-(room.ctypes.data // 8) - first) % 8
+    copy = room[start : start + len(numbers)]
+    copy[:] = numbers
+    return copy
 
 
 def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:

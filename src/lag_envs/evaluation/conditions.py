@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.tasks import TASKS
+from lag_envs.tasks.imperfections import MOST_DRAWN
 
 #: Names of the environment as it is, and of acting ten times as often.
 NOMINAL, OFTEN = "nominal", "ten times as often"
@@ -64,13 +65,53 @@ def often(env_id: str) -> Condition:
 
 def disturbances(env_id: str) -> list[Condition]:
     """Return a condition for each of the environment's numbers off by 20 %; policies don't know of it."""
-    scene, found = TASKS[env_id]().scene, []
-    for parameter in dataclasses.fields(scene):
-        value = getattr(scene, parameter.name)
-        if isinstance(value, float) and 0.0 < value < math.inf:
-            for share, sign in ((0.8, "-"), (1.2, "+")):
-                found.append(Condition(f"{parameter.name} {sign}20 %", {parameter.name: share * value}))
-    return found
+    return [
+        Condition(f"{name} {sign}20 %", {name: share * value})
+        for name, value in _positive(env_id).items()
+        for share, sign in ((0.8, "-"), (1.2, "+"))
+    ]
+
+
+def _positive(env_id: str) -> dict[str, float]:
+    """Return the environment's numbers that are above 0 and finite."""
+    scene = TASKS[env_id]().scene
+    values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
+    return {k: x for k, x in values.items() if isinstance(x, float) and 0.0 < x < math.inf}
+
+
+def imperfections(env_id: str) -> list[Condition]:
+    """Return conditions of imperfect sensors and actuators, and of hidden parameters.
+
+    Noise of 0.01 on the observation, whose entries tasks scale to about 1; actions that are one control
+    interval late; actuators with a lag of two; now and then a push of 2 % of the largest rate; the
+    environment's numbers, the first `MOST_DRAWN` of them, drawn anew within 20 %. What the environment has of
+    them anyway stays as it is.
+    """
+    task = TASKS[env_id]()
+    turning = {
+        entry.name: 0.02 * task.examples.reach
+        for entry in task.scene._layout.state
+        if entry.unit == "rad/s" and entry.coordinate in task.scene._layout.free
+    }
+    hidden = [*_positive(env_id)][:MOST_DRAWN]
+    found = {
+        "noise": {"observation_noise": 0.01},
+        "late by a step": {"action_delay": task.interval},
+        "lag of two steps": {"lag": 2.0 * task.interval},
+        "pushes": {"push": (0.5, turning)},
+        "hidden, within 20 %": {"randomize": dict.fromkeys(hidden, (0.8, 1.2))},
+    }
+    if not (turning and task.examples.reach):
+        del found["pushes"]
+    on = type(task).imperfections.keys()
+    return [Condition(name, options) for name, options in found.items() if not options.keys() & on]
+
+
+def on_board(env_id: str) -> list[Condition]:
+    """Return the conditions by which an environment's board measures robustness, see `record.Goal.rules`."""
+    goal = TASKS[env_id].goal
+    more = imperfections(env_id) if goal is not None and goal.rules >= 2 else []
+    return disturbances(env_id) + more
 
 
 def conditions(env_id: str) -> list[Condition]:

@@ -8,6 +8,7 @@ architecture   what it is
 ``linear``     action = gain · observation + offset, clipped
 ``plan``       states, actions and a gain for each step, and what holds in the end
 ``table``      actions over a grid, or values over a grid that are looked up one step ahead
+``mpc``        plans ahead on the exact model: horizon, weights of the end, budget of model steps
 ``controller`` one of `lag_envs.controllers`, with numbers
 =============  ===================================================================================
 
@@ -32,6 +33,7 @@ from lag_envs.leaderboard.architecture import POLICY, Architecture, Array, Polic
 from lag_envs.leaderboard.fields import Strict, accepted, between, shown
 from lag_envs.leaderboard.grids import Table
 from lag_envs.leaderboard.networks import GRU, MLP, Linear
+from lag_envs.leaderboard.planning import PlanAhead
 from lag_envs.leaderboard.protocol import Refused
 from lag_envs.leaderboard.tracking import Plan
 from lag_envs.tasks import TASKS, resolve
@@ -130,6 +132,7 @@ ARCHITECTURES: dict[str, type[Architecture]] = {
     "gru": GRU,
     "linear": Linear,
     "plan": Plan,
+    "mpc": PlanAhead,
     "table": Table,
     "controller": Controller,
 }

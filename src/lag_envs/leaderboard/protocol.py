@@ -46,6 +46,9 @@ FRAMES, MEMORY = 64, 256
 ALL_NUMBERS, CPU_SECONDS = 1_048_576, 3_600.0
 #: Numbers nearer to 0 count as 0: arithmetic with subnormal ones takes fifty times as long.
 TINY = 1e-150
+#: Steps that one who plans looks ahead, and steps of the model that it may take: for one of the environment,
+#: searches left out, and for a search.
+HORIZON, MODEL_STEPS, SEARCH_STEPS = 250, 10_000, 1_000_000
 #: Points of a learning curve.
 CURVE = 200
 

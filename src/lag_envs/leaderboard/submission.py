@@ -217,7 +217,7 @@ def about(files: Mapping[str, bytes]) -> About:
     training = _training(told.training, found) if told.training else {}
     kind = _kind(made, bool(training), told.kind)
     if not made.arrays and found:
-        raise Refused(f"policy_{found[0]}.safetensors: a built-in controller has no arrays; remove it")
+        raise Refused(f"policy_{found[0]}.safetensors: such a policy has no arrays; remove it")
     least = protocol.LEARNED_POLICIES if kind == "learned" else 1
     if made.arrays and len(found) < least:
         raise Refused(f"there must be at least {least} policies (kind {kind}), got {len(found)}")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lag_envs import __version__
 from lag_envs.errors import UserError
-from lag_envs.evaluation.conditions import OFTEN, Condition, disturbances, often
+from lag_envs.evaluation.conditions import OFTEN, Condition, often, on_board
 from lag_envs.evaluation.rollout import Meter, Outcome, PolicyError, Rollout, play, record
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.leaderboard import protocol
@@ -75,7 +75,7 @@ def verify(
     started, busy = time.perf_counter(), time.process_time()
     env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
     # Kicks are others when acting often, and it takes as many episodes again until they make no difference.
-    runs = [(condition, few) for condition in disturbances(env)]
+    runs = [(condition, few) for condition in on_board(env)]
     runs.append((often(env), episodes if TASKS[env]().draws else few))
     nominal, *sizes = (condition.steps(env) * count for condition, count in [(Condition(), episodes), *runs])
 

@@ -30,6 +30,7 @@ from lag_envs.scenes.shapes import Window
 if TYPE_CHECKING:
     import sympy
 
+    from lag_envs.scenes.fitting.result import Fit
     from lag_envs.stepping.general import SeriesStepper, StepBound
     from lag_envs.stepping.lag import LaggedStepper
     from lag_envs.stepping.normal_forms import NormalForm
@@ -638,6 +639,62 @@ class Scene(metaclass=SceneType):
             record = recording.record(self, self._layout)
             known[parameters] = motion.derive_motion(self, self._layout, record, parameters)
         return known[parameters]
+
+    def fit(
+        self,
+        recordings: Sequence[tuple[ArrayLike, ArrayLike | int | None, float]],
+        free: Sequence[str],
+        *,
+        noise: Mapping[str, float] | None = None,
+        level: float = 0.95,
+    ) -> Fit:
+        """Fit parameters to recordings of the motion.
+
+        Least squares of what was measured less what is simulated, of all recordings together: the most
+        likely parameters where the noise is normal and independent. The start of each recording is unknown
+        too. The search is by multiple shooting with exact derivatives: it cuts recordings into short pieces,
+        so that it finds its way from parameters that are far off and along chaotic motions, and closes the
+        gaps between them.
+
+        Parameters
+        ----------
+        recordings : sequence of (states, controls, dt)
+            ``states``, shape (N, n_state), at equal intervals ``dt`` [s]; NaN where nothing was measured, be
+            it a sample or a whole column. Angles that were measured within one turn may jump by 2π.
+            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; a last
+            one for the last sample may be there and is not used. None where all are 0, or there is none.
+        free : sequence of str
+            The parameters to find. The search begins with the scene's values. Others are held, except those
+            with the value that their default makes from others: they go on following.
+        noise : mapping from str to float, optional
+            Standard deviation of the measurements of each state. By default it is estimated, each state's its
+            own.
+        level : float, default 0.95
+            Level of the confidence intervals.
+
+        Returns
+        -------
+        fitting.result.Fit
+            Estimates, standard errors, intervals, the fitted scene, residuals. It prints as a table, and
+            `plot` draws the residuals.
+
+        Warns
+        -----
+        FitWarning
+            Where data determine a parameter badly or two hardly apart, where residuals are larger than the
+            noise or not independent. `Fit.warnings` has the texts.
+
+        Raises
+        ------
+        ValueError
+            For data that do not determine the parameters, naming those; for a parameter that the scene lacks;
+            for recordings of a wrong shape, with too few values, or with controls that are not finite.
+        StepRefused
+            Where the motion cannot be simulated with the parameters that the search begins with.
+        """
+        from lag_envs.scenes.fitting.fit import fit
+
+        return fit(self, recordings, free, noise, level)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: parameters, state, controls, equations."""

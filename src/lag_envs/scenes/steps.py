@@ -140,11 +140,19 @@ def vjp(
         raise ValueError(
             f"cotangent must have the shape of the state after the step, {(*shape, n)}, got {seeds.shape}"
         )
-    found, refused = _derivatives(scene, by).vjp(states, controls, check_step(dt), seeds.reshape(-1, n))
-    _check_refused(scene, states, controls, dt, refused)
+    found = pulled(scene, states, controls, check_step(dt), seeds.reshape(-1, n), by)
     found = found.reshape(*shape, n + m + len(by))
     parts = found[..., :n], found[..., n : n + m], found[..., n + m :]
     return parts[:2] if parameters is None else parts
+
+
+def pulled(
+    scene: Scene, states: Array, controls: Array, dt: float, cotangents: Array, by: tuple[str, ...]
+) -> Array:
+    """Return what `vjp` does for rows of checked arrays, side by side."""
+    found, refused = _derivatives(scene, by).vjp(states, controls, dt, cotangents)
+    _check_refused(scene, states, controls, dt, refused)
+    return found
 
 
 def _rows(scene: Scene, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:

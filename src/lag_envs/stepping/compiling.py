@@ -49,9 +49,10 @@ def record_block(
     return lines, [name if name in named else result for name, result in zip(outputs, results, strict=True)]
 
 
-def count_operations(lines: Iterable[str]) -> int:
-    """Return how many operations the blocks in these lines of code consist of."""
-    return sum(len(_blocks[block][0]) for line in lines for block in re.findall(_BLOCK, line))
+def count_operations(lines: Iterable[str], kinds: frozenset[str] | None = None) -> int:
+    """Return how many operations, of these kinds or of all, the blocks in these lines of code consist of."""
+    blocks = (_blocks[name][0] for line in lines for name in re.findall(_BLOCK, line))
+    return sum(kinds is None or operation.op in kinds for block in blocks for operation in block)
 
 
 @cache

@@ -8,6 +8,7 @@ neighbours.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from lag_envs.stepping.compiling import BLOCK, compile_python
 from lag_envs.stepping.lowering import SeriesRecord
-from lag_envs.stepping.machine import Layout, compile_attempt, compile_tangent
+from lag_envs.stepping.machine import Layout, compile_attempt, compile_pull, compile_tangent
 from lag_envs.stepping.series import TOLERANCE, Series
 
 #: A control step that would need more attempts than this is refused.
@@ -205,3 +206,71 @@ def compile_advance_tangents(
     numbers = _numbers(record, tolerance) | {"GUIDED": guided}
     advance = compile_python("advance", _advance_tangent, *helpers, **numbers)
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)
+
+
+def _pull_all(values, seeds, found, dt, order):  # type: ignore[no-untyped-def]
+    """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
+
+    A row of `values` is an input, a place or a velocity, of `seeds` the cotangent of a place or a velocity at
+    the end. Rows of `found` are filled in: cotangents of places and velocities at the start, and of sources.
+    """
+    rows, back = np.zeros(size * BLOCK), np.zeros((status + 2 + len(found)) * BLOCK)
+    ends, kept = status + 2, np.empty((8, 2 * n + 2, LANES))
+    count = values.shape[1]
+    for first in range(0, count, LANES):
+        for i in range(LANES):
+            lane = min(first + i, count - 1)
+            for r in range(status):
+                rows[r * BLOCK + i] = back[r * BLOCK + i] = values[r, lane]
+            rows[status * BLOCK + i] = 0.0
+            rows[left * BLOCK + i] = dt if first + i < count else 0.0
+            rows[wish * BLOCK + i] = dt
+            for r in range(len(found)):
+                back[(ends + r) * BLOCK + i] = seeds[r, lane] if r < 2 * n else 0.0
+        substeps, going = 0, True
+        while going:
+            if substeps == kept.shape[0]:
+                longer = np.empty((2 * substeps, 2 * n + 2, LANES))
+                longer[:substeps] = kept
+                kept = longer
+            for i in range(LANES):
+                for r in range(2 * n):
+                    kept[substeps, r, i] = rows[(q + r) * BLOCK + i]
+                kept[substeps, 2 * n, i] = rows[left * BLOCK + i]
+            going = attempt(rows, 0, dt, order, tolerance) == 0
+            moved = False
+            for i in range(LANES):
+                used = kept[substeps, 2 * n, i] - rows[left * BLOCK + i]
+                kept[substeps, 2 * n + 1, i] = used
+                moved |= used > 0.0
+                if rows[left * BLOCK + i] > 0.0 and (
+                    rows[status * BLOCK + i] >= LARGEST_COUNT
+                    or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
+                ):
+                    return first + i + 1
+            substeps += moved
+        for j in range(substeps - 1, -1, -1):
+            for i in range(LANES):
+                for r in range(2 * n):
+                    back[(q + r) * BLOCK + i] = kept[j, r, i]
+                back[status * BLOCK + i] = dt - kept[j, 2 * n, i]
+                back[(status + 1) * BLOCK + i] = kept[j, 2 * n + 1, i]
+            pull(back, 0, order)
+        for i in range(min(LANES, count - first)):
+            for r in range(len(found)):
+                found[r, first + i] = back[(ends + r) * BLOCK + i]
+    return 0
+
+
+@cache
+def compile_pull_all(
+    record: SeriesRecord, sources: tuple[str, ...], tolerance: float = TOLERANCE, width: int | None = None
+) -> Callable:
+    """Compile ``pull_all(values, seeds, found, dt, order)``, see `_pull_all` and `compile_pull`."""
+    width = width or lanes(record)
+    numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
+    helpers = (
+        compile_attempt(dataclasses.replace(record, tangents={}), width),
+        compile_pull(record, sources, width),
+    )
+    return compile_python("pull_all", _pull_all, *helpers, **numbers)

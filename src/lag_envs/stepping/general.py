@@ -260,10 +260,10 @@ class SeriesTangent:
         by: tuple[str, ...],
         guide: Mapping[str, float],
     ) -> None:
-        from lag_envs.stepping.driver import compile_advance_tangents
         from lag_envs.stepping.machine import slots_for
 
         self._stepper, self._numbers, self._given, self._by = stepper, numbers, record.given, by
+        self._record = record
         n = record.size
         seen = {(node.op, node.index) for node in record.nodes}
         self._still = [i for i in range(n) if ("place", i) not in seen]
@@ -280,7 +280,6 @@ class SeriesTangent:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
         self._guide = np.array([guide.get(name, 0.0) for name in record.given])
-        self._advance = compile_advance_tangents(record, self._columns, bool(self._guide.any()))
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
         """Return the derivatives of the states at the step's end by states, controls and parameters.
@@ -344,12 +343,74 @@ class SeriesTangent:
         return stacked(finished, count), 0
 
     def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
-        """Return cotangents of the states at the step's end as those of states, controls and parameters.
+        """Return gradients by states, controls and parameters from those by the states at the step's end.
 
         The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
         """
-        found, refused = self.jacobian(states, controls, dt, order)
-        return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+        if self._stepper.mechanics.coupling or self._guide.any():
+            found, refused = self.jacobian(states, controls, dt, order)
+            return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
+        by_start, by_end = self._linear(dt)
+        moving, count = len(self._moving), len(states)
+        seeds = cotangents @ by_end
+        given = (
+            np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
+        )
+        values = np.empty((len(self._given) + moving, count))
+        values[: len(self._given)] = self._constants[:, None]
+        for i, name in enumerate([*self._given, *self._moving]):
+            if name in self._rows:
+                values[i] = given[:, self._rows.index(name)]
+        found = np.empty((moving + len(self._sources), count))
+        refused = self._pull(values, np.ascontiguousarray(seeds[:, :moving].T), found, dt, order)
+        if not refused and not np.isfinite(found).all():
+            refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
+        return seeds[:, moving:] + found.T @ by_start[self._pulled], refused
+
+    def _linear(self, dt: float) -> tuple[Any, Any]:
+        """Return what the series starts from by states, controls and parameters; and its end's effect.
+
+        Where no rate is held, both are the same for all states: matrices of shape (rows, n_state + n_controls
+        + n_parameters), and (n_state, places and velocities, then the same columns).
+        """
+        xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
+        sizes = moving, len(layout.state), len(self._stepper.arguments), len(self._by)
+        ends, y, u, p = variables_of(*(np.zeros((1, n)) for n in sizes))
+        before = self._stepper.prepare(xp, y, u, self._numbers)
+        before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
+        by_start = np.zeros((len(self._rows), sum(sizes)))
+        for i, name in enumerate(self._rows):
+            by_start[i] = np.reshape(getattr(before[name], "slopes", 0.0), -1)
+        q, v = ends[: moving // 2], ends[moving // 2 :]
+        finished = self._stepper.finish(xp, q, v, y, u, dt, self._numbers)
+        return by_start[:, moving:], stacked(finished, 1)[0]
+
+    @cached_property
+    def _advance(self) -> Callable:
+        from lag_envs.stepping.driver import compile_advance_tangents
+
+        return compile_advance_tangents(self._record, self._columns, bool(self._guide.any()))
+
+    @cached_property
+    def _sources(self) -> tuple[str, ...]:
+        return tuple(name for name in self._columns if name not in self._moving)
+
+    @cached_property
+    def _rows(self) -> list[str]:
+        """What follows from states, controls and parameters when the series begins."""
+        inputs = [name for name in self._given if name not in self._record.constants]
+        return list(dict.fromkeys([*self._moving, *inputs, *self._sources]))
+
+    @cached_property
+    def _pulled(self) -> list[int]:
+        """Rows whose cotangents are found."""
+        return [self._rows.index(name) for name in (*self._moving, *self._sources)]
+
+    @cached_property
+    def _pull(self) -> Callable:
+        from lag_envs.stepping.driver import compile_pull_all
+
+        return compile_pull_all(self._record, self._sources)
 
 
 class StepBound(NamedTuple):

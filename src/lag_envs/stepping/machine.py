@@ -14,16 +14,15 @@ from numba import types
 from numba.extending import intrinsic
 
 from lag_envs.mechanics import algebra
-from lag_envs.stepping import dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping import backward, dual, elementary, lowering, primitives, series, tracing
+from lag_envs.stepping.backward import Backward
 from lag_envs.stepping.compiling import BLOCK, compile_function
 from lag_envs.stepping.dual import Dual
 from lag_envs.stepping.lowering import ELAPSED, SeriesRecord
 from lag_envs.stepping.primitives import emit
-from lag_envs.stepping.series import LARGEST_ORDER, Lane, Series
+from lag_envs.stepping.series import STRIDE, Lane, Series
 
 _DOUBLE, _INT, _BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
-#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
-STRIDE = LARGEST_ORDER + 3
 
 
 class Layout:
@@ -231,7 +230,7 @@ class Machine:
 @cache
 def _version() -> str:
     """Return a digest of the code that decides what is printed."""
-    modules = (algebra, dual, elementary, lowering, primitives, series, tracing)
+    modules = (algebra, backward, dual, elementary, lowering, primitives, series, tracing)
     source = "".join(inspect.getsource(module) for module in modules) + inspect.getsource(
         sys.modules[__name__]
     )
@@ -416,5 +415,60 @@ def _write_tangent(
     for i, number in enumerate([*q, *v]):
         builder.store(number.value, at(layout.q + i))
         builder.store(wide.number(0.0) if number.slopes is None else number.slopes, slopes(i)).align = 8
+    builder.ret_void()
+    return function
+
+
+def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
+    """Return ``pull(rows, at, order)``: steps of given lengths backwards, for compiled code.
+
+    Rows are `BLOCK` numbers apart: inputs, places and velocities as in `Layout`, the time since the control
+    step began, the step, cotangents of places and velocities after it, and of the sources. The cotangents of
+    places and velocities are replaced by those before the step, those of the sources are added to.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    sources : tuple of str
+        See `Backward`.
+    lanes : int
+        How many steps are taken at once.
+    """
+    digest = hashlib.sha256(f"{_version()} {record.digest} {sources} {lanes} pull".encode()).hexdigest()[:16]
+    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])
+    return _linked(
+        f"pull_{digest}", kind, lambda module, name: _write_pull(module, name, kind, record, sources, lanes)
+    )
+
+
+def _write_pull(
+    module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, sources: tuple, lanes: int
+) -> ir.Function:
+    """Write the function ``name(rows, order)`` into a module."""
+    step, layout, n = Backward(record, sources), Layout(record), record.size
+    function = ir.Function(module, kind, name)
+    set.add(function.attributes, '"prefer-vector-width"="512"')
+    rows, order = function.args
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    t = Machine(builder, step.entries, lanes, True)
+
+    def pointer(row: int) -> ir.Value:
+        return builder.bitcast(builder.gep(rows, [ir.Constant(_INT, row * BLOCK)]), t.kind.as_pointer())
+
+    def read(row: int) -> ir.Value:
+        value = builder.load(pointer(row))
+        value.align = 8
+        return value
+
+    inputs = {name: read(row) for name, row in layout.inputs.items()}
+    inputs[ELAPSED] = read(layout.status)
+    q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
+    ends = layout.status + 2
+    seeds = [read(ends + i) for i in range(2 * n)]
+    starts, by_sources = step.pull(t, inputs, q, v, read(layout.status + 1), order, seeds)
+    by_sources = [t.add(read(ends + 2 * n + i), x) for i, x in enumerate(by_sources)]
+    for i, value in enumerate([*starts, *by_sources]):
+        builder.store(value, pointer(ends + i)).align = 8
     builder.ret_void()
     return function

@@ -210,7 +210,7 @@ class NormalForm:
         rates: Mapping[str, Sequence[float]],
         parameters: int,
     ) -> tuple[Any, int]:
-        """Return what cotangents of the states at the step's end are as those of states, controls, parameters.
+        """Return gradients by states, controls and parameters from those by the states at the step's end.
 
         The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
         """

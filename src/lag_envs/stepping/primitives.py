@@ -77,6 +77,62 @@ def select(typingctx, condition, a, b):  # type: ignore[no-untyped-def]
     return kind(condition, a, b), codegen
 
 
+def _atomic(instruction: Callable, arguments: int, result: Any) -> Callable:
+    """Return an instruction for threads, ``(array, index, *arguments)``, on a number of an array."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        array = context.make_array(signature.args[0])(context, builder, args[0])
+        return instruction(builder, builder.gep(array.data, [args[1]]), *args[2:])
+
+    def signed(array: Any) -> tuple:
+        return result(array, *[types.uint64] * (1 + arguments)), codegen
+
+    scope = {"signed": signed}
+    names = "".join(f", x{i}" for i in range(arguments))
+    exec(f"def atomic(typingctx, array, index{names}): return signed(array)", scope)
+    return intrinsic(scope["atomic"])
+
+
+def _replace(builder: ir.IRBuilder, at: ir.Value, old: ir.Value, new: ir.Value) -> ir.Value:
+    return builder.extract_value(builder.cmpxchg(at, old, new, "acq_rel", "acquire"), 1)
+
+
+#: ``(array, index)``: the number. What another thread wrote before it stored the number is there too.
+atomic_load = _atomic(lambda b, at: b.load_atomic(at, "acquire", 8), 0, types.uint64)
+#: ``(array, index, value)``
+atomic_store = _atomic(lambda b, at, value: b.store_atomic(value, at, "release", 8), 1, types.void)
+#: ``(array, index, value)``: the number before.
+atomic_add = _atomic(lambda b, at, value: b.atomic_rmw("add", at, value, "acq_rel"), 1, types.uint64)
+atomic_max = _atomic(lambda b, at, value: b.atomic_rmw("umax", at, value, "acq_rel"), 1, types.uint64)
+#: ``(array, index, old, new)``: whether it was the old number, and so is the new one now.
+atomic_replace = _atomic(_replace, 2, types.boolean)
+
+
+@intrinsic
+def address(typingctx, array):  # type: ignore[no-untyped-def]
+    """Return where an array's numbers lie, as uint64."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        given = context.make_array(signature.args[0])(context, builder, args[0])
+        return builder.ptrtoint(given.data, _INT)
+
+    return types.uint64(array), codegen
+
+
+@intrinsic
+def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
+    """Return an array like this one whose numbers lie at an address (uint64), where nothing keeps them."""
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        made = context.make_array(signature.return_type)(context, builder, args[0])
+        made.data = builder.inttoptr(args[1], made.data.type)
+        made.meminfo = ir.Constant(made.meminfo.type, None)
+        made.parent = ir.Constant(made.parent.type, None)
+        return made._getvalue()
+
+    return array(array, types.uint64), codegen
+
+
 @intrinsic
 def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     """Ask for 512-bit vectors where the processor has them.
@@ -260,6 +316,13 @@ NAMES = {
     "fma": fma,
     "select": select,
     "wide_vectors": wide_vectors,
+    "address": address,
+    "moved": moved,
+    "atomic_load": atomic_load,
+    "atomic_store": atomic_store,
+    "atomic_add": atomic_add,
+    "atomic_max": atomic_max,
+    "atomic_replace": atomic_replace,
     "uniform": uniform,
     "episode_key": episode_key,
 }

@@ -45,6 +45,8 @@ TOLERANCE = 1e-14
 SMALLEST_SIZE = 1e-12
 #: While a control that lags is still far from its command, a substep is at most so many time constants.
 REACH = 2.0
+#: Numbers that are set aside for one series: a velocity has N + 1, and one more where N is odd.
+STRIDE = LARGEST_ORDER + 3
 #: How often a step is shortened before it counts as failed.
 TRIES = 4
 #: How many sums run side by side in one loop: enough to keep the processor busy, few enough for its
@@ -484,7 +486,7 @@ class Series:
 
     def _accelerate(self, t: Target, inverse: Inverse, right: Sequence, h: Any, k: Any) -> list:
         """Store a_k and v_{k+1}; return a_k."""
-        a = [t.number(0.0) if x is None else x for x in _times(t, inverse.rows, right)]
+        a = [t.number(0.0) if x is None else x for x in times(t, inverse.rows, right)]
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
         for i in range(self.size):
@@ -678,7 +680,7 @@ def _add_product(t: Target, total: Any, a: Any, b: Any) -> Any:
     return t.mul(a, b) if total is None else t.fma(a, b, total)
 
 
-def _times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
+def times(t: Target, matrix: Sequence[Sequence], vector: Sequence) -> list:
     """Return a matrix times a vector; None stands for zero."""
     result = []
     for row in matrix:
@@ -747,17 +749,17 @@ class Certificate:
         for i in self._series._live:
             self._tails[i] = self._tail(i)
         right, change = self._balance()
-        base = [t.number(0.0) if b is None else t.mul(self._h, b) for b in _times(t, self._inverse, right)]
+        base = [t.number(0.0) if b is None else t.mul(self._h, b) for b in times(t, self._inverse, right)]
         coupled = any(e is not None for row in change for e in row)
         # The fixed point of E = base + C E by a few terms of its Neumann series, a little enlarged; any E > 0
         # that passes the strict inequality is as good as another.
         matrix: list = [[None] * n for _ in range(n)]
         if coupled:
-            columns = [_times(t, self._inverse, column) for column in zip(*change, strict=True)]
+            columns = [times(t, self._inverse, column) for column in zip(*change, strict=True)]
             matrix = [list(row) for row in zip(*columns, strict=True)]
 
         def again(guess: list) -> list:
-            more = _times(t, matrix, guess)
+            more = times(t, matrix, guess)
             return [b if m is None else t.add(b, m) for b, m in zip(base, more, strict=True)]
 
         guess = base

@@ -28,7 +28,7 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import lift_lines
 from lag_envs.stepping.series import check_order
 from lag_envs.tasks.imperfections import KEYWORDS, Drawn, imperfections_of
-from lag_envs.tasks.record import Controller, Examples, Goal, Optimum, ValueIteration
+from lag_envs.tasks.record import Controller, Examples, Goal, Open, Optimum, ValueIteration
 
 if TYPE_CHECKING:
     from lag_envs.stepping.normal_forms import NormalForm
@@ -109,6 +109,8 @@ class Task:
         How ``python -m agents.optimum`` finds the plan that ships with the package.
     optimum : record.Optimum, optional
         The largest return from given starts, where it is known.
+    open : record.Open, optional
+        That nobody has solved it, and what was tried.
     examples : record.Examples
         Cases for tests and pictures.
     difficulty : str
@@ -153,6 +155,7 @@ class Task:
     value_iteration: ClassVar[ValueIteration | None] = None
     plans: Any = None
     optimum: ClassVar[Optimum | None] = None
+    open: ClassVar[Open | None] = None
     examples: ClassVar[Examples] = Examples()
     difficulty: ClassVar[str] = ""
     note: ClassVar[str] = ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -10,7 +11,7 @@ from typing import Any
 from lag_envs.scenes import Chain
 from lag_envs.scenes.shapes import Bodies, Polygon
 from lag_envs.tasks.base import FASTEST_START
-from lag_envs.tasks.record import Controller, Examples, Goal, Plans
+from lag_envs.tasks.record import Controller, Examples, Goal, Open, Plans
 from lag_envs.tasks.track import GuardedTrack, Support
 
 
@@ -245,7 +246,7 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -274,7 +275,7 @@ class SwingUpTriple(SwingUp):  # noqa: D101
     )
     hyperparameters = {
         "fast_ppo": {
-            "n_timesteps": 5e5,
+            "n_timesteps": 5e6,
             "n_epochs": 5,
             "reward_scale": 1.0,
             "episode_share": 1.0,
@@ -290,6 +291,51 @@ Best known is one recorded plan with time-varying feedback, which nearly always 
 that are improved for each start use the control at its limits, where feedback has no say, and lose the chain
 on the way.
 """
+
+
+class SwingUpTripleNoisy(SwingUpTriple):  # noqa: D101
+    __doc__ = (
+        (SwingUpTriple.__doc__ or "")
+        .replace("and hold it upright.", "and hold it upright, through noise.", 1)
+        .replace("The bounds are", "Each entry has normal noise. Without it the bounds are", 1)
+    )
+    id = "TripleBarNoisy-v0"
+    imperfections = {"observation_noise": 0.008}
+
+    controllers = {
+        "plan + TVLQR": SwingUpTriple.controllers["plan + TVLQR"],
+        "filter + plan + TVLQR": Controller(
+            "lag_envs.controllers.filtering:follow_filtered",
+            {"effort": 1.0, "drift": 0.01},
+            tune={"effort": (0.02, 4.0), "drift": (0.0, 0.03)},
+        ),
+    }
+    open = Open(
+        "plan + TVLQR",
+        {"observation_noise": None},
+        knows="sees the exact state",
+        tried={
+            "plan + TVLQR": "the best of 18 plans, followed by what is seen",
+            "filter + plan + TVLQR": "the same plan by the estimate of an extended Kalman filter on the "
+            "exact model; weight and drift the best of 13 pairs in 96 or 192 episodes each",
+            "fast PPO": "5 million steps a seed, without memory",
+        },
+    )
+    examples = dataclasses.replace(SwingUpTriple.examples, variants={"perfect": {"observation_noise": None}})
+    difficulty = (
+        "In the linear approximation a filter's estimate would do, with control and track to spare. But "
+        "under what is left of the noise the chain strays farther than that reaches, and is lost on the way "
+        "up or at the top."
+    )
+    note = """
+Best is the plan followed gently by a filter's estimate. Whoever sees the exact state hardly ever loses the
+chain. Nobody has tried to swing it up again once it is lost, or to choose motions that show more.
+"""
+
+    @property
+    def plans(self) -> Plans:
+        """Those of the task without noise."""
+        return dataclasses.replace(super().plans, of=SwingUpTriple.id)
 
 
 class SwingUpAnywhere(SwingUp):
@@ -361,7 +407,7 @@ class SwingUpAnywhere(SwingUp):
     id = "DoubleBarAnywhere-v0"
     draws = 2
     kick_chance, largest_kick = 0.005, 1.0
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 5e5}}
+    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
 
     controllers = {
         "LQR": Controller("lag_envs.controllers.tracking:hold"),

@@ -167,6 +167,7 @@ class Tilt(_Shell):
     goal = Goal(
         "success: within 0.05 rad of the target throughout the last second; time: until it is so for good",
         arrival="there",
+        rules=1,
     )
     reference = "LQR"
     controllers = {
@@ -325,6 +326,7 @@ class Pump(_Shell):
         "success: energy within 20 % of the wanted one throughout the last second; time: until it is so for "
         "good",
         arrival="within 20 % of the energy",
+        rules=1,
     )
     reference = "energy pump"
     controllers = {
@@ -481,6 +483,7 @@ class Damping(Task):
         "success: never loses contact in 10 s; time: until it comes to rest first, √(θ² + θ'²/ω₀²) <= 0.1",
         hold=None,
         terminated=None,
+        rules=1,
     )
     reference = "switching line"
     controllers = {

@@ -110,6 +110,7 @@ class Tilt(Task):
     goal = Goal(
         "success: within 5 cm of the mark throughout the last second; time: until it is so for good",
         arrival="there",
+        rules=1,
     )
     reference = "cascade"
     controllers = {
@@ -354,6 +355,7 @@ class Brake(Task):
         "success: across the line, at 0.55 m/s at most at the end of that step; time: until then",
         hold=None,
         terminated=True,
+        rules=1,
     )
     reference = "switching line"
     controllers = {

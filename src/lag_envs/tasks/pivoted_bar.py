@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -121,6 +122,7 @@ class SwingUp(GuardedTrack, _Bar):
     goal = Goal(
         "success: within 0.2 rad of upright throughout the last second; time: until it is so for good",
         arrival="upright",
+        rules=1,
     )
     controllers = {
         "energy shaping + LQR": Controller(
@@ -331,12 +333,13 @@ class SwingUpUnknown(SwingUp):
     hyperparameters = {
         **SwingUp.hyperparameters,
         "fast_ppo": {
-            "n_timesteps": 5e5, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "n_timesteps": 2e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
             "reward_scale": 1.0, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
             "first_layer_scale": 3.0,
         },
     }  # fmt: skip
     value_iteration = None
+    goal = dataclasses.replace(SwingUp.goal, rules=2)
     examples = Examples(
         start=SwingUp.examples.start,
         refused=SwingUp.examples.refused,
@@ -433,7 +436,10 @@ class Balance(_Bar):
     largest_angle = 0.35
 
     goal = Goal(
-        "success: neither the bar nor the support leaves its limits in 10 s; there is no time", None, None
+        "success: neither the bar nor the support leaves its limits in 10 s; there is no time",
+        None,
+        None,
+        rules=1,
     )
     reference = "LQR"
     controllers = {

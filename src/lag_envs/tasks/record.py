@@ -26,12 +26,16 @@ class Goal:
     arrival : str
         What is reached then, in a word or two. docs/agents.md reports when that is, and what is lost by then;
         with an empty string it does not.
+    rules : int
+        Version of the board's rules: 2 adds to its disturbances imperfect sensors and actuators, and hidden
+        parameters. A board keeps the version that it began with.
     """
 
     text: str
     hold: float | None = 1.0
     terminated: bool | None = False
     arrival: str = ""
+    rules: int = 2
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,8 @@ class Plans:
     smooth : mapping
         Parameters of the scene that differ in the model of the feedback: dry friction at rest is so steep
         that its slope misleads.
+    of : str
+        Id of the task whose recorded plans are followed; empty: its own.
     """
 
     place: str
@@ -97,6 +103,29 @@ class Plans:
     weights: Mapping[str, float]
     effort: float
     smooth: Mapping[str, float] = field(default_factory=dict)
+    of: str = ""
+
+
+@dataclass(frozen=True)
+class Open:
+    """That a task is open: the best policies known stay far below a reference with privileged knowledge.
+
+    Parameters
+    ----------
+    controller : str
+        Name of the controller of the task that is the reference.
+    options : mapping
+        Keywords of the environment in which it plays: those that give it what policies lack.
+    knows : str
+        What it knows that they do not, in words.
+    tried : mapping of str to str
+        What was tried: methods, and the budget of each.
+    """
+
+    controller: str
+    options: Mapping[str, Any]
+    knows: str
+    tried: Mapping[str, str]
 
 
 @dataclass(frozen=True)

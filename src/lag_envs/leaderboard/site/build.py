@@ -66,7 +66,12 @@ COLUMNS = (
     Column("effort", "Effort", "Mean square of the action.", True),
     Column("env_steps", "Steps", "Environment steps used for training, as stated by the authors.", True),
     Column("seconds", "Training", "Time used for training, as stated by the authors.", True),
-    Column("robustness", "Robust", "Least score over environments with changed masses, drag and the like."),
+    Column(
+        "robustness",
+        "Robust",
+        "Least score over environments with changed masses, drag and the like, on newer boards also with "
+        "noise, delays and pushes.",
+    ),
     Column("often", "10 × rate", "Score when acting ten times as often."),
 )
 
@@ -226,6 +231,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
         "title": given["id"],
         "about": [],
         "difficulty": "",
+        "open": None,
         "drives": [],
     }
     board |= {"protocol": protocol} | given | describe(given["id"])

@@ -17,8 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.scenes.base import Scene
 from lag_envs.scenes.picture import Picture
 from lag_envs.scenes.shapes import Circle, Frame, Magnifier, Ruler, Shape
+from lag_envs.scores import share_of_privileged
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.measured import measured
 
 #: Unit of states, actions and returns, of which three digits are shown.
 UNIT = 1e-4
@@ -37,9 +39,10 @@ def describe(env_id: str) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``state_names``, ``state_units``,
-        ``pairs`` (which entries are a coordinate and its rate), ``dt`` [s] and ``picture`` (None where the
-        scene has no bodies). Empty for an id that this version does not have, such as a frozen board's.
+        ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``open`` (None, or ``knows``,
+        ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (which
+        entries are a coordinate and its rate), ``dt`` [s] and ``picture`` (None where the scene has no
+        bodies). Empty for an id that this version does not have, such as a frozen board's.
 
     Examples
     --------
@@ -61,12 +64,22 @@ def describe(env_id: str) -> dict[str, Any]:
             if paragraph.strip()
         ],
         "difficulty": task.difficulty,
+        "open": _open(task),
         "state_names": list(task.scene.state_names),
         "state_units": list(task.scene.state_units),
         "pairs": _pairs(task.scene),
         "dt": task.dt,
         "picture": picture(Picture(task)),
     }
+
+
+def _open(task: Task) -> dict[str, Any] | None:
+    """Return what was tried of a task that is open, and how far it got."""
+    if task.open is None:
+        return None
+    found = measured(task.id).get("measured", {})
+    tried = [[name, budget, found.get(name, {}).get("mean")] for name, budget in task.open.tried.items()]
+    return {"knows": task.open.knows, "share": share_of_privileged(task.id), "tried": tried}
 
 
 def _pairs(scene: Scene) -> list[list[int]]:

@@ -1,0 +1,54 @@
+"""How many multiply-adds a second a core does at most, measured: a section of ``lag-envs bench``.
+
+A product costs as much as a product with a sum, so each counts as one. Sums alone are left out, for many
+processors do them beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from lag_envs.envs.program import Program
+from lag_envs.envs.vector import on_a_line
+from lag_envs.stepping.compiling import compile_function, count_operations
+
+#: Numbers, few enough for the nearest cache, and multiply-adds on each: enough that loads do not count.
+NUMBERS, TIMES = 1024, 12
+PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
+
+
+@cache
+def _compiled() -> Callable:
+    lines = [
+        "def multiply_adds(numbers, n):",
+        "    wide_vectors()",
+        "    for _ in range(n):",
+        f"        for i in range({NUMBERS}):",
+        "            x = numbers[i]",
+        *["            x = fma(x, 0.5, 1.0)"] * TIMES,
+        "            numbers[i] = x",
+    ]
+    return compile_function("multiply_adds", "\n".join(lines) + "\n")
+
+
+def peak() -> Callable[[int], int]:
+    """Return a function that does at least so many multiply-adds on each number, and returns how many."""
+    multiply_adds, numbers = _compiled(), on_a_line(np.ones(NUMBERS))
+
+    def run(count: int) -> int:
+        turns = -(-count // TIMES)
+        multiply_adds(numbers, turns)
+        return turns * TIMES
+
+    return run
+
+
+def products(program: Program) -> int | None:
+    """Return how many products an ordinary step of one environment computes; None where a loop does it."""
+    if program.general:
+        return None
+    lines = [*program.control, *program.fast, *program.outcome, *program.kick, *program.observe]
+    return count_operations(lines, PRODUCTS)

@@ -1,0 +1,236 @@
+"""A step of a batch, shared among threads.
+
+Whoever leads a step opens a turn, by its number. The leader and helpers claim blocks of environments, each
+from another place on, so that a block mostly stays in the cache of one core. An environment's bits do not
+depend on who steps it, or when. The leader waits only for blocks that were claimed: a helper that comes late,
+or never, costs nothing but its help, and one that comes when the turn is over finds every block claimed. So
+nothing hangs, or goes wrong, by a thread that is gone after a fork.
+
+Threads are Python's, for compiled code does not hold the interpreter's lock. They are started when first
+needed, and ended before a process forks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import queue
+import threading
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.host import usable_cores
+from lag_envs.stepping.compiling import BLOCK, compile_python
+
+#: Environments for each thread, by default: fewer are stepped before another thread is awake.
+SHARE = 4096
+#: How often a thread looks for what another is about to do, some 50 µs, before it sleeps.
+PATIENCE = 200_000
+#: Numbers that threads share: the turn, blocks that are not done, episodes that are over, the environment
+#: that was refused, where the five arrays of a step lie, bytes of an action's number. Behind them, for each
+#: block, the turn in which it was claimed last; and for each share whether a helper has it.
+WORDS = 10
+
+
+def words(blocks: int) -> int:
+    """Return how many numbers threads share."""
+    return WORDS + 2 * blocks
+
+
+def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
+    """Note, in a copy of a batch's keys, that no helper has a share of the copy."""
+    ids[3 * count + WORDS + -(-count // BLOCK) :] = 0
+
+
+# --- compiled ---
+
+
+def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares):  # type: ignore[no-untyped-def]
+    """Take part in a turn, see `compile_step_all`."""
+    at, now = np.uint64(3 * count), np.uint64(turn)
+    blocks = np.uint64((count + BLOCK - 1) // BLOCK)
+    if share > 0:
+        mine = at + np.uint64(WORDS) + blocks + np.uint64(share)
+        if not atomic_replace(ids, mine, np.uint64(0), np.uint64(1)):
+            return 0, 0  # another helper still waits for the next turn, with this `par`
+        # Waking costs much of a turn, so a helper takes part in those that soon follow too.
+        while opened(ids, at, now):
+            now = atomic_load(ids, at)
+            if ids[at + np.uint64(9)] != np.uint64(action.itemsize):
+                break
+            step_blocks(
+                f, ids, par,
+                moved(action, ids[at + np.uint64(4)]),
+                moved(obs, ids[at + np.uint64(5)]),
+                moved(reward, ids[at + np.uint64(6)]),
+                moved(terminated, ids[at + np.uint64(7)]),
+                moved(truncated, ids[at + np.uint64(8)]),
+                count, at, blocks, now, np.uint64(share), np.uint64(shares),
+            )  # fmt: skip
+            now += np.uint64(1)
+        atomic_store(ids, mine, np.uint64(0))
+        return 0, 0
+    if atomic_load(ids, at) < now:
+        if not done(ids, at):
+            return 0, -1
+        bad = bad_action(f, action, count)
+        if bad < 0:
+            return bad, 0
+        ids[at + np.uint64(1)] = blocks
+        ids[at + np.uint64(2)] = ids[at + np.uint64(3)] = np.uint64(0)
+        ids[at + np.uint64(4)] = address(action)
+        ids[at + np.uint64(5)] = address(obs)
+        ids[at + np.uint64(6)] = address(reward)
+        ids[at + np.uint64(7)] = address(terminated)
+        ids[at + np.uint64(8)] = address(truncated)
+        ids[at + np.uint64(9)] = np.uint64(action.itemsize)
+        atomic_store(ids, at, now)
+    step_blocks(
+        f, ids, par, action, obs, reward, terminated, truncated, count, at, blocks, now,
+        np.uint64(0), np.uint64(shares),
+    )  # fmt: skip
+    if not done(ids, at):
+        return 0, -1
+    return np.int64(ids[at + np.uint64(3)]), np.int64(ids[at + np.uint64(2)])
+
+
+def _next_block(ids, at, turn, blocks, tried, share, shares):  # type: ignore[no-untyped-def]
+    """Claim a block; return it, or `blocks` where none is left, and how many have been tried.
+
+    Shares lie behind one another. Their threads come from both ends of each pair of them and meet within; who
+    is done there goes on to the next pair.
+    """
+    first = share * blocks // shares
+    last = (share + np.uint64(1)) * blocks // shares - np.uint64(1)
+    while tried < blocks:
+        block = first + tried if share % np.uint64(2) == np.uint64(0) else last + blocks - tried
+        block = block if block < blocks else block - blocks
+        tried += np.uint64(1)
+        claim = at + np.uint64(WORDS) + block
+        before = atomic_load(ids, claim)
+        if before < turn and atomic_replace(ids, claim, before, turn):
+            return block, tried
+    return blocks, tried
+
+
+def _hand_in(ids, at, taken, over, refused):  # type: ignore[no-untyped-def]
+    """Add what became of the blocks that were claimed, and then that they are done."""
+    if taken > np.uint64(0):
+        atomic_add(ids, at + np.uint64(2), over)
+        atomic_max(ids, at + np.uint64(3), refused)
+        atomic_add(ids, at + np.uint64(1), np.uint64(0) - taken)
+
+
+def _opened(ids, at, turn):  # type: ignore[no-untyped-def]
+    """Tell whether a turn is open, or over; wait a little while it is not."""
+    for _ in range(PATIENCE):
+        if atomic_load(ids, at) >= turn:
+            return True
+    return False
+
+
+def _done(ids, at):  # type: ignore[no-untyped-def]
+    """Tell whether all blocks of the last turn are done; wait a little while they are not."""
+    for _ in range(PATIENCE):
+        if atomic_load(ids, at + np.uint64(1)) == np.uint64(0):
+            return True
+    return False
+
+
+def _compiled(function: Callable, *helpers: Callable) -> Callable:
+    numbers = {"BLOCK": BLOCK, "WORDS": WORDS, "PATIENCE": PATIENCE}
+    return compile_python(function.__name__[1:], function, *helpers, **numbers)
+
+
+def claiming() -> list[Callable]:
+    """Return `next_block` and `hand_in`, which the loop over blocks calls."""
+    return [_compiled(_next_block), _compiled(_hand_in)]
+
+
+def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
+    """Compile ``step_all(f, ids, par, action, obs, reward, ended, cut, count, turn, share, shares)``.
+
+    Steps every environment; one whose episode was over is restarted instead. `ended` and `cut` are the arrays
+    of terminations and truncations. `turn` is the number of the step, from 1.
+
+    Who has `share` 0 leads, and gets (status, over). The status is 0; or i + 1 where environment i was
+    refused and kept its state; or -(i + 1), before anything was stepped, where action i is not finite.
+    ``over`` counts the environments whose episode is over now; it is -1 where helpers are still at it, and
+    the same call is to be made again. Helpers make that call with another number below `shares`, and the
+    `par` that belongs to it; they go on with the steps that soon follow. What they get says nothing.
+
+    Parameters
+    ----------
+    bad_action : callable
+        ``bad_action(f, action, count)`` to 0 or -(i + 1).
+    step_blocks : callable
+        ``step_blocks(f, ids, par, ..., count, at, blocks, turn, share, shares)``, the loop over the blocks
+        that a thread can claim.
+    """
+    looks = _compiled(_opened), _compiled(_done)
+    return _compiled(_step_all, bad_action, step_blocks, *looks)
+
+
+# --- the threads of this process ---
+
+
+def default_threads(count: int) -> int:
+    """Return how many threads step a batch of so many environments where nobody says.
+
+    One for each `SHARE` environments and for each core that this process may use, but not more than
+    ``OMP_NUM_THREADS``, which Ray and others set for their workers. One in a process of `multiprocessing`'s.
+    """
+    if count < 2 * SHARE or multiprocessing.parent_process() is not None:
+        return 1
+    limit = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return max(1, min(count // SHARE, usable_cores(), int(limit) if limit.isdecimal() else count))
+
+
+def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
+    """Let `step_all` be called with each of these arguments by a helper that has nothing else to do.
+
+    Offers of others that nobody took are withdrawn; one's own from before are as good as new. `kind` is the
+    type of actions: the first step with one compiles, and there is no help in it, as a thread might still be
+    at that when the process ends.
+    """
+    global _offered
+    if (step_all, kind) not in _compiled_for:
+        _compiled_for.add((step_all, kind))
+        return
+    if id(calls) == _offered and _offers.qsize() >= len(calls):
+        return
+    _offered = id(calls)  # not the calls themselves, which keep a batch's memory
+    with contextlib.suppress(queue.Empty):
+        while _offers.get_nowait() is not None:
+            pass
+        _offers.put(None)  # it was meant for a helper
+    for i in range(len(_helpers), len(calls)):
+        _helpers.append(threading.Thread(target=_help, name=f"lag_envs helper {i + 1}", daemon=True))
+        _helpers[i].start()
+    for arguments in calls:
+        _offers.put((step_all, arguments))
+
+
+def _help() -> None:
+    while (job := _offers.get()) is not None:
+        job[0](*job[1])
+        del job  # its arrays may be large
+
+
+def _dismiss() -> None:
+    """End the helpers: a thread does not survive a fork."""
+    for _ in _helpers:
+        _offers.put(None)
+    while _helpers:
+        _helpers.pop().join()
+
+
+_offers: queue.SimpleQueue[tuple[Callable, tuple] | None] = queue.SimpleQueue()
+_offered = 0
+_helpers: list[threading.Thread] = []
+_compiled_for: set[tuple[Callable, np.dtype]] = set()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_dismiss)

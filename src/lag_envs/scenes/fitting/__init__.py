@@ -1,0 +1,1 @@
+"""Parameters of a scene from recordings of its motion: `Scene.fit`."""

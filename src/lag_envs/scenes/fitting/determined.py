@@ -1,0 +1,93 @@
+"""What data determine of the parameters, by the derivatives of the residuals at the solution."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.scenes.fitting.shooting import Shooting
+
+Array = NDArray[np.float64]
+
+#: Derivatives whose singular values, at unit length, are below this depend on each other.
+DEPENDENT = 1e-7
+#: Where twice a parameter, or one more unit of it, moves no state by more than this part of its range, it has
+#: no effect.
+NO_EFFECT = 1e-10
+
+
+class Determined:
+    """What remains of the derivatives by the parameters when the starts, which are unknown too, take theirs.
+
+    Parameters
+    ----------
+    shooting : Shooting
+        The problem.
+    z : ndarray
+        Its solution.
+    ranges : ndarray, shape (n_state,)
+        Size of the motion.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of the scaled parameters.
+    leverage : ndarray, shape (number of residuals,)
+        The part of each residual that the unknowns take up.
+    freedom : int
+        Number of residuals less that of unknowns.
+
+    Raises
+    ------
+    ValueError
+        For parameters that are not determined.
+    """
+
+    def __init__(self, shooting: Shooting, z: Array, ranges: Array) -> None:
+        from scipy.linalg import orth
+
+        self._parameters = shooting.parameters
+        p, of = len(self._parameters.names), shooting.states_of_residuals()
+        values = self._parameters.values(z[:p])
+        self._whole = np.where(self._parameters.logs, 1.0, values)  # a change by 100 %, scaled
+        derivatives = shooting.jacobian(z)
+        by_parameters, by_starts = derivatives[:, :p], derivatives[:, p:]
+        moved = by_parameters * (shooting.noise / ranges)[of][:, None] * np.maximum(np.abs(self._whole), 1.0)
+        lengths = np.linalg.norm(by_starts, axis=0)
+        starts = orth(by_starts / np.where(lengths > 0.0, lengths, 1.0), rcond=1e-10)
+        rest = by_parameters - starts @ (starts.T @ by_parameters)
+        rest -= starts @ (starts.T @ rest)  # once more, for what rounding left
+        left = np.linalg.norm(rest, axis=0)
+        none = np.abs(moved[of >= 0]).max(axis=0) < NO_EFFECT
+        none |= left <= DEPENDENT * np.linalg.norm(by_parameters, axis=0)
+        self._refuse([np.eye(p)[i] for i in np.flatnonzero(none)])
+        basis, sizes, directions = np.linalg.svd(rest / left, full_matrices=False)
+        self._refuse([v / left for v, size in zip(directions, sizes, strict=True) if size < DEPENDENT])
+        root = directions.T / sizes / left[:, None]
+        self.covariance = root @ root.T
+        self.leverage = np.sum(basis**2, axis=1) + np.sum(starts**2, axis=1)
+        self.freedom = len(derivatives) - starts.shape[1] - p
+
+    def _refuse(self, directions: list[Array]) -> None:
+        """Raise an error for directions in which the scaled parameters can change and nothing else does."""
+        texts = []
+        for direction in directions:
+            change = direction / self._whole
+            change = change / change[np.argmax(np.abs(change))]
+            parts = {
+                name: f"{name} by {part:+.3g} %"
+                for name, part in zip(self._parameters.names, change, strict=True)
+                if abs(part) > 1e-3
+            }
+            if len(parts) == 1:
+                texts.append(f"{next(iter(parts))}, which has no effect of its own on what was measured")
+            else:
+                texts.append(
+                    f"{' and '.join(parts)} apart: changing {', '.join(parts.values())} together changes "
+                    "nothing that was measured"
+                )
+        if texts:
+            raise ValueError(
+                f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
+                "held, or add recordings that it shows in, such as some under known controls"
+            )

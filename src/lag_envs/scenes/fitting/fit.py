@@ -1,0 +1,246 @@
+"""Fit a scene's parameters to recordings of its motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lag_envs.errors import hint
+from lag_envs.scenes.base import Scene
+from lag_envs.scenes.checks import check_number, check_parameters, shown
+from lag_envs.scenes.fitting.determined import Determined
+from lag_envs.scenes.fitting.parameters import FreeParameters
+from lag_envs.scenes.fitting.recordings import Recording, guess, recordings_of
+from lag_envs.scenes.fitting.result import Fit, FitWarning
+from lag_envs.scenes.fitting.shooting import Shooting, cut
+
+Array = NDArray[np.float64]
+
+#: Lengths of pieces [steps] by which parameters are sought first, with starts from the smoothed data.
+SHORT = (3, 10)
+#: The most unknowns for starts, unless there are more recordings: the time of a step grows as their square.
+MOST_STARTS = 200
+#: Gaps between pieces are expected to be as large as the noise at first, then these parts of it: none.
+CLOSING = (0.03, 1e-3)
+#: Relative changes of sum of squares and unknowns at which a search ends, on the way and at last.
+COARSE, FINE = 1e-4, 1e-12
+#: Noise is taken for at least this part of a state's range, for rounding and the errors of who made the data.
+LEAST_NOISE = 1e-9
+#: A standard error above this part of the estimate, or a correlation above this, is warned of.
+WIDE, CORRELATED = 0.5, 0.999
+#: Residuals that are so many times the noise are not noise; those below this part of the range do not matter.
+MISFIT, INVISIBLE = 2.0, 1e-6
+#: How often the noise is estimated, and the fit repeated with it, at most.
+WEIGHINGS = 8
+
+
+def fit(
+    scene: Scene,
+    recordings: Any,
+    free: Sequence[str],
+    noise: Mapping[str, float] | None = None,
+    level: float = 0.95,
+) -> Fit:
+    """See `Scene.fit`."""
+    try:
+        names = check_parameters(scene, free)
+    except ValueError as error:
+        raise ValueError(f"free: {error}") from None
+    if not names:
+        raise ValueError("free must name at least one parameter")
+    level = check_number("level", level)
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level must be between 0 and 1, got {level:g}")
+    data = recordings_of(scene, recordings)
+    sizes = _Sizes(scene, data, noise)
+    unknowns = len(names) + len(data) * len(scene.state_names)
+    if sizes.count <= unknowns:
+        raise ValueError(
+            f"{sizes.count} measured values are too few for {len(names)} parameters and the "
+            f"{unknowns - len(names)} entries of the starts of {len(data)} recordings; record longer"
+        )
+    shooting, z = _approach(FreeParameters(scene, names), data, sizes)
+    relaxed = sizes.noise.copy()
+    for part in CLOSING:
+        shooting = shooting.weighed(sizes.noise, part * sizes.gap)
+        z = shooting.solve(z, COARSE).x
+    for _ in range(WEIGHINGS):
+        shooting = shooting.weighed(sizes.noise, CLOSING[-1] * sizes.gap)
+        found = shooting.solve(z, FINE)
+        z, known = found.x, Determined(shooting, found.x, sizes.range)
+        sizes.estimate(shooting, z, known.leverage)
+        if np.allclose(sizes.noise, shooting.noise, rtol=1e-3, atol=0.0):
+            break
+    return _result(shooting, found, known, sizes, relaxed, level)
+
+
+class _Sizes:
+    """How large residuals, gaps and the motion are, by state.
+
+    Attributes
+    ----------
+    range : ndarray, shape (n_state,)
+        Largest less smallest value; of what was not measured, in the guess.
+    noise : ndarray, shape (n_state,)
+        Standard deviation of the residuals.
+    given : bool
+        Whether it was given.
+    """
+
+    def __init__(self, scene: Scene, data: Sequence[Recording], noise: Mapping[str, float] | None) -> None:
+        self.seen = np.any([r.measured.any(axis=0) for r in data], axis=0)
+        self.count = int(sum(r.measured.sum() for r in data))
+        self.guesses = [guess(scene, recording) for recording in data]
+        self.range = np.ptp(np.concatenate(self.guesses), axis=0)
+        self.range[self.range == 0.0] = 1.0
+        self.noise, self.given = self.range.copy(), noise is not None
+        for name, value in (noise or {}).items():
+            if name not in scene.state_names:
+                raise ValueError(
+                    f"noise: there is no state {shown(name)}; {hint(str(name), scene.state_names)}"
+                )
+            value = check_number(f"noise[{name!r}]", value)
+            if value <= 0.0:
+                raise ValueError(
+                    f"noise[{name!r}] must be above 0, got {value:g}; leave noise out to have it estimated"
+                )
+            self.noise[scene.state_names.index(name)] = value
+        missing = [
+            n for n, seen in zip(scene.state_names, self.seen, strict=True) if seen and n not in (noise or {})
+        ]
+        if self.given and missing:
+            raise ValueError(
+                f"noise lacks {', '.join(missing)}; give it for every measured state, or for none"
+            )
+
+    @property
+    def gap(self) -> Array:
+        """Noise as far as it is known, else the same part of the range."""
+        part = np.median((self.noise / self.range)[self.seen])
+        return np.where(self.seen, self.noise, part * self.range)
+
+    def estimate(self, shooting: Shooting, z: Array, leverage: Array | float = 0.0) -> None:
+        """Take the noise from residuals; `leverage` is the part of each that the unknowns have taken up."""
+        if self.given:
+            return
+        residuals, of = shooting.residuals(z), shooting.states_of_residuals()
+        for i in np.flatnonzero(self.seen):
+            own = of == i
+            left = np.sum(1.0 - np.broadcast_to(leverage, own.shape)[own])
+            sigma = shooting.noise[i] * math.sqrt(np.sum(residuals[own] ** 2) / max(left, 1.0))
+            self.noise[i] = max(sigma, LEAST_NOISE * self.range[i])
+
+
+def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) -> tuple[Shooting, Array]:
+    """Return a problem of short pieces and its solution: first for parameters alone, then for starts too."""
+    n, p = len(sizes.noise), len(parameters.names)
+    long = max(SHORT[-1], math.ceil(sum(len(r.states) for r in data) * n / MOST_STARTS))
+    z = parameters.start
+    for length in sorted({*SHORT, long}):
+        pieces = cut(data, length)
+        starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
+        shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
+        z = np.concatenate([z[:p], *starts])
+        shooting.simulate(z)  # where this is refused, its error says why
+        z[:p] = shooting.solve(z, COARSE, starts=False).x
+        sizes.estimate(shooting, z)
+    shooting = shooting.weighed(sizes.noise, sizes.gap)
+    z = shooting.solve(z, COARSE).x
+    sizes.estimate(shooting, z, len(z) / shooting.count)
+    return shooting, z
+
+
+def _result(
+    shooting: Shooting, found: Any, known: Determined, sizes: _Sizes, relaxed: Array, level: float
+) -> Fit:
+    from scipy.stats import norm, t
+
+    parameters = shooting.parameters
+    scene, motions = shooting.simulate(found.x)
+    names, best = parameters.names, found.x[: len(parameters.names)]
+    errors = np.sqrt(np.diag(known.covariance))
+    share = 0.5 + 0.5 * level
+    reach = errors * (norm.ppf(share) if sizes.given else t.ppf(share, known.freedom))
+    low, high = (
+        parameters.values(np.clip(best + s * reach, parameters.low, parameters.high)) for s in (-1, 1)
+    )
+    simulated = [np.empty_like(r.states) for r in shooting.recordings]
+    for piece, motion in zip(shooting.pieces, motions, strict=True):
+        rows = simulated[piece.recording][piece.own]
+        rows[:] = motion[: len(rows)]
+    measured = zip(scene.state_names, sizes.noise.tolist(), sizes.seen, strict=True)
+    fitted = Fit(
+        scene=scene,
+        estimates={name: getattr(scene, name) for name in names},
+        errors=dict(zip(names, (errors * parameters.slopes(best)).tolist(), strict=True)),
+        intervals=dict(zip(names, zip(low.tolist(), high.tolist(), strict=True), strict=True)),
+        level=level,
+        correlation=known.covariance / np.outer(errors, errors),
+        noise={name: sigma for name, sigma, seen in measured if seen},
+        recordings=shooting.recordings,
+        simulated=simulated,
+    )
+    texts = [] if found.success else ["the search ended before it converged; begin closer to the truth"]
+    texts += _doubts_of_parameters(fitted, parameters, best, errors) + _doubts_of_model(
+        fitted, sizes, relaxed
+    )
+    for text in texts:
+        warnings.warn(text, FitWarning, stacklevel=4)
+    return dataclasses.replace(fitted, warnings=tuple(texts))
+
+
+def _doubts_of_parameters(fitted: Fit, parameters: FreeParameters, best: Array, errors: Array) -> list[str]:
+    """Return what there is to warn of in what is known of the parameters."""
+    texts, names = [], list(fitted.estimates)
+    for i, (name, value) in enumerate(fitted.estimates.items()):
+        if min(best[i] - parameters.low[i], parameters.high[i] - best[i]) < 0.01 * errors[i]:
+            texts.append(f"{name}={value:.3g} lies at the end of its range: its interval is too short")
+        elif fitted.errors[name] > WIDE * abs(value):
+            texts.append(
+                f"the data hardly determine {name}: {value:.3g} with a standard error of "
+                f"{fitted.errors[name]:.2g}"
+            )
+        for j in range(i):
+            if abs(fitted.correlation[i, j]) > CORRELATED:
+                texts.append(
+                    f"{names[j]} and {name} can hardly be told apart: their correlation is "
+                    f"{fitted.correlation[i, j]:.5f}; hold one of them, or add other recordings"
+                )
+    return texts
+
+
+def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
+    """Return what there is to warn of in the residuals.
+
+    `relaxed` is the noise that remained when the motion was allowed to have gaps.
+    """
+    texts = []
+    for i in np.flatnonzero(sizes.seen):
+        name = fitted.scene.state_names[i]
+        unit = fitted.scene.state_units[i]
+        columns = [residual[:, i] for residual in fitted.residuals]
+        known = np.concatenate([c[np.isfinite(c)] for c in columns])
+        size = math.sqrt(np.mean(known**2))
+        least = sizes.noise[i] if sizes.given else relaxed[i]
+        if size < INVISIBLE * sizes.range[i]:
+            continue
+        if size > MISFIT * least:
+            texts.append(
+                f"the model does not follow {name}: it is off by {size:.2g} {unit}, where the noise is "
+                f"{least:.2g} {unit}; something that is held may be wrong, or a force is not modelled"
+            )
+        pairs = np.concatenate([c[1:] * c[:-1] for c in columns])
+        pairs = pairs[np.isfinite(pairs)]
+        likeness = pairs.mean() / np.mean(known**2) if len(pairs) else 0.0
+        if abs(likeness) > 4.0 / math.sqrt(max(len(pairs), 1)):
+            texts.append(
+                f"the residuals of {name} are not independent: from sample to sample their correlation is "
+                f"{likeness:.2f}, so the intervals are too short; look at them with plot()"
+            )
+    return texts

@@ -1,0 +1,330 @@
+"""The step of `lag_envs.stepping.series` backwards: gradients by its end as gradients by its start.
+
+The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
+Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
+Σ_j x_j z_{k-j} = 0 of a reciprocal; a coefficient's cotangent, divided by what it is multiplied with, goes to
+all the others. So an order costs two sums of products where the series has one, and no totals are kept.
+Lengths of substeps are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
+from lag_envs.stepping.series import GROUP, STRIDE, Factor, Series, Start, Target, times
+
+
+class Backward(Series):
+    """The step of a record, forwards and backwards.
+
+    Parameters
+    ----------
+    record : SeriesRecord
+        What is stepped, made with tangents.
+    sources : tuple of str
+        What gradients are wanted by besides places and velocities: names in the record's tangents.
+    """
+
+    def __init__(self, record: SeriesRecord, sources: tuple[str, ...]) -> None:
+        super().__init__(record)
+        self._sources = sources
+        #: Weights that sources change.
+        self._active = [
+            name for name, slopes in record.tangents.items() if any(source in sources for source in slopes)
+        ]
+        del self.slots  # more series are needed than for the step
+        for i in range(self.size):
+            self._slot("a", i)
+        for n in self._live:
+            node = record.nodes[n]
+            if node.op == "sum":
+                for a, w in zip(node.args, node.weights, strict=False):
+                    if w in self._active:
+                        self._factor(a)
+        self.slots = len(self._slots)
+        self._cells = {key: i for i, key in enumerate([*record.mass, *self._active])}
+
+    @property
+    def entries(self) -> int:
+        """How many numbers a lane needs: coefficients, their cotangents, those of masses and weights."""
+        return (2 * self.slots) * STRIDE + STRIDE * -(-max(len(self._cells), 1) // STRIDE)
+
+    def pull(
+        self, t: Target, inputs: dict, q: Sequence, v: Sequence, h: Any, order: Any, ends: Sequence
+    ) -> tuple[list, list]:
+        """Return cotangents of places and velocities before the step, and of the sources.
+
+        Parameters
+        ----------
+        t, inputs, q, v, h, order
+            See `expand`.
+        ends : sequence of number
+            Cotangents of places, then of velocities after it.
+        """
+        start = self.expand(t, inputs, q, v, h, order)
+        self._clear(t, order)
+        n = self.size
+
+        def seed(k: Any, carried: Sequence) -> list:
+            per = t.mul(h, t.reciprocal(t.plus(k, 1)))
+            for i in range(n):
+                t.store(self._bar(self._slots["v", i]), k, t.fma(per, ends[i], ends[n + i]))
+            return []
+
+        t.loop(t.index(0), t.plus(order, 1), [], seed)
+
+        def back(m: Any, carried: Sequence) -> list:
+            self._one_order_back(t, start, h, t.minus(order, m))
+            return []
+
+        t.loop(t.index(1), order, [], back)
+        places, weights = self._first_order_back(t, start, h)
+        velocities = [t.load(self._bar(self._slots["v", i]), t.index(0)) for i in range(n)]
+        found = [
+            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends[:n], strict=True)
+        ]
+        found += [
+            x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
+        ]
+        return found, [self._of_source(t, start, weights, source) for source in self._sources]
+
+    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str) -> Any:
+        total = t.number(0.0)
+        for name, bar in weights.items():
+            slope = self.record.tangents[name].get(source, 0.0)
+            if slope != 0.0:
+                total = t.fma(bar, self._weight(t, start.scalars, slope), total)
+        return total
+
+    # --- cotangents in memory ------------------------------------------------------------------------------
+
+    def _bar(self, slot: int) -> int:
+        return self.slots + slot
+
+    def _clear(self, t: Target, order: Any) -> None:
+        zero = t.number(0.0)
+
+        def clear(k: Any, carried: Sequence) -> list:
+            for slot in range(self.slots):
+                t.store(self._bar(slot), k, zero)
+            return []
+
+        t.loop(t.index(0), t.plus(order, 2), [], clear)
+        for key in self._cells:
+            t.store(*self._cell(t, key), zero)
+
+    def _cell(self, t: Target, key: Any) -> tuple[int, Any]:
+        cell = self._cells[key]
+        return 2 * self.slots + cell // STRIDE, t.index(cell % STRIDE)
+
+    def _add(self, t: Target, slot: int, k: Any, a: Any, b: Any) -> None:
+        """Add a product to a number in memory."""
+        t.store(slot, k, t.fma(a, b, t.load(slot, k)))
+
+    def _add_to(self, t: Target, factor: Factor, k: Any, a: Any, b: Any) -> None:
+        """Add a product to the cotangent of a factor's coefficient of order k."""
+        self._add(t, self._bar(factor.slot), t.plus(k, -factor.back), a, b)
+
+    def _weight_bar(self, t: Target, weight: Any, a: Any, b: Any) -> None:
+        if weight in self._active:
+            self._add(t, *self._cell(t, weight), a, b)
+
+    # --- one order -----------------------------------------------------------------------------------------
+
+    def _solve_back(self, t: Target, start: Start, h: Any, k: Any) -> list:
+        """Go back through M_0 a_k = r and v_{k+1} = h a_k/(k+1); return the cotangents of r."""
+        after = t.plus(k, 1)
+        step = t.mul(h, t.reciprocal(after))
+        a, bars = [], []
+        for i in range(self.size):
+            slot = self._slots["a", i]
+            a.append(t.load(slot, k))
+            v_bar = t.load(self._bar(self._slots["v", i]), after)
+            bars.append(t.fma(step, v_bar, t.load(self._bar(slot), k)))
+        right = [t.number(0.0) if x is None else x for x in times(t, start.inverse.rows, bars)]
+        for i, j in self.record.mass:
+            less = t.mul(right[i], a[j])
+            less = less if i == j else t.fma(right[j], a[i], less)
+            cell = self._cell(t, (i, j))
+            t.store(*cell, t.sub(t.load(*cell), less))
+        return right
+
+    def _one_order_back(self, t: Target, start: Start, h: Any, k: Any) -> None:
+        """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
+        record, first = self.record, t.index(0)
+        bars: dict[int, Any] = {}
+        for n in self._live:
+            if ("x", n) in self._slots and record.nodes[n].op not in KNOWN:
+                bars[n] = t.load(self._bar(self._slots["x", n]), k)
+            if ("d", n) in self._slots:
+                more = t.mul(t.real(k), t.load(self._bar(self._slots["d", n]), k))
+                bars[n] = t.add(bars[n], more) if n in bars else more
+        inner: list[tuple[Factor, Factor, Any]] = []
+        weighted: list[tuple[Any, Factor, Factor, Any]] = []
+
+        def add(n: int, a: Any, b: Any) -> None:
+            bars[n] = t.fma(a, b, bars[n]) if n in bars else t.mul(a, b)
+
+        right = self._solve_back(t, start, h, k)
+        one = t.number(1.0)
+        for i, f in enumerate(record.force):
+            if f >= 0:
+                add(f, right[i], one)
+        for (a, b), (node, weight, _) in record.mass.items():
+            if node < 0:
+                continue
+            for i, j in {(a, b), (b, a)}:
+                rate, factor = Factor(self._slots["a", j]), self._factor(node)
+                less = t.neg(right[i])
+                if weight in self._active:
+                    weighted.append((weight, factor, rate, less))
+                if weight != 1.0:
+                    less = t.mul(less, self._weight(t, start.scalars, weight))
+                add(node, less, rate.load(t, first))
+                self._add_to(t, rate, first, less, factor.load(t, k))
+                inner.append((factor, rate, less))
+        for n in reversed(self._live):
+            if n in bars:
+                inner += self._node_back(t, start, n, bars[n], h, k, add)
+        self._convolve_back(t, k, inner, weighted)
+
+    def _node_back(
+        self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable
+    ) -> list[tuple[Factor, Factor, Any]]:
+        """Take a node's cotangent of order k to order 0 and k; return what goes to those between."""
+        node, zero, first = self.record.nodes[n], start.zero, t.index(0)
+        op, args = node.op, node.args
+        if op == "place":
+            step = t.mul(h, t.reciprocal(k))
+            self._add(t, self._bar(self._slots["v", node.index]), t.plus(k, -1), step, bar)
+            return []
+        if op == "velocity" or op in KNOWN:
+            self._add_to(t, self._factor(n), k, bar, t.number(1.0))
+            return []
+        if op == "sum":
+            for a, weight in zip(args, node.weights, strict=False):
+                add(a, bar, self._weight(t, start.scalars, weight))
+                if weight in self._active:
+                    self._weight_bar(t, weight, bar, self._factor(a).load(t, k))
+            return []
+        if op == "product":
+            x, y = self._factor(args[0]), self._factor(args[1])
+            add(args[0], bar, zero[args[1]])
+            add(args[1], bar, zero[args[0]])
+            self._add_to(t, x, first, bar, y.load(t, k))
+            self._add_to(t, y, first, bar, x.load(t, k))
+            return [(x, y, bar)]
+        if op == "reciprocal":  # Σ x_j z_{k-j} = 0
+            x, z = self._factor(args[0]), self._factor(n)
+            less = t.neg(t.mul(bar, zero[n]))
+            add(args[0], less, zero[n])
+            self._add_to(t, x, first, less, z.load(t, k))
+            self._add_to(t, z, first, less, x.load(t, k))
+            return [(x, z, less)]
+        if op == "sqrt":  # Σ z_j z_{k-j} = x_k
+            z = self._factor(n)
+            half = t.mul(bar, t.div(t.number(0.5), zero[n]))
+            less = t.neg(half)
+            add(args[0], half, t.number(1.0))
+            self._add_to(t, z, first, t.add(less, less), z.load(t, k))
+            return [(z, z, less)]
+        assert op in FUNCTIONS  # k z_k = Σ_{j>0} D_j w_{k-j}
+        slope, w = self._slope(n), self._factor(args[1])
+        bar = t.neg(bar) if op == "cos" else bar
+        scaled = t.mul(t.reciprocal(k), bar)
+        if slope.back:  # D is h times the argument's rate
+            scaled = t.mul(h, scaled)
+            self._add_to(t, slope, k, scaled, zero[args[1]])
+        else:
+            add(args[0], bar, zero[args[1]])
+        self._add_to(t, w, first, scaled, slope.load(t, k))
+        return [(slope, w, scaled)]
+
+    def _convolve_back(
+        self,
+        t: Target,
+        k: Any,
+        inner: Sequence[tuple[Factor, Factor, Any]],
+        weighted: Sequence[tuple[Any, Factor, Factor, Any]],
+    ) -> None:
+        """Go back through Σ_{0<j<k} A_j B_{k-j} for all pairs with their cotangents."""
+        for begin in range(0, len(inner), GROUP):
+            some = inner[begin : begin + GROUP]
+
+            def spread(j: Any, carried: Sequence, some: Sequence = some) -> list:
+                other = t.minus(k, j)
+                x = {a: a.load(t, j) for a, _, _ in some}
+                y = {b: b.load(t, other) for _, b, _ in some}
+                for a, b, bar in some:
+                    self._add_to(t, a, j, bar, y[b])
+                for a, b, bar in some:
+                    self._add_to(t, b, other, bar, x[a])
+                return []
+
+            t.loop(t.index(1), k, [], spread)
+        for weight, a, b, bar in weighted:
+
+            def total(j: Any, carried: Sequence, a: Factor = a, b: Factor = b) -> list:
+                return [t.fma(a.load(t, j), b.load(t, t.minus(k, j)), carried[0])]
+
+            (found,) = t.loop(t.index(1), t.plus(k, 1), [t.number(0.0)], total)
+            self._weight_bar(t, weight, bar, found)
+
+    # --- order 0 -------------------------------------------------------------------------------------------
+
+    def _first_order_back(self, t: Target, start: Start, h: Any) -> tuple[list, dict[str, Any]]:
+        """Return cotangents of places and velocities (None: zero), and of the active weights."""
+        record, zero, first, n = self.record, start.zero, t.index(0), self.size
+        bars: dict[int, Any] = {
+            i: t.load(self._bar(self._slots["x", i]), first)
+            for i in range(len(record.nodes))
+            if ("x", i) in self._slots
+        }
+        found: list[Any] = [None] * (2 * n)
+
+        def add(to: Any, key: int, a: Any, b: Any) -> None:
+            old = to.get(key) if isinstance(to, dict) else to[key]
+            to[key] = t.mul(a, b) if old is None else t.fma(a, b, old)
+
+        one = t.number(1.0)
+        for f, bar in zip(record.force, self._solve_back(t, start, h, first), strict=True):
+            if f >= 0:
+                add(bars, f, bar, one)
+        for place, (entry, weight, constant) in record.mass.items():
+            bar = t.load(*self._cell(t, place))
+            self._weight_bar(t, constant, bar, one)
+            if entry >= 0:
+                add(bars, entry, bar, self._weight(t, start.scalars, weight))
+                self._weight_bar(t, weight, bar, zero[entry])
+        for i in reversed(range(len(record.nodes))):
+            node = record.nodes[i]
+            op, args = node.op, node.args
+            if op in KNOWN and ("x", i) in self._slots:
+                power = h
+                for k, w in enumerate(node.weights[1:], 1):
+                    self._weight_bar(t, w, power, t.load(self._bar(self._slots["x", i]), t.index(k)))
+                    power = t.mul(power, h)
+            if i not in bars:
+                continue
+            bar = bars[i]
+            if op in ("place", "velocity"):
+                add(found, node.index + n * (op == "velocity"), bar, one)
+            elif op in KNOWN:
+                self._weight_bar(t, node.weights[0], bar, one)
+            elif op == "sum":
+                self._weight_bar(t, node.weights[-1], bar, one)
+                for a, w in zip(args, node.weights, strict=False):
+                    add(bars, a, bar, self._weight(t, start.scalars, w))
+                    self._weight_bar(t, w, bar, zero[a])
+            elif op == "product":
+                add(bars, args[0], bar, zero[args[1]])
+                add(bars, args[1], bar, zero[args[0]])
+            elif op == "reciprocal":
+                add(bars, args[0], bar, t.neg(t.mul(zero[i], zero[i])))
+            elif op == "sqrt":
+                add(bars, args[0], bar, t.div(t.number(0.5), zero[i]))
+            else:
+                add(bars, args[0], t.neg(bar) if op == "cos" else bar, zero[args[1]])
+        return found, {name: t.load(*self._cell(t, name)) for name in self._active}

@@ -1,0 +1,75 @@
+"""The extended Kalman filter, by the statistics of its errors and by differences."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lag_envs.controllers.basic import ObservationDecoder, constant
+from lag_envs.controllers.filtering import Filtered
+from lag_envs.evaluation.rollout import Rollout
+from lag_envs.tasks import TASKS
+from lag_envs.tasks.chain import SwingUpTripleNoisy
+from lag_envs.tasks.registration import make_task
+
+ENV, NOISE = "PivotedBar-v0", 0.01
+
+
+def test_what_is_expected_is_what_is_seen():
+    task = TASKS[SwingUpTripleNoisy.id](observation_noise=None)
+    x = np.random.default_rng(0).uniform(-3.0, 3.0, (4, 8))
+    read = ObservationDecoder(task)
+    seen, slopes = read.expected(x)
+    states, _ = read(seen)
+    assert np.abs(states - x).max() <= 1e-12
+    moves = 1e-6 * np.eye(8)
+    for j, move in enumerate(moves):
+        change = (read.expected(x + move)[0] - read.expected(x - move)[0]) / 2e-6
+        assert np.abs(change - slopes[:, :, j]).max() <= 1e-8
+
+
+def test_errors_are_as_large_as_the_filter_believes():
+    """Errors weighed by the covariance are distributed as χ² with a degree of freedom for each entry."""
+    options = {"observation_noise": NOISE, "track": math.inf}
+    task = make_task(ENV, **options)
+    agent = Filtered(task, constant(task, action=0.3))
+    rollout = Rollout(ENV, agent, range(200), **options)
+    weighed = []
+    for t, _ in enumerate(rollout):
+        if t in (5, 40, 120):
+            known = rollout.memory
+            moved, spread = agent._move(known)  # from before the step to where the episodes are now
+            off = rollout.state - moved
+            weighed.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off).mean())
+        if t == 120:
+            break
+    # The mean of 200 has a standard deviation of √(2·4/200) = 0.2.
+    assert np.abs(np.array(weighed) - 4.0).max() <= 0.8
+
+
+def test_an_episode_that_begins_is_believed_anew():
+    task = make_task(ENV, observation_noise=NOISE)
+    agent, rng = Filtered(task, constant(task, action=0.0)), np.random.default_rng(0)
+    first, second = rng.normal(0.0, NOISE, (2, 3, 5)).astype(np.float32)
+    _, known = agent.predict(first)
+    _, known = agent.predict(second, known, np.array([False, True, False]))
+    _, anew = agent.predict(second)
+    _, single = agent.predict(second[1])
+    assert (known.state[1] == anew.state[1]).all() and (known.state[0] != anew.state[0]).any()
+    assert np.abs(single.state[0] - anew.state[1]).max() <= 1e-15
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "needs a task with noise on every entry of the observation"),
+        ({"observation_noise": {"cos(theta)": 0.01}}, "noise on every entry"),
+        ({"observation_noise": 0.01, "action_delay": 0.02}, "neither late nor rare"),
+        ({"observation_noise": 0.01, "observation_every": 2}, "neither late nor rare"),
+        ({"observation_noise": 0.01, "randomize": {"damping": (0.5, 2.0)}}, "for known parameters"),
+    ],
+)
+def test_a_filter_is_refused_where_it_would_be_wrong(options, message):
+    task = make_task(ENV, **options)
+    with pytest.raises(ValueError, match=message):
+        Filtered(task, constant(task, action=0.0))

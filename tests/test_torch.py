@@ -1,0 +1,180 @@
+"""Environments on tensors: equal to the environments, and with gradients."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lag_envs  # noqa: F401
+from lag_envs.envs.model import Model
+from lag_envs.tasks import TASKS
+
+torch = pytest.importorskip("torch")
+
+from lag_envs.torch import Step, TorchVectorEnv  # noqa: E402
+
+#: One with a closed form, and one of the general series.
+IDS = ["PivotedBar-v0", "CartPoleContinuous-v0"]
+
+
+@pytest.fixture(scope="module")
+def step():
+    return Step(IDS[0])
+
+
+def near(n, seed=0):
+    rng = np.random.default_rng(seed)
+    states = np.array([0.0, 0.0, np.pi, 0.0]) + rng.uniform(-0.5, 0.5, (n, 4))
+    return (torch.tensor(x, requires_grad=True) for x in (states, rng.uniform(-0.9, 0.9, (n, 1))))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gradcheck(env_id, step):
+    step = step if env_id == IDS[0] else Step(env_id)
+    assert torch.autograd.gradcheck(lambda *given: step(*given)[:3], tuple(near(2)), rtol=1e-5)
+
+
+def test_torch_func(step):
+    states, actions = near(3)
+    whole = torch.func.vmap(torch.func.jacrev(lambda s, a: step(s, a).states, argnums=(0, 1)))
+    by_state, by_action = whole(states, actions)
+    assert by_state.shape == (3, 4, 4) and by_action.shape == (3, 4, 1)
+    for i in range(3):
+        rows = torch.autograd.functional.jacobian(lambda s, a: step(s, a).states, (states[i], actions[i]))
+        torch.testing.assert_close(rows[0], by_state[i], rtol=1e-14, atol=1e-14)
+        torch.testing.assert_close(rows[1], by_action[i], rtol=1e-14, atol=1e-14)
+    # A batch of batches, one of them the same for all.
+    nested = torch.func.vmap(lambda a: step(states, a).rewards)(torch.stack([actions, -actions]))
+    torch.testing.assert_close(nested[0], step(states, actions).rewards)
+    slope = torch.func.grad(lambda s: step(s, actions[0]).rewards)(states[0])
+    torch.testing.assert_close(slope, torch.autograd.grad(step(states[0], actions[0]).rewards, states)[0][0])
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        (once,) = torch.autograd.grad(step(states, actions).rewards.sum(), states, create_graph=True)
+        once.sum().backward()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_numbers_are_those_of_the_environment(env_id, mode):
+    envs = TorchVectorEnv(env_id, 5, autoreset_mode=mode, duration=0.5)
+    plain = gym.make_vec(env_id, 5, autoreset_mode=mode, duration=0.5)
+    found, expected = envs.reset(seed=3)[0], plain.reset(seed=3)[0]
+    np.testing.assert_array_equal(found.numpy(), expected)
+    push = torch.zeros(1, requires_grad=True)
+    rng = np.random.default_rng(0)
+    for i in range(60):
+        actions = torch.tensor(rng.uniform(-1.0, 1.0, (5, 1)), dtype=torch.float32) + (push if i > 20 else 0)
+        found, expected = envs.step(actions), plain.step(actions.detach().numpy())
+        for x, y in zip(found[:4], expected[:4], strict=True):
+            np.testing.assert_array_equal(x.detach().numpy(), y)
+        np.testing.assert_array_equal(envs.state.detach().numpy(), plain.unwrapped.state)
+    (slope,) = torch.autograd.grad(found[1].sum(), push)
+    assert torch.isfinite(slope).all() and slope.abs() > 0.0
+
+
+def test_outputs_share_memory():
+    envs = TorchVectorEnv(IDS[0], 3)
+    observations, _ = envs.reset(seed=0)
+    results = envs.step(torch.zeros(3, 1))
+    assert all(not x.requires_grad for x in results[:4])
+    assert [x.dtype for x in results[:4]] == [torch.float32, torch.float64, torch.bool, torch.bool]
+    assert observations.shape == (3, 5)
+
+
+@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarBalance-v0"])
+def test_gradient_of_an_episode(env_id):
+    """Through ten steps, kicks included, by differences of the environment itself."""
+    envs = TorchVectorEnv(env_id, 3)
+
+    def total(actions):
+        envs.reset(seed=1)
+        return sum((2.0 * r).sum() + envs.state.sum() for r in (envs.step(a)[1] for a in actions))
+
+    actions = (0.3 * torch.ones(10, 3, 1, dtype=torch.float64)).requires_grad_()
+    (slope,) = torch.autograd.grad(total(actions), actions)
+    direction = torch.tensor(np.random.default_rng(2).uniform(-1.0, 1.0, actions.shape))
+    h = 1e-5
+    with torch.no_grad():
+        difference = (total(actions + h * direction) - total(actions - h * direction)) / (2.0 * h)
+    torch.testing.assert_close((slope * direction).sum(), difference, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_no_gradient_through_an_end(mode):
+    envs = TorchVectorEnv(IDS[0], 2, autoreset_mode=mode, max_episode_steps=3)
+    envs.reset(seed=0)
+    actions = torch.full((6, 2, 1), 0.5, requires_grad=True)
+    rewards = [envs.step(a)[1].sum() for a in actions]
+    (slope,) = torch.autograd.grad(rewards[5], actions, retain_graph=True)
+    # With NextStep the fourth step is a restart, which takes no action.
+    assert (slope[:3] == 0.0).all() and (slope[4:] != 0.0).all()
+    assert (slope[3] == 0.0).all() == (mode == "NextStep")
+    (slope,) = torch.autograd.grad(rewards[2], actions)  # the last step's own reward
+    assert (slope[:3] != 0.0).all()
+
+
+def test_windows():
+    envs = TorchVectorEnv(IDS[0], 2)
+    envs.reset(seed=0)
+    first, second = (torch.full((2, 1), 0.5, requires_grad=True) for _ in range(2))
+    envs.step(first)
+    envs.detach()
+    reward = envs.step(second)[1].sum()
+    assert torch.autograd.grad(reward, first, allow_unused=True, retain_graph=True) == (None,)
+    assert torch.autograd.grad(reward, second)[0].abs().min() > 0.0
+
+
+def test_gradient_by_the_start():
+    envs = TorchVectorEnv(IDS[0], 2)
+    start = torch.tensor([[0.0, 0.0, 3.0, 0.1]] * 2, dtype=torch.float64, requires_grad=True)
+    envs.reset(seed=0, options={"state": start})
+    (slope,) = torch.autograd.grad(envs.step(torch.zeros(2, 1))[1].sum(), start)
+    found = Model(TASKS[IDS[0]]()).vjp(start.detach().numpy(), [0.0, 0.0], by_rewards=1.0)
+    np.testing.assert_allclose(slope.numpy(), found.states, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"result of other operations: give state.detach\(\)"):
+        envs.reset(options={"state": 2.0 * start})
+
+
+@pytest.mark.parametrize("state", [[0.0, 0.0, np.pi, 0.0], [0.0, 0.0, 0.0, 0.0], [0.2, 0.5, 1.0, -2.0]])
+def test_float32_at_ordinary_states(step, state):
+    """Upright, hanging at rest: nothing is NaN, and all is near the float64 gradient."""
+    slopes = {}
+    for kind in (torch.float32, torch.float64):
+        given = [torch.tensor(x, dtype=kind, requires_grad=True) for x in (state, [0.0])]
+        found = step(*given)
+        assert found.states.dtype == found.rewards.dtype == kind
+        total = found.states.sum() + found.rewards + found.observations.sum()
+        slopes[kind] = torch.autograd.grad(total, given)
+    for narrow, wide in zip(*slopes.values(), strict=True):
+        torch.testing.assert_close(narrow.double(), wide, rtol=1e-5, atol=1e-5)
+
+
+def test_errors(step):
+    states, actions = (x.detach() for x in near(2))
+    with pytest.raises(TypeError, match=r"states must be a tensor, got ndarray; torch\.as_tensor"):
+        step(states.numpy(), actions)
+    with pytest.raises(ValueError, match=r"actions must have shape \(2, 1\), got \(2,\)"):
+        step(states, actions[:, 0])
+    with pytest.raises(ValueError, match=r"states must have shape \(..., 4\), got \(2, 3\)"):
+        step(states[:, :3], actions)
+    with pytest.raises(TypeError, match=r"states must be float32 or float64, got torch\.int64"):
+        step(states.long(), actions)
+    with pytest.raises(ValueError, match="states must be on the CPU, got a tensor on meta"):
+        step(states.to("meta"), actions)
+    with pytest.raises(ValueError, match=r"states must be finite, got .* in row 1"):
+        step(states * torch.tensor([[1.0], [float("nan")]]), actions)
+    with pytest.raises(ValueError, match="device must be 'cpu', got 'cuda'"):
+        TorchVectorEnv(IDS[0], 2, device="cuda")
+    with pytest.raises(ValueError, match="list of actions to choose from"):
+        TorchVectorEnv("CartPoleExact-v0", 2)
+    with pytest.raises(ValueError, match="imperfect sensors, imperfect actuators or hidden parameters"):
+        TorchVectorEnv(IDS[0], 2, action_delay=0.02)
+    with pytest.raises(ValueError, match="give one value for all"):
+        TorchVectorEnv(IDS[0], 2, damping=[0.0, 0.1])
+    with pytest.raises(ValueError, match="no environment of this package"):
+        TorchVectorEnv("Pendulum-v1", 2)
+    with pytest.raises(ValueError, match="options go with an id"):
+        Step(step.task, damping=0.1)
+    envs = TorchVectorEnv(IDS[0], 2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"actions must have shape \(2, 1\), got \(3, 1\)"):
+        envs.step(torch.zeros(3, 1))
