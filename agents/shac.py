@@ -3,8 +3,9 @@
 The environments' steps have derivatives (`lag_envs.envs.model.Model.vjp`), so nothing need be tried out: an
 iteration lets the policy act for a window of some steps (`Learner.collect`), computes by how much each action
 changes all later rewards of its window (`Learner.gradients`), and moves the policy along (`Learner.update`).
-What comes after the window a critic estimates. The algorithm is that of [1]_. Without a critic, and with
-windows as long as episodes, it is back-propagation through time, also called analytic policy gradients.
+What comes after the window a critic estimates. The algorithm is that of [1]_, with one addition: derivatives
+that have grown beyond `max_slope` are scaled back to it at each step. Without a critic, and with windows as
+long as episodes, it is back-propagation through time, also called analytic policy gradients.
 
 PyTorch sees a window as one batch. The derivatives of all its steps are computed at once, for the states are
 known by then; what is left to do backwards is a recursion of small matrices in NumPy.
@@ -49,7 +50,7 @@ class Settings(OwnSettings):
     learning_rate: float = Field(ge=0, description="of the policy at the start; it falls linearly to 0")
     gamma: float = Field(ge=0, le=1, description="discount of a step")
     max_grad_norm: float = Field(ge=0, description="largest norm of the policy's gradient")
-    max_slope: float = Field(gt=0, description="largest norm of derivatives that are passed back a step")
+    max_slope: float = Field(gt=0, description="largest norm of the derivatives by a state and action")
     reward_scale: float = Field(ge=0, description="what rewards are multiplied by")
     episode_share: float = Field(gt=0, le=1, description="part of its length after which an episode is cut")
     random_starts: float = Field(ge=0, le=1, description="share of episodes that start in random states")
@@ -207,10 +208,10 @@ class Learner:
         later = np.zeros((n, wide + many))
         for t in reversed(range(steps)):
             passed = np.einsum("nk,knj->nj", later * going[t][:, None], by_both[:-1, t])
-            later = found[t] = by_both[-1, t] + gamma * passed
+            total = by_both[-1, t] + gamma * passed
             # What grows from step to step, as near an unstable balance and at kinks, would drown all else.
-            size = np.linalg.norm(later, axis=1, keepdims=True)
-            later /= np.maximum(1.0, size / self.settings.max_slope)
+            size = np.linalg.norm(total, axis=1, keepdims=True)
+            later = found[t] = total / np.maximum(1.0, size / self.settings.max_slope)
         return found[..., wide:]
 
     def through_step(self, w: Window, by_states: Array, by_seen: Array, by_rewards: Array) -> Array:

@@ -58,7 +58,8 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
     """Against differences of one action: through policy, guard, critic, and ends of episodes."""
     steps, n, gamma, first = 12, 4, 0.97, 3
     settings = hyperparameters("shac", env_id) | {
-        "n_envs": n, "n_steps": steps, "critic": [8], "gamma": gamma, "episode_share": share, "max_slope": 1e9,
+        "n_envs": n, "n_steps": steps, "critic": [8], "gamma": gamma, "episode_share": share,
+        "max_slope": 1e9,
     }  # fmt: skip
     learner = shac.Learner(env_id, shac.Settings.of(settings), 0, 1000)
     start, act = copy.deepcopy(learner.state()), learner.policy.outputs
@@ -95,12 +96,12 @@ def test_it_swings_the_free_bar_up():
 @pytest.mark.parametrize(
     ("algo", "env_id", "changes", "message"),
     [
-        ("shac", FREE, {"gamma": 1.5}, "settings of shac: gamma: Input should be less than or equal to 1, got"),
+        ("shac", FREE, {"gamma": 1.5}, "gamma: Input should be less than or equal to 1, got 1.5"),
         ("shac", FREE, {"gama": 0.9}, "settings of shac: gama is an unknown key"),
         ("shac", FREE, {"start_ranges": {}}, "random_starts=0.5 needs start_ranges, got none"),
         ("shac", FREE, {"start_ranges": {"phi": 1.0}}, "has no state 'phi'; it has theta, theta_dot"),
         ("shac", cart_pole.CartPoleExact.id, {}, "shac needs gradients: CartPoleExact has a list of actions"),
-        ("shac", pivoted_bar.Unknown.id, {}, "shac needs gradients: Unknown has imperfect sensors"),
+        ("shac", pivoted_bar.SwingUpUnknown.id, {}, "needs gradients: SwingUpUnknown has imperfect"),
         ("cloning", cart_pole.CartPoleExact.id, {}, "has choices; try fast_ppo"),
         ("cloning", FREE, {"controller": "LQG"}, "no controller 'LQG'"),
         ("cloning", FREE, {"batch_size": 0}, "settings of cloning: batch_size: "),
