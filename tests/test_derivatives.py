@@ -237,7 +237,7 @@ def test_what_is_clipped_has_no_gradient():
 
 
 def test_kicks_are_constants():
-    task = TASKS["PivotedBarBalance-v0"]()
+    task = next(kind() for kind in TASKS.values() if kind.scene is PivotedBar and kind.draws)
     model, states, actions, _ = starts(task, seeded("kicks"), 2)
     ends, _, _ = model(states, actions[:, 0])
     seeds = np.ones((2, len(task.formulas.observation)))
@@ -252,7 +252,7 @@ def test_kicks_are_constants():
 
 
 def test_choices_have_no_gradient():
-    task = TASKS["CartPoleExact-v0"]()
+    task = next(task for task in (kind() for kind in TASKS.values()) if task.formulas.choices)
     with pytest.raises(ValueError, match="list of actions to choose from"):
         Model(task).vjp([[0.0] * 4], [1])
 

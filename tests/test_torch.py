@@ -6,14 +6,15 @@ import pytest
 
 import lag_envs  # noqa: F401
 from lag_envs.envs.model import Model
-from lag_envs.tasks import TASKS
+from lag_envs.tasks import TASKS, pivoted_bar
+from lag_envs.tasks.cart_pole import CartPoleContinuous, CartPoleExact
 
 torch = pytest.importorskip("torch")
 
 from lag_envs.torch import Step, TorchVectorEnv  # noqa: E402
 
 #: One with a closed form, and one of the general series.
-IDS = ["PivotedBar-v0", "CartPoleContinuous-v0"]
+IDS = ["PivotedBar-v0", CartPoleContinuous.id]
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,7 @@ def test_outputs_share_memory():
     assert observations.shape == (3, 5)
 
 
-@pytest.mark.parametrize("env_id", ["PivotedBar-v0", "PivotedBarBalance-v0"])
+@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, pivoted_bar.Balance.id])
 def test_gradient_of_an_episode(env_id):
     """Through ten steps, kicks included, by differences of the environment itself."""
     envs = TorchVectorEnv(env_id, 3)
@@ -165,7 +166,7 @@ def test_errors(step):
     with pytest.raises(ValueError, match="device must be 'cpu', got 'cuda'"):
         TorchVectorEnv(IDS[0], 2, device="cuda")
     with pytest.raises(ValueError, match="list of actions to choose from"):
-        TorchVectorEnv("CartPoleExact-v0", 2)
+        TorchVectorEnv(CartPoleExact.id, 2)
     with pytest.raises(ValueError, match="imperfect sensors, imperfect actuators or hidden parameters"):
         TorchVectorEnv(IDS[0], 2, action_delay=0.02)
     with pytest.raises(ValueError, match="give one value for all"):
