@@ -18,6 +18,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any, NamedTuple, Self
 
 import gymnasium as gym
@@ -138,6 +139,9 @@ class Learner:
             torch.optim.Adam(self.critic.parameters(), lr=settings.critic_rate, fused=True),
         ]
         self.policy = Policy(shared_weights(self.actor), (), formulas.largest)
+        start = deepcopy(self.state())
+        self.gradients(self.collect())  # compiles
+        self.restore(start)
 
     def iterate(self) -> None:
         """Collect a window and learn from it."""

@@ -140,6 +140,12 @@ class SwingUp(GuardedTrack, _Bar):
         "dqn": {"env_wrapper": [_SHORT, {"gymnasium.wrappers.DiscretizeAction": {"bins": 3}}]},
         # Hanging still, h² has no slope: half of the episodes start anywhere.
         "shac": {
+            "n_timesteps": 1.5e6,
+            "n_steps": 100,
+            "episode_share": 0.2,
+            "learning_rate": 2e-2,
+            "max_slope": 1.0,
+            "critic": [],
             "random_starts": 0.5,
             "start_ranges": {"s": 0.2, "s_dot": 1.5, "theta": math.pi, "theta_dot": 8.0},
         },
@@ -220,7 +226,6 @@ class SwingUpFree(SwingUp):  # noqa: D101 (that of SwingUp tells of both)
     hyperparameters = {
         **SwingUp.hyperparameters,
         "ppo": {**_SCALED, "env_wrapper": [_SHORT]},
-        # Without a guard gradients of two seconds are of use, and a critic is not needed.
         "shac": {
             "n_timesteps": 8e5,
             "n_steps": 100,
