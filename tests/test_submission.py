@@ -969,17 +969,20 @@ def test_all_agents_are_submitted(runs, tmp_path, monkeypatch, capsys):
 
 def test_page_shows_submissions_that_are_accepted(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "submissions.md").read_text(encoding="utf-8")
-    first, second = (part.split("```")[0] for part in text.split("```toml\n")[1:])
-    whole, built = tmp_path / "whole", tmp_path / "built-in"
+    first, ahead, named = (part.split("```")[0] for part in text.split("```toml\n")[1:])
+    start = first.replace('"learned"', '"controller"').split("[training]")[0]
+    whole, planned, built = (tmp_path / name for name in ("whole", "planned", "built-in"))
     for folder, about in (
         (whole, first),
-        (built, first.replace('"learned"', '"controller"').split("[training]")[0] + second),
+        (planned, start.replace("schema = 1", "schema = 2") + ahead),
+        (built, start + named),
     ):
         folder.mkdir()
         (folder / "submission.toml").write_text(about, encoding="utf-8")
     for seed in range(5):
         (whole / f"policy_{seed}.safetensors").write_bytes(save(net(seed, (3, 32, 32, 1))))
     assert len(load(whole).policies) == 5
+    assert load(planned).architecture.plans
     assert load(built).policies[0][1].agent().catch == 5.0
 
 
