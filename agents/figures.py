@@ -45,7 +45,7 @@ def save(figure: Any, file: Path) -> None:
 
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=100)
-    Image.open(buffer).convert("RGB").quantize(32).save(file, optimize=True)
+    Image.open(buffer).convert("RGB").quantize(96).save(file, optimize=True)
 
 
 def _figure(width: float, height: float) -> Any:
@@ -54,13 +54,14 @@ def _figure(width: float, height: float) -> Any:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _panels(envs: Mapping[str, Data], heights: Sequence[float] | None = None) -> tuple[Any, list[Any]]:
-    """Return a figure and a panel for each environment, two beside each other."""
-    rows = -(-len(envs) // 2)
-    tall = heights or [2.6] * len(envs)
-    ratios = [max(tall[2 * i : 2 * i + 2]) for i in range(rows)]
+def _panels(
+    envs: Mapping[str, Data], heights: Sequence[float] | None = None, columns: int = 2
+) -> tuple[Any, list[Any]]:
+    """Return a figure and a panel for each environment, some beside each other."""
+    tall = heights or [5.2 / columns] * len(envs)
+    ratios = [max(tall[i : i + columns]) for i in range(0, len(envs), columns)]
     figure = _figure(10.0, sum(ratios) + 0.3)
-    axes = figure.subplots(rows, 2, squeeze=False, gridspec_kw={"height_ratios": ratios}).ravel()
+    axes = figure.subplots(len(ratios), columns, squeeze=False, gridspec_kw={"height_ratios": ratios}).ravel()
     for ax in axes[len(envs) :]:
         ax.remove()
     for ax, env_id in zip(axes, envs, strict=False):
@@ -127,7 +128,7 @@ def curves_figure(envs: Mapping[str, Data], over: str) -> Any:
         name: {"color": LINES[i % len(LINES)], "ls": ["-", "--", "-."][i % 3], "label": name}
         for i, name in enumerate(names)
     }
-    figure, axes = _panels(shown)
+    figure, axes = _panels(shown, columns=3)
     for ax, env in zip(axes, shown.values(), strict=True):
         for name, style in styles.items():
             curve = (env["agents"].get(name, {}).get("curves") or {}).get(over)
