@@ -44,7 +44,7 @@ def slow(*values):
 
 KEPT = json.loads((Path(__file__).parents[1] / "agents" / "results" / "summary.json").read_text())["envs"]
 ALL = [(env_id, name, found) for env_id in KEPT for name, found in TASKS[env_id].controllers.items()]
-PLANS = [(env_id, name) for env_id, name, found in ALL if found.plans]
+PLANS = [(env_id, name) for env_id, name, found in ALL if found.plans and name in KEPT[env_id]["agents"]]
 
 
 def kept(env_id, name):
