@@ -48,12 +48,13 @@ def check_directions(scene, state, control, dt, directions):
 
 @pytest.mark.parametrize("env_id", covering())
 def test_jacobian_by_all_parameters(env_id):
-    """Along a random direction, so that two exact steps are enough."""
-    scene, rng = TASKS[env_id]().scene, seeded(env_id)
+    """Along a random direction, so that two exact steps are enough; over the task's own control interval."""
+    task, rng = TASKS[env_id](), seeded(env_id)
+    scene = task.scene
     state = rng.uniform(-2.0, 2.0, len(scene.state_names))
     control = rng.uniform(0.0, 2.0, len(scene.control_names))
     width = len(state) + len(control) + len(finite(scene))
-    check_directions(scene, state, control, 0.02, rng.uniform(-1.0, 1.0, (1, width)))
+    check_directions(scene, state, control, task.dt, rng.uniform(-1.0, 1.0, (1, width)))
 
 
 #: Parameters that are 0: their terms leave no code in the step, or they stand in a function.
