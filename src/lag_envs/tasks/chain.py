@@ -287,9 +287,9 @@ class SwingUpTriple(SwingUp):  # noqa: D101
         "once, and what is planned at the limits of the control cannot be corrected on the way."
     )
     note = """
-Best known is one recorded plan with time-varying feedback, which nearly always catches the chain. Plans
-that are improved for each start use the control at its limits, where feedback has no say, and lose the chain
-on the way.
+When the board opened, one recorded plan with time-varying feedback was best; it nearly always catches the
+chain. One of PPO's seeds has learnt a better swing since. Plans that are improved for each start use the
+control at its limits, where feedback has no say, and lose the chain on the way.
 """
 
 
