@@ -38,7 +38,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         pictures = [
             Picture(
                 "environment-errors",
-                "Error of whole episodes, relative to the size of the state, as the largest up to a time. "
+                "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of the "
+                "state, as the largest up to a time. "
                 "One line per episode, and for CartPole-v1 another for its update carried on past its end. "
                 "The exact states are computed to more than 30 digits. Dotted, in the same colours: what "
                 "one rounding of the start grows to, in exact arithmetic.",

@@ -37,6 +37,8 @@ from lag_envs.tasks.pivoted_bar import SwingUpFree
 __all__ = ["content", "jobs", "ours", "theirs", "undriven"]
 
 SECTION = "environments"
+#: Control steps of an episode at most: each is followed several times to more than 30 digits.
+MOST_STEPS = 1_000
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -44,11 +46,14 @@ def jobs(quick: bool) -> list[Job]:
     seeds = range(1 if quick else 5)
     seconds = 1.0 if quick else None
     made = [
-        Job(SECTION, f"{id}, seed {seed}", "environments:ours", {"id": id, "seed": seed, "duration": seconds})
-        for id in TASKS
-        if not TASKS[id].imperfections  # their motion is that of another
+        Job(
+            SECTION, f"{id}, seed {seed}", "environments:ours",
+            {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
+        )
+        for id, kind in TASKS.items()
+        if not kind.imperfections  # their motion is that of another
         for seed in seeds
-    ]
+    ]  # fmt: skip
     made += [
         Job(
             SECTION, f"{id}, seed {seed}", "environments:theirs", {"id": id, "seed": seed, "seconds": seconds}
@@ -64,6 +69,11 @@ def jobs(quick: bool) -> list[Job]:
         Job(SECTION, name, "environments:undriven", arguments)
         for name, arguments in zip(names, free, strict=True)
     ]
+
+
+def longest(task: Task) -> float | None:
+    """Return for how long an episode is followed, or None for the whole of it."""
+    return MOST_STEPS * task.dt if task.limit > MOST_STEPS else None
 
 
 # --- what is measured ---
