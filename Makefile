@@ -28,8 +28,7 @@ demo: setup  ## train and evaluate an agent on PivotedBar-v0
 
 baselines: setup  ## compute, train and measure all agents (hours; can be interrupted), write docs/agents.md
 	$(BIN)/python -m agents.optimum
-	$(BIN)/python -m agents.train all --seeds 5
-	$(BIN)/python -m agents.train all --algo sac td3 tqc dqn --seeds 1
+	$(BIN)/python -m agents.train all --algo ppo fast_ppo sac td3 tqc dqn --seeds 5
 	$(BIN)/python -m agents.bench --output agents/results/adapter.json
 	$(BIN)/python -m agents.results $(ARGS)
 
