@@ -28,8 +28,7 @@ demo: setup  ## train and evaluate an agent on PivotedBar-v0
 
 baselines: setup  ## compute, train and measure all agents (hours; can be interrupted), write docs/agents.md
 	$(BIN)/python -m agents.optimum
-	$(BIN)/python -m agents.train all --seeds 5
-	$(BIN)/python -m agents.train all --algo sac td3 tqc dqn --seeds 1
+	$(BIN)/python -m agents.train all --algo ppo fast_ppo sac td3 tqc dqn --seeds 5
 	$(BIN)/python -m agents.bench --output agents/results/adapter.json
 	$(BIN)/python -m agents.results $(ARGS)
 
@@ -39,7 +38,7 @@ test: setup  ## run the tests and doctests, all but the slow ones
 
 test-slow: setup  ## install what the slow tests need (Pinocchio, Ray, the RL Zoo) and run them; it prints how long it took
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[test,pinocchio,ray,zoo]'
-	$(BIN)/python -m pytest -m slow --no-skips --durations 10 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow --no-skips --durations 20 $(ARGS)
 
 notebooks: setup  ## run the notebooks in full, from the wheel (minutes); the tests run a shorter version
 	$(BIN)/python -m pytest -m slow --no-skips -s tests/test_notebooks.py $(ARGS)

@@ -103,7 +103,7 @@ class Learner:
             seen.append(self.observation)
             would, self.holds = self.expert.predict(self.observation, self.holds, self.begun)
             wanted.append(would)
-            action = self.policy.predict(self.observation)[0] if self.trained else would
+            action = self.policy.outputs(self.observation)[1] if self.trained else would  # clipped there
             self.observation, _, terminated, truncated, _ = self.envs.step(action)
             self.begun = terminated | truncated
         self.seen, self.wanted = np.concatenate(seen), np.concatenate(wanted)

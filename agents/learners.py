@@ -38,7 +38,7 @@ from agents.run import (
 )
 from lag_envs import __version__
 from lag_envs.evaluation.rollout import play
-from lag_envs.hyperparams import DISCRETISE
+from lag_envs.hyperparams import DISCRETISE, OFF_POLICY
 from lag_envs.leaderboard.fields import Strict, checked
 from lag_envs.scores import known_returns, score
 from lag_envs.store import write
@@ -60,6 +60,8 @@ OWN = {
     "cloning": ("agents.cloning", "cloning"),
 }
 LEARNERS = (*ALGORITHMS, *OWN)
+#: Learners whose policies come and go: the one that did best in a test is kept, in place of the last.
+KEEP_BEST = (*OFF_POLICY, "dqn")
 #: Episodes of a test while training, and of the evaluation at the end.
 TEST_EPISODES, EPISODES = 20, 100
 #: Tests, and so points of the learning curve and checkpoints, of one run.
@@ -111,6 +113,12 @@ def hyperparameters(algo: str, env_id: str, file: Path | None = None) -> dict[st
     if "n_timesteps" not in entry:
         raise UserError(f"{file}: the entry for {env_id} lacks n_timesteps")
     return entry
+
+
+def suits(algo: str, task: Task) -> bool:
+    """Tell whether a learner is made for a task's kind of actions: choices, or numbers."""
+    choices = bool(task.formulas.choices)
+    return choices if algo == "dqn" else not (choices and algo in OFF_POLICY)
 
 
 class OwnSettings(Strict):
@@ -202,6 +210,12 @@ def make_model(run: Run, envs: Any) -> Any:
                 arguments[name] = LinearSchedule(float(arguments[name].removeprefix("lin_")), 0.0, 1.0)
             except ValueError:
                 raise UserError(f"{name} must be a number or lin_NUMBER, got {arguments[name]!r}") from None
+    if "." in arguments.get("policy", ""):
+        module, _, name = arguments["policy"].rpartition(".")
+        try:
+            arguments["policy"] = getattr(import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise UserError(f"policy must be a name of {run.algo}'s or of a class, {error}") from error
     noise = run.hyperparameters.get("noise_type")
     if noise not in (None, "normal"):
         raise UserError(
@@ -221,22 +235,25 @@ def make_model(run: Run, envs: Any) -> Any:
 # --- checkpoints --------------------------------------------------------------------------------------------
 
 
-def freeze(model: Any) -> dict[str, bytes]:
+def freeze(model: Any) -> dict[str, Any]:
     """Return what Stable-Baselines3 keeps of a training: learner, normalisation, replay buffer."""
     file = io.BytesIO()
     model.save(file)
-    parts = model.get_vec_normalize_env(), getattr(model, "replay_buffer", None)
-    return {"model": file.getvalue(), "rest": pickle.dumps(parts)}
+    return {
+        "model": file.getvalue(),
+        "normalisation": pickle.dumps(model.get_vec_normalize_env()),
+        "buffer": pickle.dumps(getattr(model, "replay_buffer", None)),
+    }
 
 
-def thaw(run: Run, content: dict[str, bytes]) -> Any:
+def thaw(run: Run, content: Mapping[str, Any]) -> Any:
     """Return the learner of a checkpoint, in new environments."""
     import torch
 
     torch.set_num_threads(1)
     envs = make_envs(run)
     try:
-        normalise, buffer = pickle.loads(content["rest"])
+        normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
         if normalise is not None:
             normalise.set_venv(envs.venv)
             envs = normalise
@@ -275,6 +292,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 
     content = run.load_checkpoint()
     model = make_model(run, make_envs(run)) if content is None else thaw(run, content)
+    best = content and content["best"]
     model.get_env().reset()  # compiles
     # Another seed has other episodes from the first to the last, and so has one that goes on.
     model.get_env().seed((1_000_000 * run.seed + run.trained) % FIRST_FRESH_SEED)
@@ -299,13 +317,16 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
 
         def keep(self) -> None:
             """Test the policy as it is, and save all; none of it is training."""
+            nonlocal best
             run.stop_clock()
             content = freeze(self.model)
             seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + TEST_EPISODES)
-            mean = play(run.env, policy_of(run, self.model), seeds).mean()
+            mean = play(run.env, Policy(self.model, bins=numbered(run.hyperparameters)), seeds).mean()
             run.trained = self.last = self.num_timesteps
             run.curve.append((run.trained, round(run.seconds, 3), float(mean)))
-            run.save_checkpoint(content)
+            if best is None or run.algo not in KEEP_BEST or mean >= max(test[2] for test in run.curve):
+                best = {**content, "buffer": None, "trained": run.trained}
+            run.save_checkpoint({**content, "best": best})
             self.logger.record("test/mean_return", mean)
             tested(run)
             run.start_clock()
@@ -318,7 +339,7 @@ def train(run: Run, *, show: Callable[[Run], None], tested: Callable[[Run], None
             run.steps - run.trained, watch, tb_log_name=run.algo, reset_num_timesteps=False, log_interval=10
         )
         watch.keep()
-    finish(run, model)
+    finish(run, best)
 
 
 def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], None]) -> None:
@@ -351,28 +372,28 @@ def _train_own(run: Run, show: Callable[[Run], None], tested: Callable[[Run], No
         if run.trained - run.curve[-1][0] >= every or run.trained >= run.steps:
             test()
     learner.policy.save(run.path(MODEL))
-    evaluate(run, learner.policy)
+    evaluate(run, learner.policy, run.trained)
 
 
-def finish(run: Run, model: Any) -> None:
+def finish(run: Run, best: Mapping[str, Any]) -> None:
     """Write the policy, and evaluate it."""
-    normalise = model.get_vec_normalize_env()
-    file = io.BytesIO()
-    model.save(file)
-    write(run.path(MODEL), file.getvalue())
+    write(run.path(MODEL), best["model"])
+    normalise = pickle.loads(best["normalisation"])
     if normalise is not None and normalise.norm_obs:
-        write(run.path(NORMALISATION), pickle.dumps(normalise))
-    evaluate(run, policy_of(run, model))
+        write(run.path(NORMALISATION), best["normalisation"])
+    model = learner(run.algo).load(io.BytesIO(best["model"]), device="cpu")
+    evaluate(run, Policy(model, normalise, numbered(run.hyperparameters)), best["trained"])
 
 
-def evaluate(run: Run, policy: Any) -> None:
-    """Let the policy of a finished training play fresh episodes, and write the result."""
+def evaluate(run: Run, policy: Any, kept: int) -> None:
+    """Let the policy that a finished training had after some steps play fresh episodes; write the result."""
     started = time.perf_counter()
     returns = play(run.env, policy, fresh_seeds(EPISODES))
     known = known_returns(run.env)
     result = {
         **run.settings,
         "trained": run.trained,
+        "policy_of_step": kept,
         "wall_seconds": round(run.seconds, 2),
         "processor_seconds": round(run.processor_seconds, 2),
         "evaluation_seconds": round(time.perf_counter() - started, 2),
@@ -430,11 +451,6 @@ class Policy:
 def numbered(hyper: dict[str, Any]) -> bool:
     """Tell whether a wrapper numbers the actions."""
     return any(DISCRETISE in wrapper for wrapper in hyper.get("env_wrapper", []))
-
-
-def policy_of(run: Run, model: Any) -> Policy:
-    """Return the policy of a run's learner."""
-    return Policy(model, bins=numbered(run.hyperparameters))
 
 
 def load_policy(folder: Path) -> Any:

@@ -37,6 +37,7 @@ from agents.learners import OwnSettings, trainable
 from agents.run import CHECKPOINT, FIRST_FRESH_SEED, reports_errors
 from agents.train import command, follow, here, plan, summarise
 from lag_envs.envs.stagger import stagger
+from lag_envs.leaderboard.kernels import affine
 from lag_envs.store import write
 
 NAME = "fast_ppo"  #: see `agents.learners.OWN`
@@ -133,9 +134,20 @@ class Policy:
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[NDArray, Any]:
-        """Return the best action for each observation."""
-        last = self.outputs(np.asarray(observation, np.float32))[1]
-        return self.chosen(last) if self.choices else np.clip(last, -self.largest, self.largest), state
+        """Return the best action for each observation, as the leaderboard does: in float64, row by row.
+
+        `outputs` is faster, but its last bits depend on how many rows there are, and in chaotic motion that
+        decides where an episode ends up.
+        """
+        seen = np.asarray(observation, np.float64)
+        x = np.ascontiguousarray(seen.reshape(-1, seen.shape[-1]))
+        for k, (weight, bias) in enumerate(self.layers):
+            x = np.tanh(x) if k else x
+            x = affine(x, np.ascontiguousarray(weight.T, np.float64), bias.astype(np.float64))
+        last = x.reshape(*seen.shape[:-1], -1)
+        if self.choices:
+            return self.chosen(last), state
+        return np.clip(last, -self.largest, self.largest).astype(np.float32), state
 
     def save(self, path: Path) -> None:
         """Write the weights as the leaderboard has them, in a zip that `numpy.load` reads."""

@@ -24,7 +24,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from agents.learners import EPISODES, LEARNERS, TESTS, hyperparameters, train
+from agents.learners import EPISODES, LEARNERS, TESTS, hyperparameters, suits, train
 from agents.run import (
     CHECKPOINT,
     MODEL,
@@ -51,6 +51,9 @@ EPILOG = f"""what is left in FOLDER/ENV/ALGO/seed<K>:
 
 Re-run it to resume a run that was interrupted, by Ctrl-C or by a kill; seeds that are finished are left
 as they are. A run goes on from its last checkpoint, in other episodes than without the interruption.
+Policies of SAC, TD3, TQC and DQN come and go while they learn: what is left is the one that did best in a
+test, on episodes of their own. Of PPO it is the last one.
+
 Hyperparameters are in the form of the RL Zoo, which takes them unchanged:
   lag-envs hyperparams ppo > ppo.yml
   python -m rl_zoo3.train --algo ppo --env PivotedBar-v0 --gym-packages lag_envs --conf-file ppo.yml
@@ -75,7 +78,8 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "env", nargs="+", metavar="ENV",
-        help="ids, module:ID, or FILE or FILE:Class of your own, whose code is run; all: the package's",
+        help="ids, module:ID, or FILE or FILE:Class of your own, whose code is run; "
+        "all: those of the package whose actions suit the learner",
     )  # fmt: skip
     p.add_argument(
         "--algo", nargs="+", default=["ppo"], metavar="ALGO", help=f"{', '.join(LEARNERS)} (default ppo)"
@@ -141,6 +145,8 @@ def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType
         raise UserError(f"--output must be a folder, {args.output} is not")
     runs = []
     for (env, source), algo in product(sources.items(), algos):
+        if args.env == ["all"] and not suits(algo, TASKS[env]()):
+            continue
         hyper = {**hyperparameters(algo, env, args.config), **changed}
         try:
             steps = args.steps or int(float(hyper["n_timesteps"]))

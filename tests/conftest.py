@@ -1,7 +1,12 @@
 """Options of the test command."""
 
+import signal
+
 import pytest
 from browsers import browser, browsing  # noqa: F401 (fixtures)
+
+# A shell that starts the tests in the background makes them, and all that they start, ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser):

@@ -47,19 +47,25 @@ def features(kind: type[Task]) -> frozenset[str]:
     return frozenset(found)
 
 
+@cache
 def engine(kind: type[Task]) -> frozenset[str]:
     """Return what decides how a step is printed, whatever its formulas are."""
     form = kind().scene._form
     return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
 
+@cache
+def size(kind: type[Task]) -> int:
+    """Return how many coordinates a task's scene has."""
+    return len(kind().scene._layout.free)
+
+
 def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:
     """Return a covering set, chosen greedily: what adds most features, and then has fewest coordinates."""
     left = {env_id: of(TASKS[env_id]) for env_id in ids}
-    size = {env_id: len(TASKS[env_id]().scene._layout.free) for env_id in left}
     missing, found = frozenset[str]().union(*left.values()), []
     while missing:
-        found.append(max(left, key=lambda env_id: (len(left[env_id] & missing), -size[env_id])))
+        found.append(max(left, key=lambda env_id: (len(left[env_id] & missing), -size(TASKS[env_id]))))
         missing -= left[found[-1]]
     return [env_id for env_id in left if env_id in found]
 

@@ -138,11 +138,11 @@ def test_report(task, file, tmp_path, monkeypatch):
 
 
 def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypatch, capsys):
-    # Training: the workers know the task by its file.
+    # Training: the worker knows the task by its file.
     runs = tmp_path / "runs"
-    given = ["--output", str(runs), "--seeds", "2", "--steps", "4096"]
+    given = ["--output", str(runs), "--algo", "fast_ppo", "--seeds", "2", "--jobs", "1", "--steps", "4096"]
     assert train.main([str(file), *given]) == 0, capsys.readouterr()
-    learned = sorted((runs / ID / "ppo").glob("seed*"))
+    learned = sorted((runs / ID / "fast_ppo").glob("seed*"))
     assert len(learned) == 2 and -100.0 < play(ID, load_policy(learned[0]), range(0, 5)).mean() < 100.0
 
     # Results, and the page of docs/agents.md.
@@ -151,7 +151,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
         (output / folder).mkdir(parents=True)
     assert results.main(["--envs", ID, "--runs", str(runs), "--output", str(output), "--episodes", "8"]) == 0
     data = results.load_summary(output, needed=True)
-    assert set(data["envs"][ID]["agents"]) == {"zero", "random", "springs", "ppo"}
+    assert set(data["envs"][ID]["agents"]) == {"zero", "random", "springs", "fast_ppo"}
     text = (output / "docs" / "agents.md").read_text(encoding="utf-8")
     assert text == page(data) and f"## {ID}" in text and task.note in text and "springs, the best" in text
     found = behaviour.measures(record(Rollout(ID, make_controller(ID, "springs"), range(20))))
@@ -159,12 +159,12 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
 
     # The board: a learner's and a controller's submission, verified in episodes that follow from a nonce.
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 2)
-    submit.learned(ID, runs / ID / "ppo", tmp_path / "ppo")
+    submit.learned(ID, runs / ID / "fast_ppo", tmp_path / "fast_ppo")
     for name in controllers(task):
         submit.controller(ID, name, tmp_path / name)
     board = Board(tmp_path / "board")
     board.open()
-    for name in ("ppo", "springs", "random"):
+    for name in ("fast_ppo", "springs", "random"):
         board.add(load(tmp_path / name))
     board.publish("nonce", "https://example.org/pulse/1")
     finish(board)

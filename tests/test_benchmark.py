@@ -76,7 +76,7 @@ def test_info_tells_about_parameters_and_accuracy(id, capsys):
     status, out, _ = call(capsys, "info", id)
     assert status == 0
     words = {line.split()[0] for line in out.splitlines() if line}
-    task = cli._task(id)
+    task = TASKS[id]()
     numbers = {field.name for field in dataclasses.fields(task.scene)}
     assert {*task.scene.state_names, *task.observation, *numbers, "dt", "duration"} <= words
     assert "one substep" in out or "proved with the step" in out
@@ -86,7 +86,7 @@ def test_info_certifies_the_substeps(capsys):
     out = call(capsys, "info", ID)[1]
     (line,) = [line for line in out.splitlines() if "certified up to" in line]
     fastest = float(line.split("=")[1].split()[0])
-    task = cli._task(ID)
+    task = TASKS[ID]()
 
     def substeps(speed):
         return max(task.scene.truncation_bound([0.1, speed], u, task.dt).substeps for u in (-5.0, 5.0))

@@ -222,7 +222,7 @@ def test_watch_says_what_is_wrong(capsys, tmp_path, monkeypatch):
     assert "did you mean iLQR?" in told(capsys, "watch", ID, "--agent", "ilqrr")
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     assert "--video FILE" in told(capsys, "watch", ID)
-    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    monkeypatch.setattr("lag_envs.commands.base.find_spec", lambda name: None)
     assert 'pip install "lag-envs[render]"' in told(capsys, "watch", ID)
 
 
@@ -361,7 +361,7 @@ def test_other_shells_and_what_is_missing(capsys, monkeypatch):
         assert cli.main(["completion", shell]) == 0
         assert ID in (out := capsys.readouterr().out) or shell == "tcsh"
         assert "watch" in out
-    monkeypatch.setattr(cli, "find_spec", lambda name: None)
+    monkeypatch.setattr("lag_envs.commands.base.find_spec", lambda name: None)
     assert 'pip install "lag-envs[completion]"' in told(capsys, "completion", "bash")
 
 

@@ -154,7 +154,7 @@ def test_mistakes(run):
 
 
 def test_missing_packages_are_named(run, monkeypatch):
-    monkeypatch.setattr("lag_envs.cli.find_spec", lambda name: None if name == "safetensors" else 1)
+    monkeypatch.setattr("lag_envs.commands.base.find_spec", lambda name: None if name == "safetensors" else 1)
     assert 'safetensors is missing: pip install "lag-envs[leaderboard]"' in run("list")[2]
     assert cli.main(["list"]) == 0  # others don't need it
 

@@ -50,7 +50,11 @@ def test_notebooks_lie_without_outputs(path):
     assert "pip install" in notebook.cells[0].source and "clone" in notebook.cells[0].source
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMES)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=[] if p.stem == "first_steps" else pytest.mark.slow) for p in NOTEBOOKS],
+    ids=NAMES,
+)
 def test_notebooks_run(path, tmp_path):
     """With few steps and episodes; in full under -m slow."""
     found = texts(run(path, tmp_path, LAG_ENVS_QUICK="1"))

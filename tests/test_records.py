@@ -9,7 +9,7 @@ import pytest
 
 from lag_envs import scenes
 from lag_envs.controllers import build, controllers
-from lag_envs.hyperparams import DEFAULTS, learners
+from lag_envs.hyperparams import DEFAULTS, OFF_POLICY, learners
 from lag_envs.scores import share_of_privileged
 from lag_envs.tasks import TASKS, find
 from lag_envs.tasks.base import Task
@@ -79,9 +79,10 @@ def test_records_are_whole(env_id):
     assert task.goal is None or task.goal.text.startswith("success: ")
     assert task.goal is None or task.goal.hold is None or "time" in task.goal.text
     assert task.note and task.examples.start and task.examples.batch
-    assert set(task.hyperparameters) <= set(learners())
+    assert set(task.hyperparameters) <= {*learners(), "off_policy"}
     for learner, own in task.hyperparameters.items():
-        common = {name for name in own if own[name] == DEFAULTS[learner].get(name)}
+        general = DEFAULTS[OFF_POLICY[0] if learner == "off_policy" else learner]
+        common = {name for name in own if own[name] == general.get(name)}
         assert not common, f"{learner}: {common} are the general ones"
     known = controllers(task)
     assert not task.reference or not known[task.reference].plans

@@ -186,7 +186,7 @@ def test_command_line_errors(tmp_path, capsys):
 
 
 def test_missing_package(monkeypatch, capsys):
-    monkeypatch.setattr("lag_envs.cli.find_spec", lambda name: None if name == "mpmath" else 1)
+    monkeypatch.setattr("lag_envs.commands.base.find_spec", lambda name: None if name == "mpmath" else 1)
     assert main(["report"]) == 2
     assert 'mpmath is missing: pip install "lag-envs[report]"' in capsys.readouterr().err
 

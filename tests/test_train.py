@@ -86,7 +86,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         content = cut.load_checkpoint()
         model = learners.thaw(cut, content)
         # Weights, optimiser, normalisation and memory are those that were learnt, and learning goes on.
-        normalise, buffer = pickle.loads(content["rest"])
+        normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
         assert model.get_vec_normalize_env().obs_rms.mean.tolist() == normalise.obs_rms.mean.tolist()
         assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained
         if buffer is not None:
@@ -114,6 +114,22 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
     assert returns.tolist() == first["evaluation"]["returns"]
     one = one_by_one(ENV, policy, [run.FIRST_FRESH_SEED])
     np.testing.assert_allclose(one, returns[:1], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("algo", "kept"), [("sac", 1), ("ppo", -1)])
+def test_off_policy_learners_keep_what_did_best_in_a_test(algo, kept, tmp_path, monkeypatch):
+    means = iter([1.0, 7.0, 3.0, 2.0, 4.0, 0.0, 0.0])
+    monkeypatch.setattr(learners, "play", lambda env, policy, seeds: np.full(len(seeds), next(means)))
+    cut = make_run(tmp_path, algo)
+    assert not go(cut, 300) and len(cut.curve) >= 2
+    going = make_run(tmp_path, algo)  # the second test was the best, and is from before the interruption
+    weights = learners.thaw(going, going.load_checkpoint()).policy.state_dict()
+    assert go(going)
+    result = json.loads(going.path(run.RESULT).read_text())
+    assert result["policy_of_step"] == result["curve"][kept][0]
+    found = load_policy(tmp_path).model.policy.state_dict()
+    same = [bool((w == weights[name]).all()) for name, w in found.items()]
+    assert all(same) == (kept == 1)
 
 
 def test_normalised_observations_belong_to_the_policy(tmp_path):

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -82,6 +83,18 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
     while Path(f"/proc/{child}").exists() and "Z" not in Path(f"/proc/{child}/stat").read_text().split():
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_a_cluster_that_does_not_start(monkeypatch):
+    def init(*args, **kwargs):
+        raise Exception("The current node timed out during startup.")  # as Ray does
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    with (
+        pytest.raises(SpreadError, match="no Ray cluster at 'local': The current node"),
+        workers.cluster("local"),
+    ):
+        pass
 
 
 def test_a_cluster_that_is_not_there(monkeypatch):

@@ -12,28 +12,22 @@ from typing import Any
 DISCRETISE = "gymnasium.wrappers.DiscretizeAction"
 #: Learners that the Zoo does not know.
 OWN = ("fast_ppo", "shac", "cloning")
+#: Those that learn from a memory of steps. A task may say what differs for all of them, as "off_policy".
+OFF_POLICY = ("sac", "td3", "tqc")
+#: One update of 256 steps for 16 new ones, as quick as that may be. Noise is kept for some steps.
 _OFF_POLICY: Mapping[str, Any] = {
-    "n_envs": 4,
-    "n_timesteps": 4e4,
-    "policy": "MlpPolicy",
-    "buffer_size": 100_000,
-    "learning_starts": 1000,
+    "n_envs": 16,
+    "n_timesteps": 1e5,
+    "buffer_size": 200_000,
+    "learning_starts": 4000,
     "batch_size": 256,
+    "train_freq": 1,
+    "gradient_steps": 1,
     "gamma": 0.99,
-    "learning_rate": 1e-3,
-}
-#: Exploration as PPO's, kept for half a second. SAC draws it anew whenever it learns: so it learns as seldom,
-#: by as many steps at once.
-_SAC: Mapping[str, Any] = {
-    **_OFF_POLICY,
-    "train_freq": 25,
-    "gradient_steps": 50,
+    "learning_rate": 2e-3,
     "tau": 0.02,
-    "ent_coef": "auto",
-    "use_sde": True,
-    "sde_sample_freq": 25,
-    "policy_kwargs": {"net_arch": [64, 64], "log_std_init": 0.0},
 }
+_POLICY: Mapping[str, Any] = {"net_arch": [64, 64], "noise_steps": 8, "first_layer_scale": 3.0}
 #: By learner what any task is trained with.
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     # Exploration by noise that depends on the state (gSDE) and is kept for some steps moves the bar where
@@ -60,23 +54,32 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
             "optimizer_kwargs": {"eps": 1e-5, "fused": True},
         },
     },
-    "sac": _SAC,
+    "sac": {
+        **_OFF_POLICY,
+        "policy": "lag_envs.sb3_policies.SAC",
+        "ent_coef": "auto",
+        "policy_kwargs": _POLICY,
+    },
     "td3": {
         **_OFF_POLICY,
-        "train_freq": 1,
-        "gradient_steps": 2,
-        "tau": 0.02,
-        "noise_type": "normal",
-        "noise_std": 0.5,
-        "policy_kwargs": {"net_arch": [64, 64]},
+        "policy": "lag_envs.sb3_policies.TD3",
+        "policy_kwargs": {**_POLICY, "noise": 0.6},
     },
-    "tqc": {**_SAC, "top_quantiles_to_drop_per_net": 2},
-    # Actions are numbered by Gymnasium's wrapper.
+    "tqc": {
+        **_OFF_POLICY,
+        "policy": "lag_envs.sb3_policies.TQC",
+        "ent_coef": "auto",
+        "top_quantiles_to_drop_per_net": 2,
+        "policy_kwargs": _POLICY,
+    },
+    # For choices; a control of another kind is cut into 9 by Gymnasium's wrapper.
     "dqn": {
         **_OFF_POLICY,
-        "n_timesteps": 6e4,
-        "train_freq": 1,
-        "gradient_steps": 2,
+        "policy": "MlpPolicy",
+        "learning_starts": 1000,
+        "learning_rate": 1e-3,
+        "tau": 1.0,
+        "gradient_steps": 8,
         "target_update_interval": 500,
         "exploration_fraction": 0.3,
         "exploration_final_eps": 0.02,
@@ -159,7 +162,10 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
         The task. Where its actions are choices, none are numbered and none explored by gSDE; our own learners
         look after that themselves.
     """
-    found = {**DEFAULTS[learner], **task.hyperparameters.get(learner, {})}
+    families = ["off_policy"] * (learner in OFF_POLICY) + [learner]
+    found = dict(DEFAULTS[learner])
+    for family in families:
+        found |= task.hyperparameters.get(family, {})
     if task.formulas.choices and learner not in OWN:
         found = {name: value for name, value in found.items() if name not in ("use_sde", "sde_sample_freq")}
         wrappers = [wrapper for wrapper in found.pop("env_wrapper", []) if DISCRETISE not in wrapper]

@@ -116,7 +116,7 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
             None if address == "local" else address, runtime_env=packages, logging_level=logging.ERROR,
             log_to_driver=False,
         )  # fmt: skip
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # of that very class, where a busy machine's node does not start in time
         raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
 
     def submit(function: Callable, *args: Any) -> Future:

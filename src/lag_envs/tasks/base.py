@@ -99,8 +99,8 @@ class Task:
         that this task's environments have on. An instance has them checked here, or None. Formulas, and so
         `envs.model.Model` and controllers, are those of the task without them.
     hyperparameters : mapping
-        For a learner, one of `lag_envs.hyperparams.learners`: what differs from
-        `lag_envs.hyperparams.DEFAULTS`.
+        For a learner, one of `lag_envs.hyperparams.learners`, or for "off_policy", which stands for several:
+        what differs from `lag_envs.hyperparams.DEFAULTS`.
     goal : record.Goal, optional
         When the task is solved. Tasks of the package with a goal have a board.
     value_iteration : record.ValueIteration, optional

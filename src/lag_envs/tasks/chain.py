@@ -246,7 +246,13 @@ class SwingUpWeak(SwingUp):  # noqa: D101 (that of SwingUp tells of all)
     largest = 5.0
     steps_of_plan, strength = 115, 0.9
     quick = MappingProxyType({"steps": 108, "share": 0.92, "edge": 0.92})
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
+    hyperparameters = {
+        "fast_ppo": {
+            "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "batch_size": 2048,
+            "reward_scale": 1.0, "episode_share": 1.0, "actor": [64, 64], "critic": [128, 128],
+            "first_layer_scale": 3.0,
+        }
+    }  # fmt: skip
 
     difficulty = (
         "As with the strong support, but half the acceleration on a shorter track: energy has to be pumped "
@@ -407,7 +413,12 @@ class SwingUpAnywhere(SwingUp):
     id = "DoubleBarAnywhere-v0"
     draws = 2
     kick_chance, largest_kick = 0.005, 1.0
-    hyperparameters = {"fast_ppo": {**SwingUp.hyperparameters["fast_ppo"], "n_timesteps": 2e6}}
+    hyperparameters = {
+        "fast_ppo": {
+            "n_timesteps": 5e6, "learning_rate": 8e-3, "n_steps": 128, "n_epochs": 5, "gae_lambda": 0.8,
+            "clip_range": 0.1, "noise_steps": 2, "log_std_init": 0.5, "actor": [64, 64], "critic": [128, 128],
+        }
+    }  # fmt: skip
 
     controllers = {
         "LQR": Controller("lag_envs.controllers.tracking:hold"),

@@ -16,7 +16,6 @@ from lag_envs.tasks.record import Axis, Controller, Examples, Goal, ValueIterati
 
 #: Steps of 0.05 s: the horizon of 1/(1 - gamma) steps is as long in seconds.
 _PPO = {"gamma": 0.98, "gae_lambda": 0.95}
-_SAC = {"gamma": 0.98, "train_freq": 10, "gradient_steps": 20, "sde_sample_freq": 10}
 
 #: What is observed, with its unit.
 _ROLLING = {"theta": ("rad", "angle of the small cylinder's axis"), "theta_dot": ("rad/s", "its rate")}
@@ -177,10 +176,7 @@ class Tilt(_Shell):
     }
     hyperparameters = {
         "ppo": _PPO,
-        "sac": _SAC,
-        "td3": {"gamma": 0.98},
-        "tqc": _SAC,
-        "dqn": {"gamma": 0.98},
+        "off_policy": {"gamma": 0.98},
     }
     value_iteration = ValueIteration(
         (
@@ -338,11 +334,7 @@ class Pump(_Shell):
     }
     hyperparameters = {
         "ppo": {**_PPO, "n_timesteps": 8e5, "normalize": True},
-        "sac": _SAC,
-        "td3": {"gamma": 0.98},
-        "tqc": _SAC,
-        # Random actions move the shell most where all are full.
-        "dqn": {"gamma": 0.98, "env_wrapper": [{"gymnasium.wrappers.DiscretizeAction": {"bins": 3}}]},
+        "off_policy": {"gamma": 0.98},
     }
     value_iteration = ValueIteration(
         (

@@ -133,11 +133,7 @@ class SwingUp(GuardedTrack, _Bar):
     }
     hyperparameters = {
         "ppo": {**_SCALED, "env_wrapper": [_SHORT], "gamma": 0.99},
-        "sac": {"env_wrapper": [_SHORT]},
-        "td3": {"env_wrapper": [_SHORT], "gradient_steps": 1, "n_steps": 5},  # rewards of five steps at once
-        "tqc": {"env_wrapper": [_SHORT]},
-        # Random actions move the bar most where all are full.
-        "dqn": {"env_wrapper": [_SHORT, {"gymnasium.wrappers.DiscretizeAction": {"bins": 3}}]},
+        "off_policy": {"env_wrapper": [_SHORT]},
         # Hanging still, h² has no slope: half of the episodes start anywhere.
         "shac": {
             "n_timesteps": 1.5e6,

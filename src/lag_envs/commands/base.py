@@ -1,0 +1,68 @@
+"""What subcommands are, and what several of them need."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from lag_envs import TASKS
+from lag_envs.errors import UserError, hint
+
+if TYPE_CHECKING:
+    from lag_envs.tasks.base import Task
+
+#: What `report`, `info`, `bench` and `play` take besides ids.
+OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
+
+
+class Command(NamedTuple):
+    """A subcommand: how it is called, what it takes, what it does."""
+
+    name: str
+    help: str
+    description: str
+    declare: Callable[[argparse.ArgumentParser], Any]
+    run: Callable[[argparse.Namespace], int]
+
+
+def known(id: str) -> str:
+    """Return the id, or raise a UserError that names similar ones."""
+    if id in TASKS:
+        return id
+    raise UserError(
+        f"there is no environment {id!r}; {hint(id, TASKS, '`lag-envs list` names all')} "
+        "(a file of your own ends with .py)"
+    )
+
+
+def task_of(id: str) -> Task:
+    """Return the task of an id that is known, as it is by default."""
+    return TASKS[id]()
+
+
+def needs(extra: str, *packages: str) -> None:
+    """Raise a UserError that names what is missing, and its remedy."""
+    for package in packages:
+        if find_spec(package) is None:
+            raise UserError(f'{package} is missing: pip install "lag-envs[{extra}]"')
+
+
+def count(text: str) -> int:
+    """Return an argument that is a number of things."""
+    if not text.strip().isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    """Return an argument that is a time [s]."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"a number above 0 is needed, got {text!r}")
+    return value

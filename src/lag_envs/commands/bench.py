@@ -1,0 +1,178 @@
+"""``lag-envs bench``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+from lag_envs import TASKS
+from lag_envs.commands.base import OWN, Command, count, known, seconds
+from lag_envs.errors import UserError
+from lag_envs.host import usable_cores
+from lag_envs.own_files import is_file
+
+
+def declare_bench(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``bench``."""
+    parser.add_argument(
+        "ids",
+        metavar="ID",
+        nargs="*",
+        help=f"environments to measure (default: all; PivotedBar-v0 with --quick), or {OWN}",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer and shorter samples, no cold start: under a minute"
+    )
+    parser.add_argument(
+        "--cold", action="store_true", help="only the cold start: import, make, reset, first step"
+    )
+    parser.add_argument(
+        "--output", metavar="FILE", help="write everything, raw samples included, to this JSON file"
+    )
+    parser.add_argument(
+        "--checkout",
+        metavar="FOLDER",
+        help="take everything over into docs/speed.json, docs/speed.md and README.md of this checkout",
+    )
+    parser.add_argument(
+        "--with",
+        dest="keywords",
+        metavar="KEYWORDS",
+        action="append",
+        type=_keywords,
+        help="measure with these keywords too, as in --with 'action_delay=0.013'; repeatable",
+    )
+    parser.add_argument(
+        "--sizes", metavar="N,N,...", type=_sizes, help="sizes of the batches (default: 1,64,1024,16384)"
+    )
+    parser.add_argument(
+        "--threads",
+        metavar="N",
+        type=count,
+        default=1,
+        help="measure also how much quicker N threads step a batch, on N cores",
+    )
+    parser.add_argument(
+        "--rounds", metavar="N", type=count, help="samples of each row (default: 31, or 9 with --quick)"
+    )
+    parser.add_argument(
+        "--seconds",
+        metavar="S",
+        type=seconds,
+        help="length of a sample (default: 0.05, or 0.02 with --quick)",
+    )
+    parser.add_argument(
+        "--clock",
+        choices=["wall", "cpu"],
+        default="wall",
+        help="cpu leaves out what other programs take (default: wall)",
+    )
+    parser.add_argument(
+        "--date", default=date.today().isoformat(), help="date to note in the file (default: today)"
+    )
+
+
+def run_bench(args: argparse.Namespace) -> int:
+    """Compare speeds."""
+    from lag_envs.benchmark import Settings, in_own_process
+
+    ids, files = _measured(args.ids)
+    ids = ids or (("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS))
+    if args.output:
+        _check_writable(Path(args.output))
+    if args.checkout is not None:
+        if args.threads > 1 or any(getattr(args, o) for o in ("ids", "quick", "cold", "sizes", "keywords")):
+            raise UserError(
+                "--checkout is for the whole measurement: leave out IDs, --quick, --cold, --sizes, --with, "
+                "--threads"
+            )
+        for name in ("README.md", "docs/speed.json", "docs/speed.md"):
+            if not os.access(Path(args.checkout, name), os.W_OK):
+                raise UserError(
+                    f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
+                )
+    if args.threads > (cores := usable_cores()):
+        raise UserError(f"--threads {args.threads} needs as many cores, and this process may use {cores}")
+    if args.threads > 1 and args.clock == "cpu":
+        raise UserError("--threads needs --clock wall: the other adds up the time of all threads")
+    quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
+    given = {
+        name: getattr(args, name)
+        for name in ("sizes", "rounds", "seconds")
+        if getattr(args, name) is not None
+    }
+    plain = {
+        "ids": ids,
+        "files": files,
+        "keywords": tuple(args.keywords or ()),
+        "energies": not (args.quick or args.ids),
+        "jacobians": not (args.quick or args.ids or args.cold),
+        "divisions": not (args.quick or args.cold),
+        "speed": not args.cold,
+        "threads": args.threads,
+        "clock": args.clock,
+        "date": args.date,
+        "output": args.output,
+        "checkout": args.checkout,
+    }
+    return in_own_process(Settings(**(quick | given | plain)))
+
+
+def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the ids that are meant, and those of the names that are files."""
+    from lag_envs import own_files
+
+    files = tuple(dict.fromkeys(name for name in names if is_file(name)))
+    ids: list[str] = []
+    for name in names:
+        ids += own_files.registered(name) if name in files else [known(name)]
+    return tuple(dict.fromkeys(ids)), files
+
+
+def _check_writable(path: Path) -> None:
+    """Refuse before the measurement a file that could not be written after it."""
+    if path.is_dir():
+        raise UserError(f"--output must name a file, and {path} is a folder")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--output: there is no folder {path.absolute().parent}")
+    if not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
+        raise UserError(f"--output: {path} cannot be written to")
+
+
+def _keywords(text: str) -> str:
+    from lag_envs.benchmark import keywords_of
+
+    try:
+        keywords_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
+def _sizes(text: str) -> tuple[int, ...]:
+    return tuple(map(count, text.split(",")))
+
+
+BENCH = Command(
+    "bench",
+    "compare the speed with other libraries",
+    """Compare steps per second with Gymnasium and, where installed, EnvPool, gymnax and TorchRL, in one
+run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
+the cold start of whole processes. Ctrl-C ends the measurement and keeps what there is.
+
+examples:
+  lag-envs bench --quick                             one environment, under a minute
+  lag-envs bench --output speed.json                 everything, a few minutes
+  lag-envs bench --checkout .                        the same, into the documentation of a clone
+  lag-envs bench PivotedBar-v0 --sizes 64,16384
+  lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
+  lag-envs bench --quick --with action_delay=0.013   what keywords cost
+  lag-envs bench --quick --threads 2                 what a second thread brings
+  lag-envs bench --cold                              only the cold start
+  lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
+    declare_bench,
+    run_bench,
+)

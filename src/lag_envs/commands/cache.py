@@ -1,0 +1,52 @@
+"""``lag-envs cache``."""
+
+from __future__ import annotations
+
+import argparse
+
+from lag_envs.commands.base import Command
+from lag_envs.tables import columns
+
+
+def declare_cache(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``cache``."""
+    parser.add_argument("--clear", action="store_true", help="remove all that is kept")
+
+
+def run_cache(args: argparse.Namespace) -> int:
+    """Show what compiled code is kept on disk and check it, or remove it."""
+    from lag_envs.stepping import cache
+
+    place = cache.folder()
+    if place is None:
+        print("There is no folder for caches: each process compiles what it uses.")
+        return 0
+    if args.clear:
+        print(f"{place}: {cache.clear(place)} files removed")
+        return 0
+    kept = cache.entries(place)
+    size = sum(entry.size for entry in kept)
+    rows = [
+        ("folder", str(place)),
+        ("functions", str(len(kept))),
+        ("size", f"{size / 2**20:.1f} MiB of {cache.LIMIT / 2**20:.0f} at most"),
+        ("writable", "yes" if cache.writable(place) else "no: each process compiles what is not here"),
+    ]
+    damaged = [(str(entry.path), why) for entry in kept if (why := cache.damage(entry.path))]
+    rows += [("damaged", str(len(damaged)) + (", compiled anew when used next:" if damaged else ""))]
+    print("\n".join(columns(rows) + columns([("  " + path, why) for path, why in damaged])))
+    return 0
+
+
+CACHE = Command(
+    "cache",
+    "show or clear what is compiled",
+    """Show where compiled code is kept, how much of it there is, and whether it is whole. It is kept in
+the user's folder for caches, or in the one that the environment variable NUMBA_CACHE_DIR names.
+
+examples:
+  lag-envs cache            what there is
+  lag-envs cache --clear    remove it; what is needed is compiled anew""",
+    declare_cache,
+    run_cache,
+)

@@ -1,0 +1,112 @@
+"""``lag-envs list`` and ``lag-envs info``."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from lag_envs import TASKS
+from lag_envs.commands.base import OWN, Command, known, task_of
+from lag_envs.own_files import is_file
+from lag_envs.tables import columns
+
+if TYPE_CHECKING:
+    from lag_envs.tasks.base import Task
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print a line for every environment."""
+    head, *rows = columns([("id", "control", "dt", "steps", "length"), *(_line(id) for id in TASKS)])
+    print(head)
+    for id, row in zip(TASKS, rows, strict=True):
+        print(f"{row}\n  {(inspect.getdoc(TASKS[id]) or '').partition(chr(10))[0]}")
+    print(
+        "\n`lag-envs info ID` tells more about one, `lag-envs play ID` lets you drive, "
+        "`lag-envs watch ID` shows how it is done."
+    )
+    return 0
+
+
+def _line(id: str) -> tuple[str, ...]:
+    task = task_of(id)
+    return (
+        id,
+        ", ".join(_range(task, acting) for acting in task.formulas.acting),
+        f"{task.dt:g} s",
+        f"{task.limit:g}",
+        f"{task.duration:g} s",
+    )
+
+
+def _range(task: Task, acting: Any) -> str:
+    """Return a control's name, range and unit."""
+    unit = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))[acting.control]
+    return f"{acting.control} {acting.low:g} to {acting.high:g} {unit}".rstrip()
+
+
+def declare_info(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``info``."""
+    parser.add_argument("id", metavar="ID", help=f"an environment, such as PivotedBar-v0, or {OWN}")
+
+
+def run_info(args: argparse.Namespace) -> int:
+    """Print what there is to know about an environment."""
+    from lag_envs.facts import facts
+
+    if is_file(args.id):
+        from lag_envs import own_files
+
+        task = own_files.made(own_files.one(args.id), args.id)
+        name = task.id or type(task).__name__
+    else:
+        name = known(args.id)
+        task = task_of(name)
+    print("\n".join(facts(task, name)))
+    print("\n".join(_agents(task, name, args.id)))
+    return 0
+
+
+def _agents(task: Task, name: str, given: str) -> list[str]:
+    """Return what there is to see of an environment."""
+    from lag_envs.scores import known_returns
+    from lag_envs.watch import known
+
+    lines = ["", "Agents by name, and how to see them", *_rows(known(task, name))]
+    lines += [f"  lag-envs watch {given} --agent NAME, or drive yourself: lag-envs play {given}"]
+    if scale := known_returns(name):
+        lines += [
+            "",
+            f"Returns: random actions {scale.random:.4g}, the best known {scale.best:.4g} ({scale.policy})",
+        ]
+    return lines
+
+
+def _rows(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    return [f"  {line}" for line in columns(rows)]
+
+
+LIST = Command(
+    "list",
+    "list the environments",
+    """List the environments: what to do, control, control interval, steps and length of an episode.
+
+examples:
+  lag-envs list
+  lag-envs list | grep Incline""",
+    lambda parser: None,
+    run_list,
+)
+INFO = Command(
+    "info",
+    "tell about one environment",
+    """Tell about one environment: state, control, observation bounds, start, parameters, accuracy.
+
+examples:
+  lag-envs info PivotedBar-v0
+  lag-envs info ball_on_beam.py              a task of your own; this runs the file
+  lag-envs info mine.py:Balance              one of several""",
+    declare_info,
+    run_info,
+)

@@ -1,0 +1,48 @@
+"""``lag-envs order``."""
+
+from __future__ import annotations
+
+import argparse
+
+from lag_envs.commands.base import OWN, Command, count, known, task_of
+from lag_envs.own_files import is_file
+
+
+def declare_order(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``order``."""
+    parser.add_argument("id", metavar="ID", help=f"an environment, or {OWN}")
+    parser.add_argument(
+        "--num-envs", metavar="N", type=count, default=1024, help="size of the batch (default: 1024)"
+    )
+    parser.add_argument("--rounds", metavar="N", type=count, default=9, help="samples (default: 9)")
+
+
+def run_order(args: argparse.Namespace) -> int:
+    """Print what each order of the series costs, and which to choose."""
+    from lag_envs import own_files
+    from lag_envs.orders import ORDERS, lines, measure
+    from lag_envs.progress import progress
+
+    if is_file(args.id):
+        kind = own_files.one(args.id)
+        own_files.made(kind, args.id)
+    else:
+        kind = type(task_of(known(args.id)))
+    with progress(args.rounds * len(ORDERS)) as advance:
+        times = measure(kind, args.num_envs, args.rounds, advance=lambda: advance(kind.__name__))
+    print("\n".join(lines(kind, times, kind().scene._order(kind().dt))))
+    return 0
+
+
+ORDER = Command(
+    "order",
+    "find the order of the series that steps a task fastest",
+    """Measure the time of a step by each order of the series, under random actions in a task's own
+episodes, and tell which one to write into the task. With any order each step is certified alike.
+
+examples:
+  lag-envs order ball_on_beam.py             a task of your own; this runs the file
+  lag-envs order mine.py:Balance             one of several""",
+    declare_order,
+    run_order,
+)

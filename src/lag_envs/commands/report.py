@@ -1,0 +1,107 @@
+"""``lag-envs report``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+from lag_envs.commands.base import OWN, Command, count, needs
+from lag_envs.errors import UserError, hint
+from lag_envs.own_files import is_file
+
+
+def declare_report(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``report``."""
+    parser.add_argument(
+        "places", metavar="[FILE] [FOLDER]", nargs="*",
+        help=f"{OWN}, if it is to be measured; and where to write (default: report, or report-NAME)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer cases and methods, the pivoted bar first: under a minute"
+    )
+    parser.add_argument(
+        "--sections",
+        metavar="NAME,...",
+        help="only these: environments, work_precision, general, bound, stability, conservation, leave_out",
+    )
+    parser.add_argument(
+        "--processes", metavar="N", type=count, default=os.cpu_count() or 1,
+        help="jobs side by side (default: one per core); timings always run alone",
+    )  # fmt: skip
+    parser.add_argument(
+        "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
+    )
+    parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Measure errors and write the page."""
+    needs("report", "flint", "jinja2", "matplotlib", "mpmath", "scipy", "sympy")
+    from lag_envs.report.report import SECTIONS, NotAReport, Settings, make_report
+
+    file, folder = _places(args.places)
+    if file:
+        from lag_envs.report import own
+
+        for option in ("sections", "docs"):
+            if getattr(args, option):
+                raise UserError(f"--{option} is for the report about this package: leave out it, or {file}")
+        own.subjects(file)  # what is wrong with the file is said before anything is measured
+        made = Settings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
+        try:
+            return 0 if make_report(made) else 130
+        except (NotAReport, OSError) as error:
+            raise UserError(str(error)) from error
+    names = tuple(dict.fromkeys(args.sections.split(","))) if args.sections else SECTIONS
+    for name in names:
+        if name not in SECTIONS:
+            raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
+    if args.docs and (args.quick or names != SECTIONS):
+        raise UserError("--docs takes a whole report: leave out --quick and --sections")
+    settings = Settings(folder, args.quick, names, args.processes, args.date)
+    try:
+        if not make_report(settings):
+            return 130
+        if args.docs:
+            from lag_envs.report import docs
+
+            return docs.main([folder, args.docs])
+        return 0
+    except (NotAReport, OSError) as error:
+        raise UserError(str(error)) from error
+
+
+def _places(places: Sequence[str]) -> tuple[str, str]:
+    """Return the file that is measured, or nothing, and the report's folder."""
+    files = [place for place in places if is_file(place) and not Path(place).is_dir() and ".py" in place]
+    folders = [place for place in places if place not in files]
+    if len(files) > 1 or len(folders) > 1:
+        raise UserError(f"one FILE and one FOLDER at most, got {' '.join(places)}")
+    if files:
+        from lag_envs.own_files import split
+
+        return files[0], folders[0] if folders else f"report-{Path(split(files[0])[0]).stem}"
+    return "", folders[0] if folders else "report"
+
+
+REPORT = Command(
+    "report",
+    "measure errors, and write a page about them",
+    """Measure the error of every environment and scene against high precision, beside usual integrators
+and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
+Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
+Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.
+
+examples:
+  lag-envs report --quick                            a first look, under a minute
+  lag-envs report                                    everything, about half an hour on two cores
+  lag-envs report --docs .                           the same, and what this checkout says of it
+  lag-envs report --sections bound,stability maps    two parts, into the folder maps
+  lag-envs report ball_on_beam.py                    scenes of your own, into report-ball_on_beam;
+                                                     this runs the file""",
+    declare_report,
+    run_report,
+)
