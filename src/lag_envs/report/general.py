@@ -53,6 +53,7 @@ CLOCK = (1e-12, 16)
 LONG = 1000.0
 #: Prints the seconds until a scene has made its first step.
 FIRST = """
+from math import inf
 from time import process_time
 import numpy, numba, llvmlite.binding
 from lag_envs.scenes import *
