@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 #: Every step of an exact flow is to stay below the first, every episode below the second or so many times one
 #: rounding of its start, amplified.
 LARGEST_STEP, LARGEST_ERROR, ROUNDINGS = 1e-15, 1e-13, 100.0
+#: What any scene promises of a step. The certificate asks for less, but measures a velocity by energy: that of
+#: a light body may be small beside what it is measured by.
+PROMISED = 1e-12
 APART = 1e9  #: by this factor at least, Gymnasium's errors are to be larger than ours
 #: The undriven pendulum is let go at rest, this far from hanging [rad]; it is compared over the first, its
 #: energy over the second time [s].
@@ -260,7 +263,7 @@ def _claims(rows: list[Row]) -> list[Claim]:
             f"{_ratio(above):.2g} times in {above['case']}" if above else "",
         ),
         _of_steps(flows, LARGEST_STEP, "No step of an exact flow"),
-        _of_steps(series, TOLERANCE, "No step of the general series"),
+        _of_steps(series, PROMISED, "No step of the general series"),
         Claim(
             f"Every episode of Gymnasium's is off by more than {APART:g} times the largest error of ours "
             "that have the same equations.",
