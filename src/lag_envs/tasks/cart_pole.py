@@ -246,7 +246,7 @@ class CartPoleContinuous(_OnTrack):
         )
     }
     reference = "LQR"
-    hyperparameters = {"ppo": {"gamma": 0.98}, "fast_ppo": {"gamma": 0.98}}
+    hyperparameters = {"ppo": {"gamma": 0.98}, "fast_ppo": {"gamma": 0.98}, "off_policy": {"gamma": 0.98}}
     examples = Examples(
         start={"state": [0.1, -0.2, 0.05, 0.1]},
         moving=[0.5, 2.0, 0.1, -3.0],

@@ -176,7 +176,7 @@ class Tilt(_Shell):
     }
     hyperparameters = {
         "ppo": _PPO,
-        "off_policy": {"gamma": 0.98},
+        "off_policy": {"gamma": 0.98, "n_timesteps": 6e4},
     }
     value_iteration = ValueIteration(
         (

@@ -120,6 +120,7 @@ class Tilt(Task):
         ),
         "iLQR": Controller("lag_envs.controllers:plan", {"guess": "cascade"}, plans=True),
     }
+    hyperparameters = {"off_policy": {"gamma": 0.98, "n_timesteps": 6e4}}
     value_iteration = ValueIteration(
         (
             Axis("x [m]", -0.5, 0.5, 36, scale=0.1, centre="target", level=2),

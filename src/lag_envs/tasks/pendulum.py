@@ -122,7 +122,11 @@ class PendulumExact(_Rod):
         "energy shaping + LQR": Controller("lag_envs.controllers.pendulum:PendulumEnergyLQR"),
     }
     reference = "energy shaping + LQR"
-    hyperparameters = {"ppo": {"gamma": 0.95}, "fast_ppo": {"gamma": 0.95, "episode_share": 1.0}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.95},
+        "fast_ppo": {"gamma": 0.95, "episode_share": 1.0},
+        "off_policy": {"gamma": 0.98, "n_timesteps": 6e4},
+    }
     examples = dataclasses.replace(
         _Rod.examples,
         batch={
