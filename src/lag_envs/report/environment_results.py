@@ -87,8 +87,8 @@ def _text() -> list[str]:
         "propagated exactly. Where the system damps or does not amplify, roundings of later steps add to it.",
         "The exact flows of pendulum and linear motion leave out less than a rounding. A step of the general "
         "series is divided until each part, as its certificate says, leaves out less than "
-        f"{TOLERANCE:g} of a velocity's size, and no further. Where steps are long, or friction changes within "
-        "a narrow range of speeds, it leaves out nearly that much, which is many roundings.",
+        f"{TOLERANCE:g} of a velocity's size, and no further. Where steps are long, or friction changes "
+        "within a narrow range of speeds, it leaves out nearly that much, which is many roundings.",
         "The error of one step is the largest of any step of the episode. Each step is repeated in exact "
         "arithmetic from the state recorded before it, and compared with the state recorded after it. "
         "Ours carry cosine and sine beside the angle. If an angle has grown to many turns, its rounding "
