@@ -16,11 +16,11 @@ from lag_envs.tasks import TASKS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Limits on the error of an exact flow's step, and on that of a whole episode: so many times one rounding of its
-#: start, as the system amplifies it, or with the general series what its steps may leave out together.
+#: Limits on the error of an exact flow's step, and on that of a whole episode: so many times one rounding of
+#: its start, as the system amplifies it, or with the general series what its steps may leave out together.
 LARGEST_STEP, ROUNDINGS = 2e-15, 100.0
-#: What any scene promises of a step. The certificate asks for less, but measures a velocity by energy: that of
-#: a light body may be small beside what it is measured by.
+#: What any scene promises of a step. The certificate asks for less, but measures a velocity by energy: that
+#: of a light body may be small beside what it is measured by.
 PROMISED = 1e-12
 APART = 1e9  #: by this factor at least, Gymnasium's errors are to be larger than ours
 #: The undriven pendulum is let go at rest, this far from hanging [rad]; it is compared over the first, its
