@@ -7,7 +7,7 @@ from fractions import Fraction
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import PERFECT, covering
+from covering import PERFECT, covering, engine
 from mpmath import mp, mpf
 from rollouts import actions
 
@@ -129,7 +129,7 @@ def same(path, start, given):
         assert all(abs(a - b) < mpf(10) ** -25 for a, b in zip(path[-1], y, strict=True))
 
 
-@pytest.mark.parametrize("id", covering(PERFECT))
+@pytest.mark.parametrize("id", covering(PERFECT, engine))
 def test_one_second_of_every_environment(id):
     """Exact flows to rounding; series leave out what their certificate allows, in each step.
 
