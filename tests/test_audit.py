@@ -520,6 +520,7 @@ def test_commands(board, tmp_path, capsys):
 # --- the repository's own board -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow  # `make audit` tells it too, and `make check` runs both
 def test_the_repositorys_board_is_sound():
     """What `make audit` does besides takes longer."""
     found = audit.cheap(Board(ROOT / "leaderboard"))

@@ -233,6 +233,7 @@ def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):
     assert "ratio" in row(report, ID, "made")
 
 
+@pytest.mark.slow
 def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
     output = tmp_path / "speed.json"
     command = [sys.executable, "-m", "lag_envs.cli", "bench", ID, "--quick", "--sizes", "1", "--rounds", "1"]

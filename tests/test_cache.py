@@ -256,6 +256,7 @@ print(digest.hexdigest(), "numba.np.arraymath" in sys.modules)
 """
 
 
+@pytest.mark.slow
 def test_environments_step_on_whatever_is_left_of_their_code(place):
     def step():
         command = [sys.executable, "-c", STEP, incline.Brake.id]  # the quickest to compile

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import serious, until
-from covering import PERFECT, covering, quick
+from covering import PERFECT, covering, engine, quick
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -108,7 +108,7 @@ def check_bits(page, folder, task, name, episodes):
         )
 
 
-@pytest.mark.parametrize("id", covering(PERFECT))
+@pytest.mark.parametrize("id", covering(PERFECT, engine))
 def test_the_pages_step_has_pythons_bits(browsing, alone, id):
     task = TASKS[id]()
     page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())

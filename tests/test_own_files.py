@@ -319,6 +319,7 @@ def test_subjects_are_the_scenes_of_tasks_and_the_others(write):
     ]
 
 
+@pytest.mark.slow
 def test_stiff_parameters_are_counted(write, monkeypatch):
     from lag_envs.report import own
 

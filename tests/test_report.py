@@ -25,7 +25,7 @@ PROJECT = Path(__file__).parents[1]
 
 
 def settings(folder, **changes):
-    return Settings(str(folder), sections=(dummy_section.SECTION,), processes=2, **changes)
+    return Settings(str(folder), sections=(dummy_section.SECTION,), processes=1, **changes)
 
 
 # --- jobs ---
@@ -84,7 +84,7 @@ def test_a_line_that_was_cut_off(tmp_path):
 def test_timings_run_alone(tmp_path):
     alone = [replace(job(f"alone {i}", "waits", seconds=0.2), alone=True) for i in range(2)]
     begin = time.monotonic()
-    results, _ = run_jobs([*alone, job("first", count=1)], tmp_path, 4)
+    results, _ = run_jobs([*alone, job("first", count=1)], tmp_path, 2)
     assert time.monotonic() - begin > 0.4
     assert load(tmp_path / "results.jsonl")[0].name == "first"
     assert len(results) == 3

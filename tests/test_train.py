@@ -414,7 +414,7 @@ def beside_the_example(monkeypatch):
         pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
         # It chooses among three actions.
         pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),
-        # It has two controls and two targets. Quick is the training in test_add_task.py.
+        # It has two controls and two targets. Quick is fast PPO's training in test_add_task.py.
         pytest.param(f"{SEVERAL}:Deliver", "OwnCrane-v0", marks=pytest.mark.slow),
     ],
 )
@@ -439,7 +439,11 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
         ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
-        ([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn numbers the actions of one control"),
+        pytest.param(
+            [f"{SEVERAL}:Deliver", "--algo", "dqn"],
+            "dqn numbers the actions of one control",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):
