@@ -165,14 +165,23 @@ class UnfusedProgram:
     @cached_property
     def script(self) -> Script:
         """The functions of the module's docstring."""
+        return self.written("derive", "start", "lift", "move", "kick", "observe", "poses")
+
+    def written(self, *names: str) -> Script:
+        """Return a script of these functions."""
+        known: dict[str, tuple[str, Callable]] = {
+            "derive": ("k", self._derive),
+            "start": ("f, d, k", self._start),
+            "lift": ("f, k", self._lift),
+            "move": ("f, a, k", self._move),
+            "kick": ("f, d, k", self._kick),
+            "observe": ("f, k", self._observe),
+            "poses": ("f, p, k", self._poses),
+        }
         t = Script()
-        t.function("derive", "k", lambda: self._derive(t))
-        t.function("start", "f, d, k", lambda: self._start(t))
-        t.function("lift", "f, k", lambda: self._write_state(t, self._read(t, self.rows.y)[: self.states]))
-        t.function("move", "f, a, k", lambda: self._move(t))
-        t.function("kick", "f, d, k", lambda: self._kick(t))
-        t.function("observe", "f, k", lambda: self._observe(t))
-        t.function("poses", "f, p, k", lambda: self._poses(t))
+        for name in names:
+            arguments, write = known[name]
+            t.function(name, arguments, partial(write, t))
         return t
 
     def _read(self, t: Script, rows: slice, array: str = "f") -> list[str]:
@@ -182,6 +191,9 @@ class UnfusedProgram:
         first = rows if isinstance(rows, int) else rows.start
         for i, value in enumerate(values):
             t.say("write", array, first + i, value)
+
+    def _lift(self, t: Script) -> None:
+        self._write_state(t, self._read(t, self.rows.y)[: self.states])
 
     def _write_state(self, t: Script, y: Sequence) -> None:
         """Write a state, and cosine and sine of its angle."""
