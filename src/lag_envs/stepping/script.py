@@ -129,10 +129,10 @@ function copysign(x, sign) {{
 }}
 """,
 )
-#: C++ as compilers for processors and for GPUs take it. Who includes the text says what INLINE, INF and NAN are.
+#: C++ as compilers for processors and for GPUs take it; whoever includes it defines INLINE, INF and UNDEFINED.
 CPP = Language(
     2,
-    {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "NAN"},
+    {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "UNDEFINED"},
     f"""typedef double real;
 union Bits {{
   double number;
@@ -480,6 +480,8 @@ def _lines(block: Iterable[Statement], language: Language, depth: int = 0) -> It
         return f"({found})" if found.startswith("-") else found
 
     for kind, parts, body in block:
+        if kind == "function":
+            parts = parts[0], language.arguments.get(parts[1], parts[1])
         line = STATEMENTS[kind][column].format(*map(text, parts))
         if line:
             yield " " * depth + line
@@ -624,7 +626,14 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
 
 
 def motion(
-    t: Script, record: SeriesRecord, inputs: dict[str, Any], q: list, v: list, dt: Any, order: int
+    t: Script,
+    record: SeriesRecord,
+    inputs: dict[str, Any],
+    q: list,
+    v: list,
+    dt: Any,
+    order: int,
+    tolerance: float = TOLERANCE,
 ) -> tuple[list, list, str]:
     """Write a control step of the series; return places, velocities, and whether it was refused.
 
@@ -642,13 +651,15 @@ def motion(
         The control step [s].
     order : int
         Order of the series.
+    tolerance : float
+        What a substep's velocities may leave out, in their sizes.
     """
     n, step = record.size, Series(record)
     smallest = t.mul(SMALLEST_PART, dt)
 
     def attempt(count: Any, carried: Sequence) -> tuple[Any, list]:
         lane = Lane(carried[:n], carried[n : 2 * n], 0.0, *carried[2 * n :])
-        after, _ = step.substep(t, inputs, lane, dt, order, TOLERANCE)
+        after, _ = step.substep(t, inputs, lane, dt, order, tolerance)
         going = t.both(t.less(0.0, after.left), t.less(smallest, after.wish))
         return going, [*after.q, *after.v, after.left, after.wish]
 
