@@ -27,8 +27,8 @@ def library(source):
     name = folder() / hashlib.sha256(source.encode()).hexdigest()[:16]
     text, made = name.with_suffix(".cpp"), name.with_suffix(".so")
     text.write_text(source)
-    options = ["-std=c++17", "-O1", "-shared", "-fPIC", *APART[1:], "-Wall", "-Werror", "-Wno-unused-function"]
-    subprocess.run([COMPILER, *options, text, "-o", made], check=True)
+    options = f"-std=c++17 -O1 -shared -fPIC {APART[1]} -Wall -Werror -Wno-unused-function"
+    subprocess.run([COMPILER, *options.split(), text, "-o", made], check=True)
     return ctypes.CDLL(str(made))
 
 

@@ -19,6 +19,7 @@ from lag_envs import nvrtc
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.single import key_of, start_options
 from lag_envs.envs.vector import LagrangianVectorEnv, check_count, named, seeds_of
+from lag_envs.stepping.cache import kept
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import KEYWORDS
 
@@ -80,14 +81,15 @@ class DeviceEnvs:
                     f"on a GPU all environments have the same parameters: give {option} one value, "
                     "or make one TorchVectorEnv for each"
                 )
-        #: One environment on the CPU, which knows task, spaces and modes.
-        self.sample = sample = (
+        sample = (
             gym.make_vec(task, 1, **options).unwrapped
             if isinstance(task, str)
             else LagrangianVectorEnv(task, 1, **options)
         )
         if not isinstance(sample, LagrangianVectorEnv):
             raise ValueError(f"{name} cannot be on a GPU: it is no environment of this package")
+        #: One environment on the CPU, which knows task, spaces and modes.
+        self.sample: LagrangianVectorEnv = sample
         if sample.render_mode or sample.diagnostics:
             raise ValueError("a GPU has neither render_mode nor diagnostics; leave them out")
         if sample.task.imperfections:
@@ -97,15 +99,11 @@ class DeviceEnvs:
             )
         self.task = sample.task
         kernels = kernels_of(self.task, dtype == torch.float32)
-        limit = sample._constants[0]["limit"]
-        self._limit = int(min(limit, ENDLESS))
         self._launch = (load or load_nvrtc)(kernels.source, self.device, dtype == torch.float32)
-        self._shape = (self.num_envs, *(() if len(self.task.formulas.choices) == 1 else sample._actions.shape))
-        self._states, self._targets, self._controls = (
-            slice(0, len(self.task.formulas.state)),
-            kernels.targets,
-            kernels.controls,
-        )
+        self._limit = int(min(sample._constants[0]["limit"], ENDLESS))
+        self._shape = self.num_envs, *sample._actions.shape
+        self._states = slice(0, len(self.task.formulas.state))
+        self._targets, self._controls = kernels.targets, kernels.controls
         self.rows = self._new(kernels.kept, dtype=dtype).zero_()
         self._ids = self._new(2, dtype=torch.int64).zero_()
         self._ages = self._new(dtype=torch.int32).zero_()
@@ -166,8 +164,9 @@ class DeviceEnvs:
     def step(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Take a control step, as `TorchVectorEnv.step` does."""
         if not isinstance(actions, Tensor):
-            raise TypeError(f"actions must be a tensor, got {type(actions).__name__}; torch.as_tensor makes one")
-        if actions.device.type != self.device.type:
+            kind = type(actions).__name__
+            raise TypeError(f"actions must be a tensor, got {kind}; torch.as_tensor makes one")
+        if actions.device != self.device:
             raise ValueError(f"actions must be on {self.device}, got a tensor on {actions.device}")
         whole = bool(self.task.formulas.choices)
         if actions.is_complex() or actions.dtype == torch.bool or actions.is_floating_point() == whole:
@@ -225,15 +224,16 @@ class DeviceEnvs:
 def load_nvrtc(source: str, device: torch.device, single: bool) -> Launch:
     """Compile kernels for a GPU; return what starts them on its current stream."""
     major, minor = torch.cuda.get_device_capability(device)
-    code = nvrtc.compiled(source, f"sm_{major}{minor}", () if single else APART[:1])
-    torch.cuda.synchronize(device)  # makes the context in which the module is loaded
+    target, options = f"sm_{major}{minor}", () if single else APART[:1]
+    parts = repr((source, target, options, nvrtc.version()))
+    code = kept("kernels", parts, lambda: nvrtc.compiled(source, target, options))
     with torch.cuda.device(device):
+        torch.cuda.synchronize()  # makes the context in which the module is loaded
         module = nvrtc.Module(code)
 
     def launch(name: str, count: int, *arguments: Any) -> None:
-        with torch.cuda.device(device):
-            stream = torch.cuda.current_stream(device).cuda_stream
-            module.launch(name, count, stream, [count, *map(address, arguments)])
+        stream = torch.cuda.current_stream(device).cuda_stream
+        module.launch(name, count, stream, [count, *map(address, arguments)])
 
     return launch
 
@@ -258,6 +258,6 @@ def _checked_device(device: str | torch.device) -> torch.device:
         )
         raise ValueError(f"there is no device {str(device)!r} here. {why}; or leave device out")
     number = torch.cuda.current_device() if found.index is None else found.index
-    if number >= torch.cuda.device_count():
-        raise ValueError(f"there is no device {str(device)!r} here: the last one is cuda:{torch.cuda.device_count() - 1}")
+    if number >= (count := torch.cuda.device_count()):
+        raise ValueError(f"there is no device {str(device)!r} here: the last one is cuda:{count - 1}")
     return torch.device("cuda", number)

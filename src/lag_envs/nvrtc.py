@@ -11,7 +11,13 @@ from typing import Any
 BLOCK = 128
 
 
-@cache
+def version() -> tuple[int, int]:
+    """Return the compiler's version."""
+    status, *found = _bindings()[1].nvrtcVersion()
+    _checked((status,))
+    return found[0], found[1]
+
+
 def compiled(source: str, architecture: str, options: tuple[str, ...] = ()) -> bytes:
     """Return a GPU's machine code of a C++ text.
 
@@ -56,6 +62,7 @@ class Module:
 
     def __init__(self, code: bytes) -> None:
         self._driver, _ = _bindings()
+        self._context = _checked(self._driver.cuCtxGetCurrent())
         self._module = _checked(self._driver.cuModuleLoadData(code))
         self._kernels: dict[str, Any] = {}
 
@@ -77,13 +84,17 @@ class Module:
             self._kernels[name] = _checked(self._driver.cuModuleGetFunction(self._module, name.encode()))
         given = tuple(arguments), (ctypes.c_longlong,) * len(arguments)
         grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
-        _checked(self._driver.cuLaunchKernel(self._kernels[name], *grid, *block, 0, stream, given, 0))
+        _checked(self._driver.cuCtxPushCurrent(self._context))  # another thread may have none
+        try:
+            _checked(self._driver.cuLaunchKernel(self._kernels[name], *grid, *block, 0, stream, given, 0))
+        finally:
+            _checked(self._driver.cuCtxPopCurrent())
 
 
 @cache
 def _bindings() -> tuple[Any, Any]:
     try:
-        from cuda.bindings import driver, nvrtc
+        from cuda.bindings import driver, nvrtc  # type: ignore[import-not-found]  # no build for the CPU has it
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "cuda.bindings is missing, which PyTorch's builds for CUDA bring: pip install cuda-bindings",

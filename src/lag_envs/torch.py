@@ -134,16 +134,16 @@ class Step:
 class TorchVectorEnv:
     """Many environments of one task as tensors, with a `step` that can be differentiated.
 
-    On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its memory.
-    Where the actions, or the states that earlier actions led to, require a gradient, `step` is recorded:
-    gradients flow from observations and rewards to actions, and along `state` from step to step until
-    `detach` cuts them off. No gradient flows through an episode's end into the next one.
+    On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its
+    memory. Where the actions, or the states that earlier actions led to, require a gradient, `step` is
+    recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
+    until `detach` cuts them off. No gradient flows through an episode's end into the next one.
 
-    On an NVIDIA GPU one kernel takes the whole step, states stay there, and there are no gradients. In float64
-    the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for the GPU,
-    so it does not raise `StepRefused`, nor complain of actions that are no numbers: where a step cannot be
-    taken, the environment keeps its state, its reward is 0, and the episode is truncated; ``infos["refused"]``
-    tells where. There `state` is memory that the next step writes.
+    On an NVIDIA GPU one kernel takes the whole step, states stay there, and there are no gradients. In
+    float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
+    the GPU, so it neither raises `StepRefused` nor complains of actions that are not finite: where a step
+    cannot be taken, the environment keeps its state, its reward is 0, and the episode is truncated;
+    ``infos["refused"]`` tells where. `state` is memory there that the next step writes.
 
     Parameters
     ----------
@@ -307,6 +307,7 @@ class TorchVectorEnv:
             self.envs.close()
 
     def _advance(self, actions: Tensor) -> list[Any]:
+        assert isinstance(self.envs, LagrangianVectorEnv)
         *results, self._infos = self.envs.step(actions.detach().numpy())
         return list(results)
 
@@ -386,7 +387,7 @@ class _EnvStep(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
-        envs = env.envs
+        envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.stepped = envs._read("n") >= 0.0
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))

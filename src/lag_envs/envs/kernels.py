@@ -1,9 +1,10 @@
 """The whole step of a batch as C++: the text that a GPU's compiler takes, and any other one.
 
 The text consists of a task's script (`lag_envs.envs.unfused`), printed in C++, and of two kernels around it.
-``begin`` starts episodes, ``step`` takes a control step: control, guard, motion in certified substeps, reward,
-ending, kick, observation, and the start of the next episode where one is over. Each environment is computed by
-one thread, from its own numbers only. Without a GPU's compiler the kernels are loops over the environments.
+``begin`` starts episodes, ``step`` takes a control step: control, guard, motion in certified substeps,
+reward, ending, kick, observation, and the start of the next episode where one is over. Each environment is
+computed by one thread, from its own numbers only. Without a GPU's compiler the kernels are loops over the
+environments.
 
 In double precision, compiled without contraction of products and sums, all bits are those of
 `lag_envs.envs.unfused.Unfused`. In single precision the functions are those of C's library, and the series
@@ -96,8 +97,9 @@ KERNEL begin(long long n, real *rows, word *ids, int *ages, const real *k, const
   }
 }
 
-KERNEL step(long long n, real *rows, word *ids, int *ages, const real *k, long long limit, const real *actions,
-            float *observations, real *rewards, bool *terminated, bool *truncated, bool *refused, float *last) {
+KERNEL step(long long n, real *rows, word *ids, int *ages, const real *k, long long limit,
+            const real *actions, float *observations, real *rewards, bool *terminated, bool *truncated,
+            bool *refused, float *last) {
   const int choices[ACTIONS + 1] = {CHOICES};
   EACH(i, n) {
     real f[SIZE];

@@ -129,7 +129,7 @@ function copysign(x, sign) {{
 }}
 """,
 )
-#: C++ as compilers for processors and for GPUs take it; whoever includes it defines INLINE, INF and UNDEFINED.
+#: C++ for compilers for processors and for GPUs; INLINE, INF and UNDEFINED come with what is around it.
 CPP = Language(
     2,
     {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "UNDEFINED"},
