@@ -10,7 +10,7 @@ from gymnasium.error import ResetNeeded
 from own_tasks import TASKS as OWN
 
 import lag_envs.torch
-from lag_envs import nvrtc
+from lag_envs import benchmark_device, cli, nvrtc
 from lag_envs.device import DeviceEnvs
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.unfused import Unfused
@@ -267,14 +267,40 @@ def test_nvrtc_compiles_it():
         nvrtc.compiled("extern int f(", "sm_90")
 
 
+def test_the_benchmark_measures_both_precisions(monkeypatch):
+    """Here on the processor: its numbers are those of no GPU."""
+    monkeypatch.setattr(benchmark_device, "DeviceEnvs", _on_any)
+    monkeypatch.setattr(benchmark_device, "COPIED", 2**20)
+    found = benchmark_device.rates([CHOICES.id, BAR.id], [7], "cpu", 1e-3, 3)
+    assert [(r.id, r.dtype) for r in found] == [
+        (id, dtype) for id in (CHOICES.id, BAR.id) for dtype in (torch.float32, torch.float64)
+    ]
+    assert all(r.steps > 0.0 and r.share > 0.0 for r in found)
+    lines = benchmark_device.table(found).split("\n")
+    assert len(lines) == 5 and lines[1].split()[:3] == [CHOICES.id, "float32", "7"]
+    # State, target and control there and back, action, reward, two observations, age, three truth values.
+    assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 5 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 3
+
+
+def _on_any(task, num_envs, device, dtype, **options):
+    return on_processor(task, num_envs, dtype=dtype, **options)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_without_a_gpu():
+def test_without_a_gpu(capsys):
     with pytest.raises(ValueError, match=r"there is no device 'cuda' here. .* or leave device out"):
         TorchVectorEnv(BAR.id, 2, device="cuda")
     with pytest.raises(ValueError, match="device must be 'cpu' or 'cuda', got 'meta'"):
         TorchVectorEnv(BAR.id, 2, device="meta")
     with pytest.raises(ValueError, match=r"on the CPU dtype must be torch\.float64, got torch\.float32"):
         TorchVectorEnv(BAR.id, 2, dtype=torch.float32)
+    for given, message in (
+        (["--device", "cuda"], "--device: there is no device 'cuda' here"),
+        (["--device", "gpu"], "--device: Expected one of cpu, cuda"),
+        (["--device", "cuda", "--cold"], "--device takes no other options than"),
+    ):
+        assert cli.main(["bench", *given]) == 2
+        assert message in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")

@@ -72,7 +72,7 @@ class DeviceEnvs:
         if dtype not in (torch.float32, torch.float64):
             raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
         self.num_envs = check_count("num_envs", num_envs)
-        self.device = _checked_device(device) if load is None else torch.device(device)
+        self.device = checked_device(device) if load is None else torch.device(device)
         self.dtype = dtype
         name = task if isinstance(task, str) else task.__name__
         for option, value in options.items():
@@ -245,7 +245,7 @@ def address(argument: Tensor | int | None) -> int:
     return argument.data_ptr() if isinstance(argument, Tensor) else argument
 
 
-def _checked_device(device: str | torch.device) -> torch.device:
+def checked_device(device: str | torch.device) -> torch.device:
     """Return an NVIDIA GPU that is there, with its number, or raise a ValueError."""
     found = torch.device(device)
     if found.type != "cuda":

@@ -1,4 +1,4 @@
-"""The environment's step without fused operations: the same bits on any machine, in Python and JavaScript.
+"""The environment's step without fused operations: the same bits on any machine, in three languages.
 
 The formulas of task and scene and the general series are recorded as for the compiled step and printed as a
 script (`lag_envs.stepping.script`). All scenes are stepped by the general series here, those with an exact
