@@ -94,7 +94,7 @@ class Module:
 @cache
 def _bindings() -> tuple[Any, Any]:
     try:
-        from cuda.bindings import driver, nvrtc  # type: ignore[import-not-found]  # no build for the CPU has it
+        from cuda.bindings import driver, nvrtc
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "cuda.bindings is missing, which PyTorch's builds for CUDA bring: pip install cuda-bindings",
