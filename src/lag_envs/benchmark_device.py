@@ -13,6 +13,7 @@ from itertools import product
 from statistics import median
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from lag_envs.device import DeviceEnvs
@@ -105,7 +106,7 @@ def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
     """Return a function that takes a step of random actions that were made beforehand."""
     space = envs.sample.single_action_space
     space.seed(0)
-    sample = torch.as_tensor([space.sample() for _ in range(1000)], device=envs.device)
+    sample = torch.as_tensor(np.array([space.sample() for _ in range(1000)]), device=envs.device)
     actions = sample[torch.randint(len(sample), (envs.num_envs,), device=envs.device)]
     if actions.is_floating_point():
         actions = actions.to(envs.dtype)
