@@ -137,22 +137,18 @@ class DeviceEnvs:
             raise ResetNeeded(
                 "the first reset must reset every environment, got a reset_mask that leaves some out"
             )
-        lanes = torch.nonzero(mask)[:, 0].tolist()
         targets = self.task.formulas.targets
-        states = self._given("state", state, self._states.stop, lanes, self.task.start_state)
-        goals = self._given("target", target, targets, lanes, self.task.check_target)
+        states = self._given("state", state, self._states.stop, mask, self.task.start_state)
+        goals = self._given("target", target, targets, mask, self.task.check_target)
         if not self._started:
             drawn = self.sample.np_random.integers(2**63, size=self.num_envs)
             self._ids[0] = torch.from_numpy(drawn).to(self.device)
         if seeds:
+            lanes = torch.tensor([i for i, _ in seeds], device=self.device)
             keys = np.array([key_of(s) for _, s in seeds], np.uint64).view(np.int64)
-            fresh = torch.zeros_like(mask)
-            fresh[[i for i, _ in seeds]] = True
-            own = torch.zeros_like(self._ids[0])
-            own[fresh] = torch.from_numpy(keys).to(self.device)
-            fresh &= mask
-            self._ids[0] = torch.where(fresh, own, self._ids[0])
-            self._ids[1] = torch.where(fresh, 0, self._ids[1])
+            chosen = mask[lanes]
+            self._ids[0, lanes[chosen]] = torch.from_numpy(keys).to(self.device)[chosen]
+            self._ids[1, lanes[chosen]] = 0
         observations = self._new(len(self.task.observation), dtype=torch.float32)
         self._launch(
             "begin", self.num_envs, self.rows, self._ids, self._ages, self._constants,
@@ -207,8 +203,8 @@ class DeviceEnvs:
             raise ValueError("options['reset_mask'] must select at least one environment")
         return found.to(self.device)
 
-    def _given(self, name: str, values: Any, width: int, lanes: list[int], check: Callable) -> Tensor | None:
-        """Return starts that were given, each checked, as the kernels take them."""
+    def _given(self, name: str, values: Any, width: int, mask: Tensor, check: Callable) -> Tensor | None:
+        """Return starts that were given, those of the mask checked, as the kernels take them."""
         if values is None:
             return None
         array = torch.as_tensor(values).detach().to("cpu", torch.float64).numpy()
@@ -216,7 +212,7 @@ class DeviceEnvs:
         if array.shape != shape:
             raise ValueError(f"options[{name!r}] must have shape {shape}, got {array.shape}")
         found = np.zeros((self.num_envs, width))
-        for i in lanes:
+        for i in torch.nonzero(mask)[:, 0].tolist():
             found[i] = named(i, check, array[i])
         return torch.from_numpy(found).to(self.device, self.dtype)
 

@@ -154,7 +154,7 @@ class TorchVectorEnv:
     device : str or torch.device
         Where tensors are: ``"cpu"``, or ``"cuda"`` for an NVIDIA GPU.
     dtype : torch.dtype
-        Type of states and rewards; on a GPU float32 is much faster, and as exact as its 24 bits.
+        Type of states and rewards: float64, or on a GPU float32.
     **options
         What ``gym.make_vec`` takes: `autoreset_mode`, parameters of the scene and of the task. They are the
         same for all environments.
@@ -169,7 +169,7 @@ class TorchVectorEnv:
     Raises
     ------
     ValueError
-        For a device that is not there, one with imperfect sensors or actuators, and parameters that differ
+        For a device that is not there, a task with imperfect sensors or actuators, and parameters that differ
         between environments; on the CPU also for a task whose actions are choices, and for float32.
     """
 
@@ -190,6 +190,8 @@ class TorchVectorEnv:
             self.envs = found = DeviceEnvs(task, num_envs, device, dtype, **options)
             self.num_envs, self.device = found.num_envs, found.device
             self._take_spaces(found.sample)
+            self.observation_space = batch_space(self.single_observation_space, num_envs)
+            self.action_space = batch_space(self.single_action_space, num_envs)
             return
         if dtype != torch.float64:
             raise ValueError(f"on the CPU dtype must be torch.float64, got {dtype}")
@@ -205,12 +207,11 @@ class TorchVectorEnv:
         _checked_task(made.task)
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
         self._take_spaces(made)
+        self.observation_space, self.action_space = made.observation_space, made.action_space
 
     def _take_spaces(self, made: LagrangianVectorEnv) -> None:
         self.single_observation_space = made.single_observation_space
         self.single_action_space = made.single_action_space
-        self.observation_space = batch_space(made.single_observation_space, self.num_envs)
-        self.action_space = batch_space(made.single_action_space, self.num_envs)
 
     @property
     def model(self) -> Model:
