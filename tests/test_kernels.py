@@ -278,7 +278,7 @@ def test_the_benchmark_measures_both_precisions(monkeypatch):
     assert all(r.steps > 0.0 and r.share > 0.0 for r in found)
     lines = benchmark_device.table(found).split("\n")
     assert len(lines) == 5 and lines[1].split()[:3] == [CHOICES.id, "float32", "7"]
-    # State, cosine, sine and control there and back, action, reward; two observations, age, three truth values.
+    # State, its cosine and sine, control there and back, action, reward; two observations, age, three flags.
     assert benchmark_device.traffic(on_processor(BAR, 1)) == 8 * (2 * 7 + 1 + 1) + 2 * 4 * 5 + 2 * 4 + 3
 
 
