@@ -289,7 +289,7 @@ def _on_any(task, num_envs, device, dtype, **options):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_without_a_gpu(capsys):
-    with pytest.raises(ValueError, match=r"there is no device 'cuda' here. .* or leave device out"):
+    with pytest.raises(ValueError, match=r"there is no device 'cuda' here: .* or leave device out"):
         TorchVectorEnv(BAR.id, 2, device="cuda")
     with pytest.raises(ValueError, match="device must be 'cpu' or 'cuda', got 'meta'"):
         TorchVectorEnv(BAR.id, 2, device="meta")

@@ -248,11 +248,11 @@ def checked_device(device: str | torch.device) -> torch.device:
         raise ValueError(f"device must be 'cpu' or 'cuda', got {str(device)!r}")
     if torch.version.cuda is None or not torch.cuda.is_available():
         why = (
-            "this PyTorch has been built without CUDA: install one that has it, see pytorch.org"
+            "this PyTorch has been built without CUDA. Install one that has it, see pytorch.org,"
             if torch.version.cuda is None
-            else "PyTorch sees no GPU: nvidia-smi tells whether there is one, and its driver"
+            else "PyTorch sees no GPU. Look with nvidia-smi whether there is one, and a driver for it,"
         )
-        raise ValueError(f"there is no device {str(device)!r} here. {why}; or leave device out")
+        raise ValueError(f"there is no device {str(device)!r} here: {why} or leave device out")
     number = torch.cuda.current_device() if found.index is None else found.index
     if number >= (count := torch.cuda.device_count()):
         raise ValueError(f"there is no device {str(device)!r} here: the last one is cuda:{count - 1}")
