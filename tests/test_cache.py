@@ -327,6 +327,20 @@ def test_where_it_lies(monkeypatch, tmp_path):
 NAMED = 1.0
 
 
+def test_other_machine_code_is_kept_too(place):
+    made = []
+
+    def code(parts, what=b"code"):
+        return cache.kept("kernels", parts, lambda: (made.append(parts), what)[1])
+
+    assert code("a") == code("a") == b"code" and made == ["a"]
+    assert code("b", b"other") == b"other" and made == ["a", "b"]
+    flipped(-1)(next(path for path in files(place) if b"other" in path.read_bytes()))
+    with pytest.warns(RuntimeWarning, match="is damaged: its digest does not match"):
+        assert code("b", b"other") == b"other"
+    assert made == ["a", "b", "b"] and len(files(place)) == 2
+
+
 def test_numbers_that_a_function_names_decide_too(monkeypatch):
     def found():
         function = cache.jit(add_named)

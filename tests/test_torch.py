@@ -163,8 +163,6 @@ def test_errors(step):
         step(states.to("meta"), actions)
     with pytest.raises(ValueError, match=r"states must be finite, got .* in row 1"):
         step(states * torch.tensor([[1.0], [float("nan")]]), actions)
-    with pytest.raises(ValueError, match="device must be 'cpu', got 'cuda'"):
-        TorchVectorEnv(IDS[0], 2, device="cuda")
     with pytest.raises(ValueError, match="list of actions to choose from"):
         TorchVectorEnv(CartPoleExact.id, 2)
     with pytest.raises(ValueError, match="imperfect sensors, imperfect actuators or hidden parameters"):

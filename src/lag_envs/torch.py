@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 try:
@@ -31,6 +32,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 import lag_envs  # noqa: F401  (registers the environments)
+from lag_envs.device import DeviceEnvs
 from lag_envs.envs.model import Model
 from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.tasks.base import Task
@@ -132,10 +134,16 @@ class Step:
 class TorchVectorEnv:
     """Many environments of one task as tensors, with a `step` that can be differentiated.
 
-    The numbers are those of the native vector environment, bit for bit; on the CPU tensors share its memory.
-    Where the actions, or the states that earlier actions led to, require a gradient, `step` is recorded:
-    gradients flow from observations and rewards to actions, and along `state` from step to step until
-    `detach` cuts them off. No gradient flows through an episode's end into the next one.
+    On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its
+    memory. Where the actions, or the states that earlier actions led to, require a gradient, `step` is
+    recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
+    until `detach` cuts them off. No gradient flows through an episode's end into the next one.
+
+    On an NVIDIA GPU one kernel takes the whole step, states stay there, and there are no gradients. In
+    float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
+    the GPU, so it neither raises `StepRefused` nor complains of actions that are not finite: where a step
+    cannot be taken, the environment keeps its state, its reward is 0, and the episode is truncated;
+    ``infos["refused"]`` tells where. `state` is memory there that the next step writes.
 
     Parameters
     ----------
@@ -143,31 +151,50 @@ class TorchVectorEnv:
         Id of an environment, or a task's class.
     num_envs : int
         Number of environments.
-    device : {"cpu"}
-        Where tensors are.
+    device : str or torch.device
+        Where tensors are: ``"cpu"``, or ``"cuda"`` for an NVIDIA GPU.
+    dtype : torch.dtype
+        Type of states and rewards: float64, or on a GPU float32.
     **options
         What ``gym.make_vec`` takes: `autoreset_mode`, parameters of the scene and of the task. They are the
         same for all environments.
 
     Attributes
     ----------
-    envs : LagrangianVectorEnv
+    envs : LagrangianVectorEnv or DeviceEnvs
         The environments.
-    state : Tensor of float64, shape (num_envs, n_state)
-        The states, with their history.
+    state : Tensor, shape (num_envs, n_state)
+        The states, on the CPU with their history.
 
     Raises
     ------
     ValueError
-        For another device, a task whose actions are choices, one with imperfect sensors or actuators, and
-        parameters that differ between environments.
+        For a device that is not there, a task with imperfect sensors or actuators, and parameters that differ
+        between environments; on the CPU also for a task whose actions are choices, and for float32.
     """
 
+    envs: LagrangianVectorEnv | DeviceEnvs
+
     def __init__(
-        self, task: str | type[Task], num_envs: int = 1, device: str = "cpu", **options: Any
+        self,
+        task: str | type[Task],
+        num_envs: int = 1,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float64,
+        **options: Any,
     ) -> None:
-        if str(device) != "cpu":
-            raise ValueError(f"device must be 'cpu', got {str(device)!r}; move the tensors that step returns")
+        self._model: Model | None = None
+        self.state = torch.empty(0)
+        self._infos: dict[str, Any] = {}
+        if torch.device(device).type != "cpu":
+            self.envs = found = DeviceEnvs(task, num_envs, device, dtype, **options)
+            self.num_envs, self.device = found.num_envs, found.device
+            self._take_spaces(found.sample)
+            self.observation_space = batch_space(self.single_observation_space, num_envs)
+            self.action_space = batch_space(self.single_action_space, num_envs)
+            return
+        if dtype != torch.float64:
+            raise ValueError(f"on the CPU dtype must be torch.float64, got {dtype}")
         made = (
             gym.make_vec(task, num_envs, **options).unwrapped
             if isinstance(task, str)
@@ -179,12 +206,12 @@ class TorchVectorEnv:
             raise ValueError("gradients need the same parameters in all environments; give one value for all")
         _checked_task(made.task)
         self.envs, self.num_envs, self.device = made, made.num_envs, torch.device("cpu")
+        self._take_spaces(made)
+        self.observation_space, self.action_space = made.observation_space, made.action_space
+
+    def _take_spaces(self, made: LagrangianVectorEnv) -> None:
         self.single_observation_space = made.single_observation_space
         self.single_action_space = made.single_action_space
-        self.observation_space, self.action_space = made.observation_space, made.action_space
-        self._model: Model | None = None
-        self.state = torch.empty(0)
-        self._infos: dict[str, Any] = {}
 
     @property
     def model(self) -> Model:
@@ -208,6 +235,10 @@ class TorchVectorEnv:
         infos : dict
             Empty, or the diagnostics.
         """
+        if isinstance(self.envs, DeviceEnvs):
+            seen = self.envs.reset(seed, options)
+            self.state = self.envs.state
+            return seen, {}
         given = dict(options or {})
         state = given.get("state")
         if isinstance(state, Tensor):
@@ -252,6 +283,13 @@ class TorchVectorEnv:
         ResetNeeded, StepRefused
             As `LagrangianVectorEnv.step` does.
         """
+        if isinstance(self.envs, DeviceEnvs):
+            if torch.is_grad_enabled() and isinstance(actions, Tensor) and actions.requires_grad:
+                raise ValueError(
+                    "a GPU's step has no gradients: give actions.detach(), or make the environments with "
+                    "device='cpu'"
+                )
+            return self.envs.step(actions)
         _check("actions", actions, (self.num_envs, self.envs.task.formulas.actions))
         if torch.is_grad_enabled() and (actions.requires_grad or self.state.requires_grad):
             observations, rewards, self.state, *ends = _EnvStep.apply(self, self.state, actions)
@@ -266,9 +304,11 @@ class TorchVectorEnv:
 
     def close(self) -> None:
         """Close the environments."""
-        self.envs.close()
+        if isinstance(self.envs, LagrangianVectorEnv):
+            self.envs.close()
 
     def _advance(self, actions: Tensor) -> list[Any]:
+        assert isinstance(self.envs, LagrangianVectorEnv)
         *results, self._infos = self.envs.step(actions.detach().numpy())
         return list(results)
 
@@ -348,7 +388,7 @@ class _EnvStep(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
-        envs = env.envs
+        envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.stepped = envs._read("n") >= 0.0
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))

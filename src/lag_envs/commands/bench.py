@@ -9,7 +9,7 @@ from datetime import date
 from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, known, seconds
+from lag_envs.commands.base import OWN, Command, count, known, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
@@ -56,6 +56,11 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         help="measure also how much quicker N threads step a batch, on N cores",
     )
     parser.add_argument(
+        "--device",
+        metavar="DEVICE",
+        help="measure on a GPU, cuda, in place of the processor (default sizes: 4096,1048576)",
+    )
+    parser.add_argument(
         "--rounds", metavar="N", type=count, help="samples of each row (default: 31, or 9 with --quick)"
     )
     parser.add_argument(
@@ -81,6 +86,8 @@ def run_bench(args: argparse.Namespace) -> int:
 
     ids, files = _measured(args.ids)
     ids = ids or (("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS))
+    if args.device:
+        return _on_device(args, ids)
     if args.output:
         _check_writable(Path(args.output))
     if args.checkout is not None:
@@ -119,6 +126,25 @@ def run_bench(args: argparse.Namespace) -> int:
         "checkout": args.checkout,
     }
     return in_own_process(Settings(**(quick | given | plain)))
+
+
+def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
+    """Measure on a GPU."""
+    others = ("cold", "checkout", "keywords", "output")
+    if args.threads > 1 or args.clock == "cpu" or any(getattr(args, name) for name in others):
+        raise UserError("--device takes no other options than --quick, --sizes, --rounds, --seconds")
+    needs("torch", "torch")
+    from lag_envs.benchmark_device import rates, table
+    from lag_envs.device import checked_device
+
+    try:
+        device = checked_device(args.device)
+    except (ValueError, RuntimeError) as error:  # torch's own, of a word that is no device
+        raise UserError(f"--device: {error}") from error
+    perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
+    found = rates(perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.2, args.rounds or 9)
+    print(table(found))
+    return 0
 
 
 def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -171,6 +197,7 @@ examples:
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --quick --with action_delay=0.013   what keywords cost
   lag-envs bench --quick --threads 2                 what a second thread brings
+  lag-envs bench --quick --device cuda               on a GPU, in both precisions
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
     declare_bench,

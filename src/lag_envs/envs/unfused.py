@@ -1,4 +1,4 @@
-"""The environment's step without fused operations: the same bits on any machine, in Python and JavaScript.
+"""The environment's step without fused operations: the same bits on any machine, in three languages.
 
 The formulas of task and scene and the general series are recorded as for the compiled step and printed as a
 script (`lag_envs.stepping.script`). All scenes are stepped by the general series here, those with an exact
@@ -42,7 +42,12 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
+from lag_envs.stepping.series import TOLERANCE
 from lag_envs.tasks.base import Task
+
+#: What a substep's truncation may be in single precision, relative to the velocities: half a unit in the last
+#: place.
+SINGLE_TOLERANCE = 2.0**-25
 
 
 class Rows(NamedTuple):
@@ -77,6 +82,8 @@ class UnfusedProgram:
     ----------
     task : Task
         The task; not with imperfections, which scripts do not have.
+    single : bool
+        Whether the numbers are of single precision, to which shorter series are certified.
 
     Attributes
     ----------
@@ -91,7 +98,7 @@ class UnfusedProgram:
         The picture's frames; empty where there is no picture.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: Task, single: bool = False) -> None:
         if task.imperfections:
             raise FormulaError(
                 f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which no "
@@ -123,7 +130,8 @@ class UnfusedProgram:
         #: Constants for formulas; what is zero leaves no code.
         self._k = {name: 0.0 if numbers[name] == 0.0 else place for name, place in self._place.items()}
         self._record = self._stepper.record(gone, fused=False)
-        self._order = vars(scene).get(ORDER) or usual_order(task.dt)
+        order = vars(scene).get(ORDER) or usual_order(task.dt)
+        self._order, self._tolerance = (order // 2, SINGLE_TOLERANCE) if single else (order, TOLERANCE)
         self.states = len(formulas.state)
         self._width = self._form.width if self._form else self.states
         self._turned = len([n for n in scene._layout.left_out if n in scene._layout.names])
@@ -165,14 +173,23 @@ class UnfusedProgram:
     @cached_property
     def script(self) -> Script:
         """The functions of the module's docstring."""
+        return self.written("derive", "start", "lift", "move", "kick", "observe", "poses")
+
+    def written(self, *names: str) -> Script:
+        """Return a script of these functions."""
+        known: dict[str, tuple[str, Callable]] = {
+            "derive": ("k", self._derive),
+            "start": ("f, d, k", self._start),
+            "lift": ("f, k", self._lift),
+            "move": ("f, a, k", self._move),
+            "kick": ("f, d, k", self._kick),
+            "observe": ("f, k", self._observe),
+            "poses": ("f, p, k", self._poses),
+        }
         t = Script()
-        t.function("derive", "k", lambda: self._derive(t))
-        t.function("start", "f, d, k", lambda: self._start(t))
-        t.function("lift", "f, k", lambda: self._write_state(t, self._read(t, self.rows.y)[: self.states]))
-        t.function("move", "f, a, k", lambda: self._move(t))
-        t.function("kick", "f, d, k", lambda: self._kick(t))
-        t.function("observe", "f, k", lambda: self._observe(t))
-        t.function("poses", "f, p, k", lambda: self._poses(t))
+        for name in names:
+            arguments, write = known[name]
+            t.function(name, arguments, partial(write, t))
         return t
 
     def _read(self, t: Script, rows: slice, array: str = "f") -> list[str]:
@@ -182,6 +199,9 @@ class UnfusedProgram:
         first = rows if isinstance(rows, int) else rows.start
         for i, value in enumerate(values):
             t.say("write", array, first + i, value)
+
+    def _lift(self, t: Script) -> None:
+        self._write_state(t, self._read(t, self.rows.y)[: self.states])
 
     def _write_state(self, t: Script, y: Sequence) -> None:
         """Write a state, and cosine and sine of its angle."""
@@ -296,9 +316,8 @@ class UnfusedProgram:
 
         given = dict(zip((*wanted, *moving), self._run(t, prepare, y, u), strict=True))
         inputs = {name: given.get(name) or self._k[f"motion_{name}"] for name in record.given}
-        q, v, refused = motion(
-            t, record, inputs, [given[x] for x in moving[:n]], [given[x] for x in moving[n:]], dt, self._order
-        )
+        places, velocities = [given[x] for x in moving[:n]], [given[x] for x in moving[n:]]
+        q, v, refused = motion(t, record, inputs, places, velocities, dt, self._order, self._tolerance)
         return self._run(t, finish, q, v, y, u), refused
 
     def _kick(self, t: Script) -> None:

@@ -200,7 +200,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         ValueError, TypeError
             For unknown options, and arrays of the wrong shape, type or content; nothing is reset then.
         """
-        seeds = self._check_seeds(seed)
+        seeds = seeds_of(seed, self.num_envs)
         state, target, mask = start_options(options, ("state", "target", "reset_mask"))
         mask = self._check_mask(mask)
         lanes = self._lanes[mask]
@@ -574,19 +574,6 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
             raise ValueError(f"{name} must select at least one environment, got {shown(mask)}")
         return mask
 
-    def _check_seeds(self, seed: Any) -> list[tuple[int, int]]:
-        """Return (environment, seed) for each that is to be seeded."""
-        if seed is None:
-            return []
-        if isinstance(seed, list | tuple | range) or (type(seed) is np.ndarray and seed.ndim == 1):
-            if len(seed) != self.num_envs:
-                raise ValueError(
-                    f"seed must be one number or {self.num_envs}, got {len(seed)}: {shown(seed)}"
-                )
-            return [(i, check_seed(f"seed[{i}]", s)) for i, s in enumerate(seed) if s is not None]
-        first = check_seed("seed", seed)
-        return [(i, first + i) for i in range(self.num_envs)]
-
     def _check_rows(self, name: str, values: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
         array = real_array(f"options[{name!r}]", values)
         if array.shape != shape:
@@ -622,6 +609,18 @@ def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> An
         return function(*arguments, **keywords)
     except ValueError as error:
         raise ValueError(f"environment {i}: {error}") from error
+
+
+def seeds_of(seed: Any, n: int) -> list[tuple[int, int]]:
+    """Return (environment, seed) for each of n that is to be seeded, or raise an error."""
+    if seed is None:
+        return []
+    if isinstance(seed, list | tuple | range) or (type(seed) is np.ndarray and seed.ndim == 1):
+        if len(seed) != n:
+            raise ValueError(f"seed must be one number or {n}, got {len(seed)}: {shown(seed)}")
+        return [(i, check_seed(f"seed[{i}]", s)) for i, s in enumerate(seed) if s is not None]
+    first = check_seed("seed", seed)
+    return [(i, first + i) for i in range(n)]
 
 
 def check_mode(mode: str | AutoresetMode) -> AutoresetMode:

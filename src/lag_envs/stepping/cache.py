@@ -169,14 +169,7 @@ class _Cache:
         if not self._enabled or place is None:
             return None
         path, key = self._entry(place, types, target.codegen())
-        try:
-            content = _read(path, key)
-            if content is not None:
-                return _rebuild(content, target)
-        except Damaged as error:
-            _remove(path)
-            _warn(path, error)
-        return None
+        return _load(path, key, lambda content: _rebuild(content, target))
 
     def save_overload(self, types: Any, result: Any) -> None:
         """Keep a compiled function; where that cannot be done nothing happens."""
@@ -185,9 +178,7 @@ class _Cache:
             return
         path, key = self._entry(place, types, result.codegen)
         with contextlib.suppress(OSError):
-            place.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _write(path, key, _reduce(result))
-            trim(place, LIMIT)
+            _save(path, key, _reduce(result))
 
     def _entry(self, place: Path, types: Any, codegen: Any) -> tuple[Path, bytes]:
         """Return the file for these types on this machine, and the digest of all that it depends on."""
@@ -197,8 +188,53 @@ class _Cache:
         settings = (config.OPT, config.BOUNDSCHECK, config.DEBUGINFO_DEFAULT)
         machine = (sys.version, __version__, llvmlite.__version__, settings, codegen.magic_tuple())
         parts = repr((self._name, self._key, str(types), machine))
-        key = hashlib.sha256(parts.encode()).digest()
-        return place / f"{self._name}-{key[:8].hex()}{_SUFFIX}", key
+        return _place(place, self._name, parts)
+
+
+def kept(name: str, parts: str, make: Callable[[], bytes]) -> bytes:
+    """Return what was made once, from the cache.
+
+    Parameters
+    ----------
+    name : str
+        What it is called there.
+    parts : str
+        All that it depends on.
+    make : callable
+        Makes it, where the cache does not have it.
+    """
+    folder_now = folder()
+    if folder_now is None:
+        return make()
+    path, key = _place(folder_now, name, parts)
+    if (found := _load(path, key, bytes)) is None:
+        found = make()
+        with contextlib.suppress(OSError):
+            _save(path, key, found)
+    return found
+
+
+def _place(place: Path, name: str, parts: str) -> tuple[Path, bytes]:
+    """Return the file of what depends on these parts, and their digest."""
+    key = hashlib.sha256(parts.encode()).digest()
+    return place / f"{name}-{key[:8].hex()}{_SUFFIX}", key
+
+
+def _load(path: Path, key: bytes, rebuild: Callable[[bytes], Any]) -> Any:
+    """Return what a file holds; None where it is not there, or is dropped."""
+    try:
+        content = _read(path, key)
+        return None if content is None else rebuild(content)
+    except Damaged as error:
+        _remove(path)
+        _warn(path, error)
+        return None
+
+
+def _save(path: Path, key: bytes, content: bytes) -> None:
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _write(path, key, content)
+    trim(path.parent, LIMIT)
 
 
 def _reduce(result: Any) -> bytes:

@@ -1,8 +1,8 @@
-"""Prints recorded formulas and the series' step as source text, in Python or in JavaScript.
+"""Prints recorded formulas and the series' step as source text, in Python, JavaScript or C++.
 
-What is printed is unfused: + - * / √, comparisons, and a few exact operations on bits. So the text of either
-language gives the same bits, on any machine. `OPERATIONS` has a line per operation and a column per language;
-loops, over the order of the series among them, are printed as loops.
+What is printed is unfused: + - * / √, comparisons, and a few exact operations on bits. So the text of any
+language gives the same bits, on any machine; C++ also on a GPU. `OPERATIONS` has a line per operation and a
+column per language; loops, over the order of the series among them, are printed as loops.
 """
 
 from __future__ import annotations
@@ -13,50 +13,62 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from lag_envs.stepping.driver import LARGEST_COUNT, SMALLEST_PART
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import SeriesRecord
 from lag_envs.stepping.series import LARGEST_ORDER, TOLERANCE, Lane, Series, elementary
 from lag_envs.stepping.tracing import IEEE, MAGIC, Number, Operation, Value
 
-#: Every operation of a recording, in Python and in JavaScript. Where Python raises an error, C does not.
-OPERATIONS: Mapping[str, tuple[str, str]] = {
-    "+": ("{} + {}", "{} + {}"),
-    "-": ("{} - {}", "{} - {}"),
-    "*": ("{} * {}", "{} * {}"),
-    "/": ("{0} / {1} if {1} else divide({0}, {1})", "{} / {}"),
-    "neg": ("-{}", "-{}"),
-    "<": ("{} < {}", "{} < {}"),
-    "<=": ("{} <= {}", "{} <= {}"),
-    "&": ("{} and {}", "{} && {}"),
-    "|": ("{} or {}", "{} || {}"),
-    "~": ("not {}", "!{}"),
-    "where": ("{1} if {0} else {2}", "{} ? {} : {}"),
-    "sqrt": ("sqrt({0}) if {0} >= 0.0 else nan", "Math.sqrt({})"),
-    "abs": ("abs({})", "Math.abs({})"),
-    "floor": ("floor({})", "Math.floor({})"),
-    "pow2": ("pow2({})", "pow2({})"),
-    "exponent": ("exponent({})", "exponent({})"),
-    "copysign": ("copysign({}, {})", "copysign({}, {})"),
-    "real": ("float({})", "{}"),
-    "read": ("{}[{}]", "{}[{}]"),
+#: Every operation of a recording, in Python, JavaScript and C++. Where Python raises an error, C does not.
+OPERATIONS: Mapping[str, tuple[str, str, str]] = {
+    "+": ("{} + {}", "{} + {}", "{} + {}"),
+    "-": ("{} - {}", "{} - {}", "{} - {}"),
+    "*": ("{} * {}", "{} * {}", "{} * {}"),
+    "/": ("{0} / {1} if {1} else divide({0}, {1})", "{} / {}", "{} / {}"),
+    "neg": ("-{}", "-{}", "-{}"),
+    "<": ("{} < {}", "{} < {}", "{} < {}"),
+    "<=": ("{} <= {}", "{} <= {}", "{} <= {}"),
+    "&": ("{} and {}", "{} && {}", "{} && {}"),
+    "|": ("{} or {}", "{} || {}", "{} || {}"),
+    "~": ("not {}", "!{}", "!{}"),
+    "where": ("{1} if {0} else {2}", "{} ? {} : {}", "{} ? {} : {}"),
+    "sqrt": ("sqrt({0}) if {0} >= 0.0 else nan", "Math.sqrt({})", "sqrt({})"),
+    "abs": ("abs({})", "Math.abs({})", "fabs({})"),
+    "floor": ("floor({})", "Math.floor({})", "Math.floor({})"),
+    "pow2": ("pow2({})", "pow2({})", "pow2({})"),
+    "exponent": ("exponent({})", "exponent({})", "exponent({})"),
+    "copysign": ("copysign({}, {})", "copysign({}, {})", "copysign({}, {})"),
+    "real": ("float({})", "{}", "real({})"),
+    "read": ("{}[{}]", "{}[{}]", "{}[{}]"),
 }
 
-#: Statements in both languages.
-STATEMENTS: Mapping[str, tuple[str, str]] = {
-    "let": ("{} = {}", "const {} = {};"),
-    "vary": ("{} = {}", "let {} = {};"),
-    "set": ("{} = {}", "{} = {};"),
-    "write": ("{}[{}] = {}", "{}[{}] = {};"),
-    "if": ("if {}:", "if ({}) {{"),
-    "for": ("for {0} in range({1}, {2}, {3}):", "for (let {0} = {1}; {0} < {2}; {0} += {3}) {{"),
-    "leave": ("if not {}: break", "if (!{}) break;"),
-    "function": ("def {}({}):", "function {}({}) {{"),
-    "return": ("return {}", "return {};"),
-    "call": ("{}({})", "{}({});"),
-    "nothing": ("pass", ""),
-    "end": ("", "}}"),
+#: Statements in all languages.
+STATEMENTS: Mapping[str, tuple[str, str, str]] = {
+    "let": ("{} = {}", "const {} = {};", "const auto {} = {};"),
+    "array": ("{} = [0.0] * {}", "const {} = new Float64Array({});", "real {}[{}];"),
+    "vary": ("{} = {}", "let {} = {};", "auto {} = {};"),
+    "set": ("{} = {}", "{} = {};", "{} = {};"),
+    "write": ("{}[{}] = {}", "{}[{}] = {};", "{}[{}] = {};"),
+    "if": ("if {}:", "if ({}) {{", "if ({}) {{"),
+    "for": (
+        "for {0} in range({1}, {2}, {3}):",
+        "for (let {0} = {1}; {0} < {2}; {0} += {3}) {{",
+        "for (int {0} = {1}; {0} < {2}; {0} += {3}) {{",
+    ),
+    "leave": ("if not {}: break", "if (!{}) break;", "if (!{}) break;"),
+    "function": ("def {}({}):", "function {}({}) {{", "INLINE auto {}({}) {{"),
+    "return": ("return {}", "return {};", "return {};"),
+    "call": ("{}({})", "{}({});", "{}({});"),
+    "nothing": ("pass", "", ""),
+    "end": ("", "}}", "}}"),
 }
+
+
+#: Statements of a function, beyond which it is cut: a browser runs functions of more than some 60 kB of its
+#: own code much slower.
+LARGEST = 1500
 
 
 class Language(NamedTuple):
@@ -68,25 +80,37 @@ class Language(NamedTuple):
         Its column in `OPERATIONS` and `STATEMENTS`.
     words : mapping
         Its words for truth values and for numbers that are none.
-    memory : str
-        What makes an array of so many numbers.
     head : str
         What the operations on bits are made of.
+    rounded : callable
+        A float as the language's numbers hold it.
+    suffix : str
+        What is written behind it.
+    arguments : mapping
+        A function's arguments as it declares them, where that is not by name alone.
+    largest : int, optional
+        Statements of a function, beyond which it is cut.
+    own_functions : bool
+        Whether sines are printed too. If not, those of its library are called, which have other bits.
+    own_memory : bool
+        Whether each function has arrays of its own, and not all of them the same.
     """
 
     column: int
     words: Mapping[str, str]
-    memory: str
     head: str
+    rounded: Callable[[float], float] = float
+    suffix: str = ""
+    arguments: Mapping[str, str] = {}
+    largest: int | None = LARGEST
+    own_functions: bool = True
+    own_memory: bool = False
 
 
-PYTHON = Language(
-    0, {"True": "True", "False": "False", "inf": "inf", "-inf": "(-inf)", "nan": "nan"}, "[0.0] * {}", ""
-)
+PYTHON = Language(0, {"True": "True", "False": "False", "inf": "inf", "-inf": "(-inf)", "nan": "nan"}, "")
 JAVASCRIPT = Language(
     1,
     {"True": "true", "False": "false", "inf": "Infinity", "-inf": "(-Infinity)", "nan": "NaN"},
-    "new Float64Array({})",
     f"""const real = new Float64Array(1);
 const bits = new Uint32Array(real.buffer);
 function pow2(n) {{
@@ -104,6 +128,48 @@ function copysign(x, sign) {{
   return bits[1] >>> 31 ? -Math.abs(x) : Math.abs(x);
 }}
 """,
+)
+#: C++ for compilers for processors and for GPUs; INLINE, INF and UNDEFINED come with what is around it.
+CPP = Language(
+    2,
+    {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "UNDEFINED"},
+    f"""typedef double real;
+union Bits {{
+  double number;
+  unsigned long long bits;
+}};
+INLINE real pow2(real n) {{
+  Bits x;
+  x.number = n + {MAGIC + 1023.0!r};
+  x.bits <<= 52;
+  return x.number;
+}}
+INLINE real exponent(real number) {{
+  Bits x;
+  x.number = number;
+  return real(int(x.bits >> 52 & 0x7ff) - 1023);
+}}
+""",
+    arguments={
+        "x": "real x",
+        "f, d, k": "real *f, const real *d, const real *k",
+        "f, a, k": "real *f, const real *a, const real *k",
+        "f, k": "real *f, const real *k",
+    },
+    largest=None,
+    own_memory=True,
+)
+#: The same in single precision, with the functions of C's library.
+CPP_SINGLE = CPP._replace(
+    head="""typedef float real;
+INLINE real pow2(real n) { return exp2(n); }
+INLINE real exponent(real x) { return ilogb(x); }
+INLINE real rough_exp2(real x) { return exp2(x); }
+INLINE real rough_log2(real x) { return log2(x); }
+""",
+    rounded=lambda x: float(np.float32(x)),
+    suffix="f",
+    own_functions=False,
 )
 
 
@@ -183,15 +249,25 @@ class Script:
         self._block: list[Statement] = []
         self._functions: list[Statement] = []
         self._elementary: dict[str, Statement] = {}
-        self._count = self._memory = self._spilled = 0
+        self._count = self._memory = 0
 
     # --- text ----------------------------------------------------------------------------------------------
 
     def text(self, language: Language) -> str:
         """Return all that was written, in a language."""
-        arrays = [("m", self._memory), ("s", self._spilled)]
-        made = [Statement("let", (name, language.memory.format(n))) for name, n in arrays if n]
-        lines = _lines([*made, *self._elementary.values(), *self._functions], language)
+        functions, spilled = self._functions, 0
+        if language.largest:
+            functions = []
+            for function in self._functions:
+                parts, numbers = _cut(function, language.largest)
+                functions += parts
+                spilled = max(spilled, numbers)
+        arrays = [Statement("array", (name, n)) for name, n in (("m", self._memory), ("s", spilled)) if n]
+        if language.own_memory:
+            functions = [_with_memory(function, arrays) for function in functions]
+            arrays = []
+        own = self._elementary.values() if language.own_functions else ()
+        lines = _lines([*arrays, *own, *functions], language)
         return language.head + "".join(line + "\n" for line in lines)
 
     def say(self, kind: str, *parts: Any, body: Sequence[Statement] = ()) -> None:
@@ -216,14 +292,8 @@ class Script:
         return tuple(written) or (Statement("nothing", ()),)
 
     def function(self, name: str, arguments: str, body: Callable[[], Any]) -> None:
-        """Write a function whose body returns what it returns, or None.
-
-        Long ones are cut: a browser runs functions of more than some 60 kB of its own code much slower.
-        """
-        made = _without_unused(self._function(name, arguments, body))
-        parts, spilled = _cut(made)
-        self._spilled = max(self._spilled, spilled)
-        self._functions += parts
+        """Write a function whose body returns what it returns, or None."""
+        self._functions.append(_without_unused(self._function(name, arguments, body)))
 
     def _function(self, name: str, arguments: str, body: Callable[[], Any]) -> Statement:
         def inside() -> None:
@@ -386,8 +456,6 @@ class Script:
 
 #: Numbers that are set aside for one series.
 STRIDE = LARGEST_ORDER + 3
-#: Statements of a function, beyond which it is cut.
-LARGEST = 1500
 _NAME = re.compile(r"\b[xyk][0-9]+\b")
 
 
@@ -404,10 +472,16 @@ def _lines(block: Iterable[Statement], language: Language, depth: int = 0) -> It
             return form.format(*map(text, value.args))
         if isinstance(value, str):
             return value
-        found = language.words.get(str(value)) or repr(value)
+        if isinstance(value, float):
+            value = language.rounded(value)
+            found = language.words.get(str(value)) or f"{value!r}{language.suffix}"
+        else:
+            found = language.words.get(str(value)) or repr(value)
         return f"({found})" if found.startswith("-") else found
 
     for kind, parts, body in block:
+        if kind == "function":
+            parts = parts[0], language.arguments.get(parts[1], parts[1])
         line = STATEMENTS[kind][column].format(*map(text, parts))
         if line:
             yield " " * depth + line
@@ -465,7 +539,15 @@ def _without_unused(function: Statement) -> Statement:
     return function._replace(body=kept(function.body))
 
 
-def _cut(function: Statement) -> tuple[list[Statement], int]:
+def _with_memory(function: Statement, arrays: Iterable[Statement]) -> Statement:
+    """Return a function that makes those arrays itself which it uses."""
+    every = list(_all(function.body))
+    used = {part.args[0] for s in every for part in s.parts if isinstance(part, Term) and part.op == "read"}
+    used |= {s.parts[0] for s in every if s.kind == "write"}
+    return function._replace(body=(*(array for array in arrays if array.parts[0] in used), *function.body))
+
+
+def _cut(function: Statement, largest: int) -> tuple[list[Statement], int]:
     """Return a function as several where it is long, and how many numbers go from one to another."""
     name, arguments = function.parts
     found: list[Statement] = []
@@ -474,7 +556,7 @@ def _cut(function: Statement) -> tuple[list[Statement], int]:
         return sum(1 for _ in _all(block))
 
     def shortened(block: Sequence[Statement]) -> tuple[Statement, ...]:
-        if size(block) <= LARGEST:
+        if size(block) <= largest:
             return tuple(block)
         result: list[Statement] = []
         group: list[Statement] = []
@@ -495,7 +577,7 @@ def _cut(function: Statement) -> tuple[list[Statement], int]:
                 result.append(statement)
                 continue
             more = size([statement])
-            if long + more > LARGEST:
+            if long + more > largest:
                 close()
                 long = 0
             long += more
@@ -544,7 +626,14 @@ def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Sta
 
 
 def motion(
-    t: Script, record: SeriesRecord, inputs: dict[str, Any], q: list, v: list, dt: Any, order: int
+    t: Script,
+    record: SeriesRecord,
+    inputs: dict[str, Any],
+    q: list,
+    v: list,
+    dt: Any,
+    order: int,
+    tolerance: float = TOLERANCE,
 ) -> tuple[list, list, str]:
     """Write a control step of the series; return places, velocities, and whether it was refused.
 
@@ -562,13 +651,15 @@ def motion(
         The control step [s].
     order : int
         Order of the series.
+    tolerance : float
+        What a substep's velocities may leave out, in their sizes.
     """
     n, step = record.size, Series(record)
     smallest = t.mul(SMALLEST_PART, dt)
 
     def attempt(count: Any, carried: Sequence) -> tuple[Any, list]:
         lane = Lane(carried[:n], carried[n : 2 * n], 0.0, *carried[2 * n :])
-        after, _ = step.substep(t, inputs, lane, dt, order, TOLERANCE)
+        after, _ = step.substep(t, inputs, lane, dt, order, tolerance)
         going = t.both(t.less(0.0, after.left), t.less(smallest, after.wish))
         return going, [*after.q, *after.v, after.left, after.wish]
 

@@ -1,0 +1,111 @@
+"""Compiles and starts kernels on an NVIDIA GPU, by the bindings that come with PyTorch's builds for CUDA."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+#: Threads of a block: each of them has a whole environment in its registers, so few blocks fit at once.
+BLOCK = 128
+
+
+def version() -> tuple[int, int]:
+    """Return the compiler's version."""
+    status, *found = _bindings()[1].nvrtcVersion()
+    _checked((status,))
+    return found[0], found[1]
+
+
+def compiled(source: str, architecture: str, options: tuple[str, ...] = ()) -> bytes:
+    """Return a GPU's machine code of a C++ text.
+
+    Parameters
+    ----------
+    source : str
+        The text.
+    architecture : str
+        For which GPUs, such as ``"sm_90"``.
+    options : tuple of str
+        Further options of NVRTC.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        Without `cuda.bindings`.
+    RuntimeError
+        With the compiler's messages, where the text cannot be compiled.
+    """
+    _, nvrtc = _bindings()
+    program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b"environment.cu", 0, [], []))
+    given = [option.encode() for option in ("--std=c++17", f"--gpu-architecture={architecture}", *options)]
+    status, *_ = nvrtc.nvrtcCompileProgram(program, len(given), given)
+    if status.value:
+        log = b" " * _checked(nvrtc.nvrtcGetProgramLogSize(program))
+        _checked(nvrtc.nvrtcGetProgramLog(program, log))
+        raise RuntimeError(f"NVRTC cannot compile the step: {log.decode().strip(chr(0)).strip()}")
+    code = b" " * _checked(nvrtc.nvrtcGetCUBINSize(program))
+    _checked(nvrtc.nvrtcGetCUBIN(program, code))
+    _checked(nvrtc.nvrtcDestroyProgram(program))
+    return code
+
+
+class Module:
+    """Machine code on the GPU whose context is current.
+
+    Parameters
+    ----------
+    code : bytes
+        What `compiled` returned.
+    """
+
+    def __init__(self, code: bytes) -> None:
+        self._driver, _ = _bindings()
+        self._context = _checked(self._driver.cuCtxGetCurrent())
+        self._module = _checked(self._driver.cuModuleLoadData(code))
+        self._kernels: dict[str, Any] = {}
+
+    def launch(self, name: str, count: int, stream: int, arguments: Sequence[int]) -> None:
+        """Start a kernel, with one thread for each of `count` environments.
+
+        Parameters
+        ----------
+        name : str
+            The kernel.
+        count : int
+            Number of threads.
+        stream : int
+            Address of the stream; what was given to it earlier comes first.
+        arguments : sequence of int
+            Addresses and whole numbers of 64 bits.
+        """
+        if name not in self._kernels:
+            self._kernels[name] = _checked(self._driver.cuModuleGetFunction(self._module, name.encode()))
+        given = tuple(arguments), (ctypes.c_longlong,) * len(arguments)
+        grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
+        _checked(self._driver.cuCtxPushCurrent(self._context))  # another thread may have none
+        try:
+            _checked(self._driver.cuLaunchKernel(self._kernels[name], *grid, *block, 0, stream, given, 0))
+        finally:
+            _checked(self._driver.cuCtxPopCurrent())
+
+
+@cache
+def _bindings() -> tuple[Any, Any]:
+    try:
+        from cuda.bindings import driver, nvrtc
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "cuda.bindings is missing, which PyTorch's builds for CUDA bring: pip install cuda-bindings",
+            name=error.name,
+        ) from error
+    return driver, nvrtc
+
+
+def _checked(result: tuple) -> Any:
+    """Return what a function of the bindings found, or raise a RuntimeError with its status."""
+    status, *found = result
+    if status.value:
+        raise RuntimeError(f"CUDA reports {status.name}")
+    return found[0] if found else None
