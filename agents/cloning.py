@@ -103,7 +103,8 @@ class Learner:
             seen.append(self.observation)
             would, self.holds = self.expert.predict(self.observation, self.holds, self.begun)
             wanted.append(would)
-            action = self.policy.outputs(self.observation)[1] if self.trained else would  # clipped there
+            # What is beyond the action space the environments clip.
+            action = self.policy.outputs(self.observation)[1] if self.trained else would
             self.observation, _, terminated, truncated, _ = self.envs.step(action)
             self.begun = terminated | truncated
         self.seen, self.wanted = np.concatenate(seen), np.concatenate(wanted)
