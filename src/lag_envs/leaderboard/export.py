@@ -103,8 +103,11 @@ def _json(file: Path) -> Mapping[str, Any]:
     return content
 
 
-def _algorithm(file: Path) -> str:
-    """Return the algorithm of a model's file."""
+def _algorithm(source: Source) -> str:
+    """Return the algorithm of a model, as its training noted or its policy tells."""
+    if (noted := (source.result or {}).get("algo")) in ALGORITHMS:
+        return noted
+    file = source.model
     try:
         with zipfile.ZipFile(file) as archive:
             data = json.loads(archive.read("data"))
@@ -120,9 +123,9 @@ def _algorithm(file: Path) -> str:
     return "a2c" if "a2c" in names and "n_epochs" not in data else names[0]
 
 
-def _name(file: Path, algo: str | None) -> str:
+def _name(source: Source, algo: str | None) -> str:
     """Return what a model's learner is called."""
-    return "PPO" if arrays_of(file) else ALGORITHMS[algo or _algorithm(file)][1]
+    return "PPO" if arrays_of(source.model) else ALGORITHMS[algo or _algorithm(source)][1]
 
 
 def _load(source: Source, algo: str) -> tuple[Any, Any]:
@@ -343,7 +346,7 @@ def export(
         For models that cannot be exported, or that do not act as their export does.
     """
     known = [s.result for s in sources if s.result]
-    name = name or _name(sources[0].model, algo)
+    name = name or _name(sources[0], algo)
     env = env or _same("environment", [r.get("env") for r in known], "--env")
     if env not in protocol.boards():
         raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
@@ -357,7 +360,7 @@ def export(
         if (ready := arrays_of(source.model)) is not None:
             table, content = ready
         else:
-            kind = algo or _algorithm(source.model)
+            kind = algo or _algorithm(source)
             model, normalise = _load(source, kind)
             table, content = convert(model, normalise, bool(TASKS[env]().formulas.choices))
         try:
@@ -467,7 +470,7 @@ def run_export(args: argparse.Namespace) -> int:
         torch.set_num_threads(1)  # such networks are too small to share out
         sources = find(args.models, args.normalise)
         known = args.env or _same("environment", [(s.result or {}).get("env") for s in sources], "--env")
-        name = args.name or _name(sources[0].model, args.algo)
+        name = args.name or _name(sources[0], args.algo)
         submission, off, count = export(
             sources, args.output or Path(f"{known}-{name}".replace(" ", "-").replace("/", "-")),
             env=args.env, name=name, authors=args.author, license=args.license, algo=args.algo,
