@@ -209,9 +209,9 @@ class Tilt(_Shell):
         "turning at one rate; the cylinder swings about that place with little damping."
     )
     note = """
-Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 is
-better than PPO on most seeds, with far fewer steps. Both reach the target nearly as soon as the controllers.
-Most of their loss comes afterwards: they stop beside the target, where the controllers end on it.
+Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 and
+SAC are better than PPO, with far fewer steps. They reach the target nearly as soon as the controllers. Most of
+their loss comes afterwards: they stop beside the target, where the controllers end on it.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
@@ -518,7 +518,6 @@ class Damping(Task):
 Best is the greedy policy of value iteration. The switching line is as good within the uncertainty of these
 episodes: let go, and brake fully where that leads straight to rest. PPO is near rest for as much of the time
 as the line, but close to it for less, because its network does not resolve the corner of the switching line.
-TD3, with its one seed, ended with the action that never brakes.
 """
 
     def check(self) -> None:

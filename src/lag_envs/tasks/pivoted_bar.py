@@ -169,8 +169,8 @@ class SwingUp(GuardedTrack, _Bar):
 Best is iLQR. It plans on the exact model, from both ends, and hands over to the LQR for the hold. Energy
 shaping pumps until the energy is that of upright, then waits for the bar to get there. PPO's seeds are nearly
 as good, except one that misses the catch from some starts and keeps swinging. The estimate by value iteration
-is for the bar without a track, so nobody knows whether the difference can be gained. The other learners catch
-the bar only now and then.
+is for the bar without a track, so nobody knows whether the difference can be gained. TD3 and SAC get as far
+on most seeds, with a fifth of PPO's steps.
 """
 
     @property
