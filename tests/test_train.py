@@ -1,6 +1,7 @@
 """The training script: learners, checkpoints, seeds side by side, Ray, and what users get wrong."""
 
 import errno
+import io
 import json
 import os
 import pickle
@@ -22,7 +23,7 @@ from agents.learners import ALGORITHMS, hyperparameters, load_policy
 from agents.run import Run, UserError
 from lag_envs import cli
 from lag_envs.evaluation.rollout import play
-from lag_envs.hyperparams import as_yaml
+from lag_envs.hyperparams import OFF_POLICY, as_yaml
 from lag_envs.leaderboard.networks import bin_centres
 from lag_envs.tasks import TASKS, incline
 
@@ -123,7 +124,8 @@ def test_off_policy_learners_keep_what_did_best_in_a_test(algo, kept, tmp_path, 
     cut = make_run(tmp_path, algo)
     assert not go(cut, 300) and len(cut.curve) >= 2
     going = make_run(tmp_path, algo)  # the second test was the best, and is from before the interruption
-    weights = learners.thaw(going, going.load_checkpoint()).policy.state_dict()
+    file = io.BytesIO(going.load_checkpoint()["best"]["model"])
+    weights = learners.learner(algo).load(file, device="cpu").policy.state_dict()
     assert go(going)
     result = json.loads(going.path(run.RESULT).read_text())
     assert result["policy_of_step"] == result["curve"][kept][0]
@@ -150,7 +152,9 @@ def test_hyperparameters_are_there_for_every_environment(algo):
     for env_id in TASKS:
         entry = hyperparameters(algo, env_id)
         assert entries[env_id] == entry  # in the Zoo's form they are the same
-        assert entry["n_timesteps"] >= 1e4 and entry["policy"] == "MlpPolicy"
+        assert entry["n_timesteps"] >= 1e4
+        policy = f"lag_envs.sb3_policies.{algo.upper()}" if algo in OFF_POLICY else "MlpPolicy"
+        assert entry["policy"] == policy
 
 
 def test_bins_are_gymnasiums():

@@ -210,8 +210,8 @@ class Tilt(_Shell):
     )
     note = """
 Best is iLQR; LQR, PD and the greedy policy of value iteration are close behind. Among the learners TD3 and
-SAC are better than PPO, with far fewer steps. They reach the target nearly as soon as the controllers. Most of
-their loss comes afterwards: they stop beside the target, where the controllers end on it.
+SAC are better than PPO, with far fewer steps. They reach the target nearly as soon as the controllers. Most
+of their loss comes afterwards: they stop beside the target, where the controllers end on it.
 """
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
