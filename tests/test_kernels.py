@@ -255,6 +255,7 @@ def test_text_does_not_depend_on_numbers():
     assert a == b != c
 
 
+@pytest.mark.gpu
 def test_nvrtc_compiles_it():
     pytest.importorskip("cuda.bindings.nvrtc")
     try:
@@ -304,6 +305,7 @@ def test_without_a_gpu(capsys):
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 @pytest.mark.parametrize("id", covering(PERFECT, engine))
 @pytest.mark.parametrize("mode", MODES[:2])
