@@ -636,9 +636,9 @@ def test_a_log_that_is_replaced_while_one_waits(board):
     [
         ("every_step",),
         ("random_moments", "6"),
-        pytest.param(("random_moments", "80"), marks=pytest.mark.slow),
+        pytest.param(("random_moments", "200"), marks=pytest.mark.slow),
         ("at_once", "3", "5"),
-        pytest.param(("at_once", "6", "20"), marks=pytest.mark.slow),
+        pytest.param(("at_once", "8", "40"), marks=pytest.mark.slow),
         ("finished_at_once", "3", "4"),
     ],
     ids=" ".join,

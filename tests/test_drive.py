@@ -125,7 +125,7 @@ def test_so_it_has_on_users_tasks(browsing, bare, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("id", quick(PERFECT))
-def test_all_bits_in_forty_episodes(browsing, alone, id):
+def test_all_bits_in_a_hundred_episodes(browsing, alone, id):
     task = TASKS[id]()
     page = browsing.open(f"{alone.as_uri()}/{id}.html", alone.as_uri())
     check_bits(
@@ -133,7 +133,7 @@ def test_all_bits_in_forty_episodes(browsing, alone, id):
         alone,
         task,
         id,
-        [(2**40 + i, at_random(task, i) if i % 2 else by_agent(task)) for i in range(40)],
+        [(2**40 + i, at_random(task, i) if i % 2 else by_agent(task)) for i in range(100)],
     )
 
 

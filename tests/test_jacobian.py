@@ -112,7 +112,7 @@ def oracle(case):
         ("task", 3),
         ("damped", 3),
         ("stiff", 4),
-        *(pytest.param(kind, 20, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
+        *(pytest.param(kind, 40, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
     ],
 )
 def test_exact_flows(kind, n):
