@@ -277,14 +277,14 @@ def test_certified_speed(env_id, page):
 
 @pytest.mark.parametrize("env_id", covering(i for i in PERFECT if TASKS[i]().scene._form))
 def test_measured_error(env_id):
-    """A step errs by less than 2e-15 of the state's size: README says so, as the report claims.
+    """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
     Where several bars whip, a step is divided, and it makes much of a rounding: it errs by that many times as
     much. Here are some steps of an episode of random actions; the report's tests take all of them.
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
-    assert f"No step of an environment with an exact flow errs by more than {limit} of" in plain(readme())
+    assert f"With an exact flow no step errs by more than {limit} of" in plain(readme())
     assert f"errs by less than {limit} of the largest that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
