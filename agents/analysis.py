@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.evaluation.conditions import NOMINAL
-from lag_envs.evaluation.statistics import estimate, improvement, interval, iqm, pooled_iqm
+from lag_envs.evaluation.statistics import estimate, improvement, interval, iqm, median_time, pooled_iqm
 from lag_envs.scores import Scale, normalised
 
 Array = NDArray[np.float64]
@@ -18,6 +18,8 @@ Data = dict[str, Any]
 
 #: Points of a learning curve.
 POINTS = 33
+#: Scores that are waited for.
+LEVELS = (0.9, 0.97, 0.99)
 
 
 # --- statistics ---------------------------------------------------------------------------------------------
@@ -51,6 +53,30 @@ def learning_curve(curves: Sequence[Sequence[Sequence[float]]], column: int) -> 
     if len(lines) > 1:
         ends = np.array([interval(iqm, line) for line in lines.T])
         found["low"], found["high"] = ends.T.tolist()
+    return found
+
+
+def reached(curve: Iterable[Sequence[float]], level: float, clock: int = 1) -> float | None:
+    """Return when a curve first reached a level; None for never.
+
+    Points end with the score; `clock` is the place of what is told: 0 steps, 1 seconds.
+    """
+    return next((point[clock] for point in curve if point[-1] >= level), None)
+
+
+def times(curves: Sequence[Sequence[Sequence[float]]]) -> Data:
+    """Return for each level how many seeds reached it, and the medians of steps and seconds.
+
+    Examples
+    --------
+    >>> times([[(10, 1.0, 0.5), (20, 2.0, 0.95)]])["0.9"], times([[(10, 1.0, 0.5)]])["0.9"]
+    ({'seeds': 1, 'steps': 20.0, 'seconds': 2.0}, {'seeds': 0, 'steps': None, 'seconds': None})
+    """
+    found = {}
+    for level in LEVELS:
+        steps, seconds = ([reached(curve, level, clock) for curve in curves] for clock in (0, 1))
+        seeds = sum(value is not None for value in steps)
+        found[str(level)] = {"seeds": seeds, "steps": median_time(steps), "seconds": median_time(seconds)}
     return found
 
 
@@ -92,6 +118,8 @@ def summarise_env(agents: Iterable[Data], scale: Scale | None) -> Data:
                 "seconds": float(np.mean(agent["seconds"])),
                 "curves": {"steps": learning_curve(curves, 0), "seconds": learning_curve(curves, 1)},
             }
+            if scale is not None:
+                entry["reached"] = times(curves)
         found[agent["name"]] = entry
     known = None if scale is None else [scale.random, scale.best]
     return {"known": known, "agents": ranked(found), "improvement": compare(found)}

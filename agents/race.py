@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from agents import learners
+from agents.analysis import LEVELS, reached
 from agents.learners import LEARNERS, hyperparameters, label
 from agents.run import Run, UserError, check_env, check_name, reports_errors, terminable
 from lag_envs import store, workers
@@ -25,8 +26,6 @@ from lag_envs.scores import known_returns, score
 from lag_envs.tables import columns
 
 ENV = "PivotedBar-v0"
-#: Scores that are waited for.
-LEVELS = (0.9, 0.97, 0.99)
 #: Tests of a training, and episodes of each.
 TESTS, EPISODES = 24, 100
 EPILOG = f"""Each training runs in a process of its own on one core, one after the other: with one seed every
@@ -137,15 +136,10 @@ def train(settings: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def reached(row: dict[str, Any], level: float, clock: int = 1) -> float | None:
-    """Return when a training reached a level; None for never. The clock is a place in the curve's points."""
-    return next((point[clock] for point in row["curve"] if point[3] >= level), None)
-
-
 def told(row: dict[str, Any]) -> str:
     """Return in a line how a training went."""
     when = ", ".join(
-        f"{level:g} never" if (time := reached(row, level)) is None else f"{level:g} in {time:.1f} s"
+        f"{level:g} never" if (time := reached(row["curve"], level)) is None else f"{level:g} in {time:.1f} s"
         for level in LEVELS
     )
     return f"{when}; {row['score']:.3f} after {row['seconds']:.1f} s, process {row['process_seconds']:.1f} s"
@@ -160,7 +154,7 @@ def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
         slowest = _median([row for row in rows if row["algo"] == names[-1]], level, 2)
         for name in names:
             own = [row for row in rows if row["algo"] == name]
-            count = sum(reached(row, level) is not None for row in own)
+            count = sum(reached(row["curve"], level) is not None for row in own)
             steps, seconds, processor = (_median(own, level, clock) for clock in range(3))
             part = "" if processor is None or not slowest else f"{processor / slowest:.2f}"
             cells.append(
@@ -179,7 +173,7 @@ def table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def _median(rows: Sequence[dict[str, Any]], level: float, clock: int) -> float | None:
-    return median_time([reached(row, level, clock) for row in rows])
+    return median_time([reached(row["curve"], level, clock) for row in rows])
 
 
 def _text(value: float | None, form: str) -> str:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from agents.analysis import Data
+from agents.analysis import LEVELS, Data
 from lag_envs.benchmark import quartiles, short
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
@@ -45,7 +45,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     for env_id, env in envs.items():
         parts += [f"## {env_id}", *([notes[env_id].strip()] if notes.get(env_id) else [])]
         parts += [_range(env_id, env), *_optimum(env_id)]
-        parts += [_env_table(env, data["episodes"]), *_behaviour(env_id)]
+        parts += [_env_table(env, data["episodes"]), *_times(env), *_behaviour(env_id)]
         parts += [_problems(env)] if env.get("problems") else []
         parts.append(
             _image(f"agents-robustness-{env_id}.png", f"{env_id}: every agent under every condition")
@@ -149,6 +149,25 @@ def _env_table(env: Data, episodes: int) -> str:
             ]
         )
     return markdown_table(head, rows)
+
+
+def _times(env: Data) -> list[str]:
+    """Tell when learners first reached the levels in a test."""
+    rows = []
+    for name, agent in env["agents"].items():
+        if "reached" not in agent:
+            continue
+        row = [labelled(name, agent)]
+        for found in (agent["reached"][str(level)] for level in LEVELS):
+            count = f"{found['seeds']} of {len(agent['seeds'])}"
+            median = found["steps"] is not None
+            when = f": {found['steps']:,.0f} steps, {found['seconds']:.3g} s" if median else ""
+            row.append(count + when)
+        rows.append(row)
+    if not rows:
+        return []
+    text = "Seeds whose tests reached a score, and the median of all seeds' first such tests:"
+    return [text, markdown_table(["learner", *(f"{level:g}" for level in LEVELS)], rows)]
 
 
 def labelled(name: str, agent: Data) -> str:
@@ -282,6 +301,10 @@ def _method(data: Data) -> str:
             " functions tests compare ours. The probability of improvement compares runs: an agent that was"
             " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"
             " between tests.",
+            "- *First tests*: a run has 16, so a score may have been reached up to a sixteenth of the run"
+            " earlier, and 20 episodes may be lucky ones. Seconds are those of training alone, while as many"
+            " runs as the machine has cores went on side by side. `python -m agents.race` tests more often, one"
+            " run at a time.",
         ]
     )
 

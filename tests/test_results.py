@@ -10,7 +10,7 @@ import pytest
 from covering import covering
 
 from agents import behaviour, figures, measure, report, results
-from agents.analysis import learning_curve, level, summarise_env, summarise_learners
+from agents.analysis import learning_curve, level, summarise_env, summarise_learners, times
 from agents.run import fresh_seeds
 from lag_envs.controllers import KNOW_NOTHING, Constant, controllers, make_controller
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN, Condition
@@ -105,6 +105,19 @@ def test_summary_of_an_environment():
     assert env["improvement"]["ppo"]["sac+"]["value"] == 1.0 and len(env["improvement"]["ppo"]) == 4
     assert env["improvement"]["td3"]["ppo"]["interval"] is None
     assert invented()["learners"]["ppo"]["envs"] == ["PivotedBar-v0"]  # the others have no score
+
+
+def test_when_learners_reach_a_score():
+    """Half of the seeds or more have to reach a level for a median; without a scale there are no levels."""
+    slow, quick = ([(0, 0.1, 0.0), (500 * k, 3.0 * k, 0.98)] for k in (2, 1))
+    assert times([slow, quick, quick[:1]]) == {
+        "0.9": {"seeds": 2, "steps": 1000.0, "seconds": 6.0},
+        "0.97": {"seeds": 2, "steps": 1000.0, "seconds": 6.0},
+        "0.99": {"seeds": 0, "steps": None, "seconds": None},
+    }
+    text = report.page(invented())
+    assert "| ppo, 5 seeds of 1,000 steps | 5 of 5: 1,000 steps, 6 s | 0 of 5 | 0 of 5 |" in text
+    assert "reached" not in invented()["envs"][pivoted_bar.Balance.id]["agents"]["ppo"]
 
 
 # --- the command ---
