@@ -17,16 +17,11 @@ from typing import Any
 
 from agents.results import to_json
 from agents.run import UserError, reports_errors
-from lag_envs.benchmark import (
-    Contestant,
-    Run,
-    batch,
-    measure,
-    quartiles,
-    random_actions,
-    ratios,
-    short,
-)
+from lag_envs.benchmark.actions import random_actions
+from lag_envs.benchmark.console import short
+from lag_envs.benchmark.environments import batch
+from lag_envs.benchmark.results import quartiles, ratios
+from lag_envs.benchmark.rounds import Contestant, Run, measure
 from lag_envs.evaluation.statistics import rounded
 from lag_envs.host import ONE_THREAD, machine
 from lag_envs.store import write

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from agents.analysis import LEVELS, Data
-from lag_envs.benchmark import quartiles, short
+from lag_envs.benchmark.console import short
+from lag_envs.benchmark.results import quartiles
 from lag_envs.evaluation.conditions import NOMINAL, OFTEN
 from lag_envs.evaluation.statistics import LEVEL, RESAMPLES
 from lag_envs.scores import known_returns

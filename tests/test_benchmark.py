@@ -13,10 +13,16 @@ import pytest
 from covering import covering
 
 import lag_envs
-from lag_envs import benchmark, cli
-from lag_envs.benchmark import Contestant, Settings
-from lag_envs.benchmark_jacobians import compile_steps
-from lag_envs.benchmark_peak import PRODUCTS
+from lag_envs import cli
+from lag_envs.benchmark import cold_start, contestants, divisions, docs, energies, jacobians, measurement
+from lag_envs.benchmark.actions import random_actions
+from lag_envs.benchmark.console import short
+from lag_envs.benchmark.environments import stagger_episodes
+from lag_envs.benchmark.measurement import Settings, bench
+from lag_envs.benchmark.peak import PRODUCTS
+from lag_envs.benchmark.results import quartiles, ratios, summary
+from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant, measure
+from lag_envs.benchmark.targets import TARGETS, verdicts
 from lag_envs.scenes import CartPole
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
@@ -160,8 +166,8 @@ def row(report, id, kind="vector", num_envs=1):
 
 
 def test_bench_writes_json_and_goes_on_past_failing_peers(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(benchmark, "PEERS", [*peers(broken, absent), *benchmark.PEERS[:1]])
-    benchmark.bench(tiny(tmp_path))
+    monkeypatch.setattr(contestants, "PEERS", [*peers(broken, absent), *contestants.PEERS[:1]])
+    bench(tiny(tmp_path))
     out = capsys.readouterr().out
     report = json.loads((tmp_path / "speed.json").read_text())
 
@@ -200,7 +206,7 @@ def test_a_peer_that_fails_later_keeps_its_samples():
     rows = [
         Contestant("gone", f"Peer{i}", "vector", 2, lambda run=run: run) for i, run in enumerate((fails, int))
     ]
-    assert benchmark.measure(rows, 3, 1e-9)
+    assert measure(rows, 3, 1e-9)
     assert rows[0].problem == "failed: ZeroDivisionError: late"
     assert [len(row.rates) for row in rows] == [1, 3]
 
@@ -217,8 +223,8 @@ def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monke
 
         return run
 
-    monkeypatch.setattr(benchmark, "PEERS", peers(interrupted))
-    benchmark.bench(tiny(tmp_path, sizes=(1,), rounds=1000, seconds=1e-6, cold_starts=3))
+    monkeypatch.setattr(contestants, "PEERS", peers(interrupted))
+    bench(tiny(tmp_path, sizes=(1,), rounds=1000, seconds=1e-6, cold_starts=3))
     report = json.loads((tmp_path / "speed.json").read_text())
     assert not report["complete"]
     assert report["cold_start"] == {}
@@ -227,8 +233,8 @@ def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monke
 
 
 def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "PEERS", peers(broken))
-    report = benchmark.bench(tiny(tmp_path, sizes=(1,), output=None))
+    monkeypatch.setattr(contestants, "PEERS", peers(broken))
+    report = bench(tiny(tmp_path, sizes=(1,), output=None))
     assert "ratio" not in row(report, ID)  # nothing of its kind to compare with
     assert "ratio" in row(report, ID, "made")
 
@@ -249,10 +255,10 @@ def test_the_whole_command_measures_in_a_process_of_its_own(tmp_path):
 def test_cold_start_times_empty_and_filled_caches(monkeypatch):
     caches = []
     monkeypatch.setattr(
-        benchmark, "cold_start", lambda id, cache, files: caches.append(cache) or [len(caches)]
+        cold_start, "cold_start", lambda id, cache, files: caches.append(cache) or [len(caches)]
     )
     times = {}
-    assert benchmark.cold_starts(ID, 3, times)
+    assert cold_start.cold_starts(ID, 3, times)
     assert times == {"empty": [[1], [2]], "filled": [[3], [4], [5]]}
     assert caches[0] != caches[1]
     assert caches[2:] == [caches[0]] * 3
@@ -260,16 +266,16 @@ def test_cold_start_times_empty_and_filled_caches(monkeypatch):
 
 def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
     start = time.perf_counter()
-    stages = benchmark.cold_start(ID, str(tmp_path))
-    assert len(stages) == len(benchmark.STAGES)
+    stages = cold_start.cold_start(ID, str(tmp_path))
+    assert len(stages) == len(cold_start.STAGES)
     assert 0.0 < sum(stages) < time.perf_counter() - start
     assert all(stage > 0.0 for stage in stages)
 
 
 def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
-    some = partial(benchmark.jacobians, names=("Incline", "CartPole"))
-    monkeypatch.setattr(benchmark, "jacobians", some)
-    report = benchmark.bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, jacobians=True))
+    some = partial(jacobians.jacobians, names=("Incline", "CartPole"))
+    monkeypatch.setattr(measurement, "jacobians", some)
+    report = bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, jacobians=True))
     rows = {row["name"]: row for row in report["jacobians"]}
     assert [rows[name]["columns"] for name in ("Incline", "CartPole")] == [3, 5]
     assert all(row["ratio"] > 0.0 and row["aim"] == 1 + 2 * row["columns"] for row in rows.values())
@@ -277,27 +283,27 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     # The loop that it is compared with takes the very steps of the scene.
     scene, states = CartPole(), np.array([[0.1, 0.2, 0.3, 0.4], [0.5, -0.2, 3.0, 1.0]])
     ends = [scene.simulate(x, [u], 0.02)[1].sum() for x, u in zip(states, (1.0, -2.0), strict=True)]
-    steps = compile_steps(scene, 0.02)(states, np.array([[1.0], [-2.0]]))
+    steps = jacobians.compile_steps(scene, 0.02)(states, np.array([[1.0], [-2.0]]))
     assert steps == pytest.approx(sum(ends), rel=1e-14)
 
 
 @pytest.mark.slow
 def test_how_often_steps_are_divided(tmp_path, capsys):
     ids = (ID, chain.SwingUp.id, pivoted_bar.SwingUpUnknown.id)
-    report = benchmark.bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, divisions=True, ids=ids))
+    report = bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, divisions=True, ids=ids))
     one, two = report["divisions"]  # nothing of the imperfect one
     assert (one["id"], one["mean"], one["most"], one["divided"]) == (ID, 1.0, 1, 0.0)
     assert two["most"] > 5 and 1.5 < two["mean"] < two["most"] and 0.5 < two["divided"] < 1.0
     assert two["fastest"] > 20.0
     assert "series a step" in capsys.readouterr().out
-    text = benchmark.benchmark_divisions.markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
+    text = divisions.markdown(report["divisions"], {two["id"]: 100.0 * two["mean"]})
     assert text.splitlines()[2].endswith("| 100 ns |") and ID not in text
 
 
 @pytest.mark.slow
 def test_scenes_of_energies_beside_cart_pole(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(benchmark, "LONGEST", 2)
-    report = benchmark.bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))
+    monkeypatch.setattr(energies, "LONGEST", 2)
+    report = bench(tiny(tmp_path, sizes=(3,), rounds=1, energies=True))
     for id in ("CartPole, exact", "Chain(1)", "Chain(2)"):
         found = row(report, id, num_envs=3)
         assert found["problem"] is None and found["ratio"]
@@ -339,8 +345,8 @@ def made(library, id, kind, num_envs, rates):
 
 def test_ratios_are_taken_within_a_round():
     # The machine is ten times slower in the second round: the ratio of medians would be 2.5.
-    assert benchmark.ratios([40.0, 4.0, 50.0], [20.0, 2.0, 10.0]) == [2.0, 2.0, 5.0]
-    assert benchmark.quartiles([2.0, 2.0, 5.0])[1] == 2.0
+    assert ratios([40.0, 4.0, 50.0], [20.0, 2.0, 10.0]) == [2.0, 2.0, 5.0]
+    assert quartiles([2.0, 2.0, 5.0])[1] == 2.0
 
 
 def test_rows_are_compared_with_cartpole_of_their_size():
@@ -352,7 +358,7 @@ def test_rows_are_compared_with_cartpole_of_their_size():
         made("lag_envs", ID, "vector", 64, [700.0, 1000.0]),
         made("lag_envs", ID, "vector", 7, [1.0, 1.0]),
     ]
-    results = [benchmark.summary(r, rows) for r in rows]
+    results = [summary(r, rows) for r in rows]
     assert results[3]["ratio"] == (3.0, 3.0, 3.0)
     assert results[4]["ratio"] == (5.5, 6.0, 6.5)
     assert results[4]["steps_per_second"] == (775.0, 850.0, 925.0)
@@ -362,7 +368,7 @@ def test_rows_are_compared_with_cartpole_of_their_size():
 @pytest.mark.parametrize(("ratio", "met"), [(6.0, True), (5.99, False)])
 def test_targets(ratio, met):
     rows = [{"library": "lag_envs", "id": ID, "kind": "vector", "num_envs": 64, "ratio": (0.0, ratio, 9.0)}]
-    results = {t["target"]: t for t in benchmark.verdicts(rows, {"empty": [2.0, 2.4, 9.0], "filled": [1.2]})}
+    results = {t["target"]: t for t in verdicts(rows, {"empty": [2.0, 2.4, 9.0], "filled": [1.2]})}
     assert results["vector, 64: at least 6 x CartPole-v1"]["met"] is met
     assert results["vector, 64: at least 6 x CartPole-v1"]["measured"] == {ID: ratio}
     assert results["single, made: at least 2 x CartPole-v1"]["met"] is None
@@ -373,13 +379,13 @@ def test_targets(ratio, met):
 def report_of(ratios):
     """Return a report in which, at the targets' sizes, an environment is so many times as fast."""
     rows = []
-    for target, ratio in zip(benchmark.TARGETS, ratios, strict=True):
+    for target, ratio in zip(TARGETS, ratios, strict=True):
         rows += [made("gymnasium", "CartPole-v1", target.kind, target.num_envs, [1e7])]
         rows += [made("lag_envs", ID, target.kind, target.num_envs, [ratio * 1e7] if ratio else [])]
         rows[-1].problem = None if ratio else "failed: OSError: no luck"
     return {
         "date": "2020-02-20", "machine": {"processor": "P"}, "versions": {"gymnasium": "1"},
-        "settings": {"rounds": 1, "clock": "wall"}, "rows": [benchmark.summary(r, rows) for r in rows],
+        "settings": {"rounds": 1, "clock": "wall"}, "rows": [summary(r, rows) for r in rows],
         "cold_start": {"empty": {"median": 1.234}},
     }  # fmt: skip
 
@@ -390,8 +396,8 @@ def test_checkout_takes_the_table_over(tmp_path):
     for name in ("README.md", "docs/speed.md"):
         (tmp_path / name).write_text(marks)
     report = report_of([2.0, 5.99, 20.0, 1.5])
-    benchmark.take_over(report, tmp_path)
-    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(benchmark.to_json(report))
+    docs.take_over(report, tmp_path)
+    assert json.loads((tmp_path / "docs" / "speed.json").read_text()) == json.loads(docs.to_json(report))
     text = (tmp_path / "docs" / "speed.md").read_text()
     assert (
         f"| {ID} | 50 ns, 2.0× | 16.7 ns, **5.99×, missed** | 5 ns, 20.0× | 66.7 ns, **1.50×, missed** |"
@@ -402,15 +408,15 @@ def test_checkout_takes_the_table_over(tmp_path):
     for name in ("README.md", "docs/speed.md"):
         text = (tmp_path / name).read_text()
         assert "alone 2 to 2 times" in text and "2 of 4 targets are missed" in text
-    assert "all targets are met" in benchmark.claim(report_of([2.0, 6.0, 3.0, 3.0]))
-    assert "| failed: OSError: no luck |" in benchmark.markdown(report_of([2.0, 6.0, None, 3.0]))
+    assert "all targets are met" in docs.claim(report_of([2.0, 6.0, 3.0, 3.0]))
+    assert "| failed: OSError: no luck |" in docs.markdown(report_of([2.0, 6.0, None, 3.0]))
 
 
 def test_what_was_broken_off_is_not_taken_over(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "PEERS", benchmark.PEERS[:1])
-    monkeypatch.setattr(benchmark, "measure", lambda *_: False)
-    monkeypatch.setattr(benchmark, "take_over", lambda *_: pytest.fail("taken over"))
-    assert not benchmark.bench(tiny(tmp_path, checkout=str(tmp_path)))["complete"]
+    monkeypatch.setattr(contestants, "PEERS", contestants.PEERS[:1])
+    monkeypatch.setattr(measurement, "measure", lambda *_: False)
+    monkeypatch.setattr(measurement, "take_over", lambda *_: pytest.fail("taken over"))
+    assert not bench(tiny(tmp_path, checkout=str(tmp_path)))["complete"]
 
 
 @pytest.mark.parametrize(
@@ -425,7 +431,7 @@ def test_what_was_broken_off_is_not_taken_over(tmp_path, monkeypatch):
     ],
 )
 def test_rates_have_three_digits(value, text):
-    assert benchmark.short(value) == text
+    assert short(value) == text
 
 
 def test_episodes_are_spread_out():
@@ -433,36 +439,36 @@ def test_episodes_are_spread_out():
 
     envs = gym.make_vec(ID, num_envs=4, duration=0.16)  # 8 steps
     envs.reset(seed=0)
-    actions = benchmark.random_actions(4)
-    benchmark.stagger_episodes(envs, actions)
+    actions = random_actions(4)
+    stagger_episodes(envs, actions)
     ended = [envs.step(action)[3] for action in actions[:9]]  # an episode and the step that resets
     assert [sum(column) for column in zip(*ended, strict=True)] == [1, 1, 1, 1]
     assert max(map(sum, ended)) == 1
 
 
 def test_threads_are_measured_beside_one(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(benchmark, "PEERS", [])
-    report = benchmark.bench(tiny(tmp_path, sizes=(3,), threads=2))
+    monkeypatch.setattr(contestants, "PEERS", [])
+    report = bench(tiny(tmp_path, sizes=(3,), threads=2))
     (found,) = report["speedups"]
     one, two = (
         next(r["rates"] for r in report["rows"] if r["library"] == library and r["kind"] == "vector")
-        for library in ("lag_envs", benchmark.THREADED)
+        for library in ("lag_envs", THREADED)
     )
     assert (found["id"], found["num_envs"]) == (ID, 3)
-    assert found["ratio"] == benchmark.quartiles(benchmark.ratios(two, one))
+    assert found["ratio"] == quartiles(ratios(two, one))
     assert "2 threads : 1" in capsys.readouterr().out
-    assert benchmark.bench(tiny(tmp_path, sizes=(3,)))["speedups"] == []
+    assert bench(tiny(tmp_path, sizes=(3,)))["speedups"] == []
 
 
 def test_arithmetic_is_compared_with_what_the_core_can_do(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(benchmark, "PEERS", [])
-    report = benchmark.bench(tiny(tmp_path, sizes=(1, 3)))
+    monkeypatch.setattr(contestants, "PEERS", [])
+    report = bench(tiny(tmp_path, sizes=(1, 3)))
     (found,) = report["arithmetic"]
-    (core,) = [r for r in report["rows"] if r["library"] == benchmark.CORE]
+    (core,) = [r for r in report["rows"] if r["library"] == CORE]
     assert "ratio" not in core
-    pairs = benchmark.ratios(row(report, ID, num_envs=3)["rates"], core["rates"])
+    pairs = ratios(row(report, ID, num_envs=3)["rates"], core["rates"])
     assert (found["id"], found["num_envs"]) == (ID, 3)
-    assert found["share"] == pytest.approx(benchmark.quartiles([found["products"] * x for x in pairs]))
+    assert found["share"] == pytest.approx(quartiles([found["products"] * x for x in pairs]))
     assert "of the core's peak" in capsys.readouterr().out
 
 
@@ -474,10 +480,10 @@ def test_products_are_counted_with_and_without_a_sum():
 
 
 def test_keywords_are_measured_beside_the_defaults():
-    rows = benchmark.contestants((ID,), (1, 64), ("action_delay=0.013",))
-    varied = [row for row in rows if row.library == benchmark.VARIED]
+    rows = contestants.contestants((ID,), (1, 64), ("action_delay=0.013",))
+    varied = [row for row in rows if row.library == VARIED]
     assert {row.id for row in varied} == {f"{ID}, action_delay=0.013"}
     assert [(row.kind, row.num_envs) for row in varied] == [("unwrapped", 1), ("vector", 1), ("vector", 64)]
     for text in ("0.013", "action_delay=", "**{}", "action_delay=open('x')"):
         with pytest.raises(ValueError, match="keywords must be as in a call"):
-            benchmark.keywords_of(text)
+            contestants.keywords_of(text)

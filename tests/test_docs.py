@@ -17,7 +17,7 @@ from covering import PERFECT, covering
 from PIL import Image
 from rollouts import IDS, RENDERS, make
 
-from lag_envs.benchmark import TARGETS
+from lag_envs.benchmark.targets import TARGETS
 from lag_envs.envs.program import BLOCK
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.protocol import reference

@@ -10,7 +10,8 @@ from gymnasium.error import ResetNeeded
 from own_tasks import TASKS as OWN
 
 import lag_envs.torch
-from lag_envs import benchmark_device, cli, nvrtc
+from lag_envs import cli, nvrtc
+from lag_envs.benchmark import device as benchmark_device
 from lag_envs.device import DeviceEnvs
 from lag_envs.envs.kernels import APART, kernels_of
 from lag_envs.envs.unfused import Unfused

@@ -11,7 +11,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from lag_envs import benchmark, own_files
+from lag_envs import own_files
+from lag_envs.benchmark import cold_start, contestants
+from lag_envs.benchmark.actions import actions_of
+from lag_envs.benchmark.measurement import Settings, bench
 from lag_envs.cli import main
 from lag_envs.errors import UserError
 
@@ -230,29 +233,29 @@ def test_the_leaderboard_runs_no_file_of_anybody():
 
 
 def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(benchmark, "PEERS", [])
+    monkeypatch.setattr(contestants, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")
-    settings = benchmark.Settings(ids, (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
-    rows = [row for row in benchmark.bench(settings)["rows"] if row["library"] == "lag_envs"]
+    settings = Settings(ids, (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
+    rows = [row for row in bench(settings)["rows"] if row["library"] == "lag_envs"]
     assert len(rows) == 9 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
 
 
 def test_random_actions_fit_their_space():
     box, several = gym.spaces.Box(-2.0, 2.0, (1,)), gym.spaces.Box(-1.0, 1.0, (2,))
     for space in (box, several, gym.spaces.Discrete(3), gym.spaces.MultiDiscrete([2, 3])):
-        for actions in benchmark.actions_of(space, 4)[:20]:
+        for actions in actions_of(space, 4)[:20]:
             assert all(
                 space.contains(space.dtype.type(a) if a.ndim == 0 else a.astype(space.dtype)) for a in actions
             )
-    chosen = np.concatenate(benchmark.actions_of(gym.spaces.Discrete(3), 50))
+    chosen = np.concatenate(actions_of(gym.spaces.Discrete(3), 50))
     assert set(chosen) == {0, 1, 2}
 
 
 @pytest.mark.slow
 def test_cold_start_of_a_file(tmp_path):
-    stages = benchmark.cold_start("OwnDrift-v0", str(tmp_path), (SEVERAL,))
-    assert len(stages) == len(benchmark.STAGES) and min(stages) >= 0.0
+    stages = cold_start.cold_start("OwnDrift-v0", str(tmp_path), (SEVERAL,))
+    assert len(stages) == len(cold_start.STAGES) and min(stages) >= 0.0
 
 
 # --- play ---

@@ -82,7 +82,8 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
 
 def run_bench(args: argparse.Namespace) -> int:
     """Compare speeds."""
-    from lag_envs.benchmark import Settings, in_own_process
+    from lag_envs.benchmark.measurement import Settings
+    from lag_envs.benchmark.process import in_own_process
 
     ids, files = _measured(args.ids)
     ids = ids or (("PivotedBar-v0",) if args.quick or args.cold else tuple(TASKS))
@@ -134,7 +135,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     if args.threads > 1 or args.clock == "cpu" or any(getattr(args, name) for name in others):
         raise UserError("--device takes no other options than --quick, --sizes, --rounds, --seconds")
     needs("torch", "torch")
-    from lag_envs.benchmark_device import rates, table
+    from lag_envs.benchmark.device import rates, table
     from lag_envs.device import checked_device
 
     try:
@@ -169,7 +170,7 @@ def _check_writable(path: Path) -> None:
 
 
 def _keywords(text: str) -> str:
-    from lag_envs.benchmark import keywords_of
+    from lag_envs.benchmark.contestants import keywords_of
 
     try:
         keywords_of(text)

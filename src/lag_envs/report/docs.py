@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lag_envs import benchmark
+from lag_envs.benchmark.docs import texts as speed_texts
 from lag_envs.report import overview, page
 from lag_envs.report.content import Picture, Table
 from lag_envs.report.report import FILE, content_of
@@ -151,7 +151,7 @@ def generated(project: Path) -> dict[Path, str]:
         for name in ("accuracy.json", "speed.json")
     )
     pages = {"accuracy.md": markdown(accuracy), DETAILS: details(accuracy)}
-    return {project / "docs" / name: text for name, text in pages.items()} | benchmark.texts(speed, project)
+    return {project / "docs" / name: text for name, text in pages.items()} | speed_texts(speed, project)
 
 
 def drawn(picture: Picture, folder: Path) -> Path:

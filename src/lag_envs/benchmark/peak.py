@@ -6,11 +6,15 @@ processors do them beside.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
+from lag_envs.benchmark.results import quartiles, ratios
+from lag_envs.benchmark.rounds import CORE, Contestant
 from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_function, count_operations
@@ -52,3 +56,20 @@ def products(program: Program) -> int | None:
         return None
     lines = [*program.control, *program.fast, *program.outcome, *program.kick, *program.observe]
     return count_operations(lines, PRODUCTS)
+
+
+def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
+    """Return, for our largest batch of each id, its products a step and its share of the core's peak.
+
+    The share has quartiles, over the rounds, of products a second to multiply-adds a second.
+    """
+    limits = next((row.rates for row in rows if row.library == CORE), [])
+    batches = [r for r in rows if r.library == "lag_envs" and r.kind == "vector"]
+    largest = {r.id: r for r in sorted(batches, key=lambda r: r.num_envs)}
+    found = []
+    for id, row in largest.items():
+        count = products(gym.make_vec(id, num_envs=1)._program) if row.rates else None  # type: ignore[attr-defined]
+        if count and (pairs := ratios(row.rates, limits)):
+            share = quartiles([count * pair for pair in pairs])
+            found.append({"id": id, "num_envs": row.num_envs, "products": count, "share": share})
+    return found

@@ -1,0 +1,115 @@
+"""A report as lines of text, for the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lag_envs.benchmark import divisions, jacobians
+from lag_envs.benchmark.results import quartiles, times_of
+from lag_envs.tables import columns
+
+
+def table(report: dict[str, Any]) -> list[str]:
+    """Return the report as lines of text."""
+    about, settings = report["machine"], report["settings"]
+    lines = [
+        f"{about['processor']}, {about['cores']} cores, {about['system']}, Python {about['python']}",
+        f"{'a core for each thread' if report.get('speedups') else 'one core'}, {settings['clock']} time, "
+        f"{settings['rounds']} samples of {settings['seconds']:g} s each",
+        ", ".join(f"{name} {number}" for name, number in report["versions"].items()),
+        "",
+    ]
+    if report["rows"]:
+        head = (
+            "library",
+            "environment",
+            "kind",
+            "envs",
+            "steps/s",
+            "(quartiles)",
+            "ns/step",
+            "x CartPole",
+            "(quartiles)",
+        )
+        lines += columns([head, *map(_cells, report["rows"])])
+        lines += [
+            "",
+            "x CartPole: median over the rounds of the ratio to Gymnasium's CartPole-v1 of the same size",
+            "",
+        ]
+    if found := report.get("speedups"):
+        names = ("environment", "envs", f"{settings['threads']} threads : 1", "(quartiles)")
+        lines += [*columns([names, *map(_compared, found)]), ""]
+    if found := report.get("arithmetic"):
+        titles = ("environment", "envs", "products a step", "of the core's peak", "(quartiles)")
+        lines += [*columns([titles, *map(_share, found)]), ""]
+    if found := report.get("chains"):
+        times = ", ".join(f"{bars}: {ns:,.0f}" for bars, ns in zip(found["bars"], found["ns"], strict=True))
+        lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
+    if costs := report.get("jacobians"):
+        lines += [*columns(jacobians.table(costs)), ""]
+    if found := report.get("divisions"):
+        rows = [divisions.cells(row, times_of(report).get(row["id"])) for row in found]
+        lines += [*columns([divisions.HEAD, *rows]), ""]
+    for name, cold in report["cold_start"].items():
+        low, middle, high = quartiles(cold["seconds"])
+        spread = f"({low:.2f} - {high:.2f}), {len(cold['seconds'])} processes"
+        lines += [f"cold start, cache {name}: {middle:.2f} s {spread}; median of each stage, ms:"]
+        rows = [(f"  {stage}", f"{1e3 * seconds:.1f}") for stage, seconds in cold["stages"].items()]
+        lines += [*columns(rows), ""]
+    words = {True: "met", False: "missed", None: "not measured"}
+    lines += columns([(words[t["met"]], t["target"], _worst(t)) for t in report["targets"]])
+    if not report["complete"]:
+        lines += ["", "interrupted: these are the samples so far"]
+    return lines
+
+
+def short(value: float) -> str:
+    """Return a rate with three digits.
+
+    Examples
+    --------
+    >>> short(1234.0), short(41_234_567.0)
+    ('1.23 k', '41.2 M')
+    """
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= 0.9995 * size:
+            value /= size
+            return f"{value:.{max(0, 2 - (value >= 9.995) - (value >= 99.95))}f} {unit}"
+    return f"{value:.0f}"
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    name = (row["library"], row["id"], row["kind"], f"{row['num_envs']:,}")
+    if "steps_per_second" not in row:
+        return (*name, row["problem"] or "not measured")
+    low, middle, high = row["steps_per_second"]
+    cells: tuple[str, ...] = (*name, short(middle), f"({short(low)} - {short(high)})", f"{1e9 / middle:,.1f}")
+    if "ratio" in row:
+        low, middle, high = row["ratio"]
+        cells = (*cells, f"{middle:.2f}", f"({low:.2f} - {high:.2f})")
+    return (*cells, row["problem"]) if row["problem"] else cells
+
+
+def _compared(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["ratio"]
+    return row["id"], f"{row['num_envs']:,}", f"{middle:.2f}", f"({low:.2f} - {high:.2f})"
+
+
+def _share(row: dict[str, Any]) -> tuple[str, ...]:
+    low, middle, high = row["share"]
+    numbers = f"{row['num_envs']:,}", f"{row['products']:,}"
+    return row["id"], *numbers, f"{middle:.0%}", f"({low:.0%} - {high:.0%})"
+
+
+def _worst(target: dict[str, Any]) -> str:
+    measured = target["measured"]
+    if not measured:
+        return ""
+    if "seconds" in measured:
+        return f"{measured['seconds']:.2f} s"
+    worst = min(measured, key=measured.get)
+    missed = sum(value < target["limit"] for value in measured.values())
+    return f"{measured[worst]:.2f} by {worst}" + (
+        f", missed by {missed} of {len(measured)}" if missed and len(measured) > 1 else ""
+    )

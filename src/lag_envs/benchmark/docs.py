@@ -1,0 +1,116 @@
+"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, and what README says."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from lag_envs.benchmark import divisions
+from lag_envs.benchmark.results import times_of
+from lag_envs.benchmark.rounds import ENERGIES
+from lag_envs.benchmark.targets import TARGETS, Target, reached
+from lag_envs.generated import replaced
+from lag_envs.store import write
+from lag_envs.tables import markdown_table
+
+
+def take_over(report: dict[str, Any], checkout: Path) -> None:
+    """Write a report into a checkout: ``docs/speed.json``, and what docs/speed.md and README say of it."""
+    write(checkout / "docs" / "speed.json", to_json(report))
+    for path, text in texts(report, checkout).items():
+        write(path, text)
+
+
+def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
+    """Return the files of a checkout that tell of a report, as they ought to be."""
+    page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
+    text = replaced(page.read_text(encoding="utf-8"), "bench", markdown(report))
+    return {
+        page: replaced(text, "fast", claim(report)),
+        readme: replaced(readme.read_text(encoding="utf-8"), "fast", claim(report)),
+    }
+
+
+def to_json(report: dict[str, Any]) -> str:
+    """Return a report as JSON, with lists of numbers on a line."""
+    text = json.dumps(report, indent=1, allow_nan=False)
+    return re.sub(r"\[[^\[\]{}\"]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """Return the table of docs/speed.md: every environment at the sizes of `TARGETS`; what misses is marked.
+
+    Parameters
+    ----------
+    report : dict
+        What `bench` returns; of these sizes, with CartPole-v1 among them.
+    """
+    rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
+    rival = ("gymnasium", "CartPole-v1")
+
+    def cell(library: str, id: str, target: Target) -> str:
+        row = rows[library, id, target.kind, target.num_envs]
+        if "steps_per_second" not in row:
+            return row["problem"] or "not measured"
+        time = 1e9 / row["steps_per_second"][1]
+        text = f"{time:,.0f} ns" if time >= 99.5 else f"{time:.3g} ns"
+        if (library, id) == rival:
+            return text
+        ratio = row["ratio"][1]
+        return f"{text}, {ratio:.1f}×" if ratio >= target.ratio else f"{text}, **{ratio:.2f}×, missed**"
+
+    sizes = ["1 (`gym.make`)" if t.kind == "made" else f"{t.num_envs:,} at once" for t in TARGETS]
+    ids = dict.fromkeys(row["id"] for row in report["rows"] if row["library"] == "lag_envs")
+    lines = [
+        *([id, *(cell("lag_envs", id, t) for t in TARGETS)] for id in ids),
+        ["CartPole-v1", *(cell(*rival, t) for t in TARGETS)],
+        ["*target*", *(f"*{t.ratio:g}×*" for t in TARGETS)],
+    ]
+    machine, settings = report["machine"], report["settings"]
+    parts = [
+        "Time of a step, and how many times as long a step of as many of Gymnasium's `CartPole-v1` takes: "
+        f"medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
+        f"{machine['processor']} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
+        f"{report['date']}).",
+        markdown_table(["id", *sizes], lines),
+    ]
+    exact = [r for r in report["rows"] if r["library"] == ENERGIES and "ratio" in r]
+    if exact:
+        size = max(r["num_envs"] for r in exact)
+        told = [
+            f"`{r['id']}` {1e9 / r['steps_per_second'][1]:,.0f} ns, {r['ratio'][1]:.2f}×"
+            for r in exact
+            if r["num_envs"] == size and r["id"] in ("CartPole, exact", "Chain(2)")
+        ]
+        parts.append(
+            f"Scenes that are only energies, {size:,} at once, beside the same `CartPole-v1`: "
+            f"{'; '.join(told)}."
+        )
+    if found := report.get("divisions"):
+        parts.append(
+            "Into how many series the certificate divides steps under random actions, and the time of one, "
+            "many at once. Others never needed more than one; those with imperfections were left out."
+        )
+        parts.append(divisions.markdown(found, times_of(report)))
+    if cold := report["cold_start"]:
+        starts = " and ".join(f"{part['median']:.2f} s with its cache {name}" for name, part in cold.items())
+        parts.append(f"A whole process (import, make, reset, first step) took {starts}.")
+    return "\n\n".join(parts)
+
+
+def claim(report: dict[str, Any]) -> str:
+    """Return a sentence on speed: the ranges of the table, and how many targets are missed."""
+    found = [sorted(reached(report["rows"], target).values()) for target in TARGETS]
+    places = ["alone", *(f"{target.num_envs:,} at once" for target in TARGETS[1:])]
+    ranges = ", ".join(
+        f"{place} {ratios[0]:.3g} to {ratios[-1]:.3g} times"
+        for place, ratios in zip(places, found, strict=True)
+        if ratios
+    )
+    missed = sum(
+        ratio < target.ratio for target, ratios in zip(TARGETS, found, strict=True) for ratio in ratios
+    )
+    aims = f"{missed} of {sum(map(len, found))} targets are missed" if missed else "all targets are met"
+    return f"Steps per second, relative to Gymnasium's `CartPole-v1`: {ranges}; {aims}."

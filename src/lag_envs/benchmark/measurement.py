@@ -1,0 +1,90 @@
+"""The whole measurement, from its settings to a report."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lag_envs
+from lag_envs.benchmark import cold_start
+from lag_envs.benchmark.console import table
+from lag_envs.benchmark.contestants import contestants
+from lag_envs.benchmark.divisions import divisions
+from lag_envs.benchmark.docs import take_over, to_json
+from lag_envs.benchmark.energies import chains, of_energies
+from lag_envs.benchmark.jacobians import jacobians
+from lag_envs.benchmark.peak import arithmetic
+from lag_envs.benchmark.results import speedups, summary
+from lag_envs.benchmark.rounds import CLOCKS, measure
+from lag_envs.benchmark.targets import verdicts
+from lag_envs.host import installed, machine
+from lag_envs.own_files import registered
+from lag_envs.tasks import TASKS
+
+LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "jax", "torchrl", "torch")
+
+
+@dataclass
+class Settings:
+    """What is measured, and for how long."""
+
+    ids: tuple[str, ...] = tuple(TASKS)
+    files: tuple[str, ...] = ()  #: users' own, which register some of the ids
+    keywords: tuple[str, ...] = ()  #: each as a call takes them: measured beside the defaults
+    energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
+    jacobians: bool = False  #: what derivatives of a step cost beside it
+    divisions: bool = False  #: how often the certificate divides steps
+    sizes: tuple[int, ...] = (1, 64, 1024, 16384)
+    threads: int = 1  #: where more, batches that they step are measured too
+    rounds: int = 31
+    seconds: float = 0.05  #: aimed length of one sample
+    clock: str = "wall"  #: or "cpu", which leaves out what other programs take of the core
+    speed: bool = True
+    cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
+    date: str = ""
+    output: str | None = None
+    checkout: str | None = None  #: whose docs take the result over
+
+
+def bench(settings: Settings) -> dict[str, Any]:
+    """Measure, print the tables, write the file if one is named, and return what it holds."""
+    for name in settings.files:
+        registered(name)
+    ours = settings.ids, settings.sizes, settings.keywords, settings.threads
+    rows = contestants(*ours) if settings.speed else []
+    if settings.speed and settings.energies:
+        rows += of_energies(settings.sizes)
+    times: dict[str, list[list[float]]] = {}
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    complete = measure(rows, settings.rounds, settings.seconds, CLOCKS[settings.clock])
+    if complete and settings.cold_starts:
+        complete = cold_start.cold_starts(settings.ids[0], settings.cold_starts, times, settings.files)
+    cold = {cache: cold_start.summary(some) for cache, some in times.items()}
+    results = [summary(row, rows) for row in rows]
+    report: dict[str, Any] = {
+        "date": settings.date,
+        "complete": complete,
+        "machine": machine() | {"load_at_start": load},
+        "versions": {"lag_envs": lag_envs.__version__} | installed(LIBRARIES),
+        "settings": asdict(settings),
+        "rows": results,
+        "cold_start": cold,
+        "targets": verdicts(results, {cache: found["seconds"] for cache, found in cold.items()}),
+        "chains": chains(results),
+        "speedups": speedups(rows),
+        "arithmetic": arithmetic(rows),
+    }
+    if settings.jacobians and complete:
+        report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
+    if settings.divisions and complete:
+        report["divisions"] = divisions(settings.ids)
+    print("\n".join(table(report)))
+    if settings.output:
+        Path(settings.output).write_text(to_json(report), encoding="utf-8")
+        print(f"written to {settings.output}")
+    if settings.checkout and complete:
+        take_over(report, Path(settings.checkout))
+        print(f"written to docs/speed.json, docs/speed.md and README.md in {settings.checkout}")
+    return report

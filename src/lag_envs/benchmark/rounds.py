@@ -1,0 +1,92 @@
+"""Samples of all contestants, taken in turn, round after round."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from lag_envs.progress import progress
+
+#: Takes at least that many steps of every environment, and returns how many it took.
+Run = Callable[[int], int]
+Clock = Callable[[], float]
+CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+@dataclass
+class Contestant:
+    """One row of the table.
+
+    ``rates`` holds the env-steps per second of each round; ``problem`` tells why there are no (more) of them.
+    """
+
+    library: str
+    id: str
+    kind: str  #: "made", "unwrapped" or "vector"
+    num_envs: int
+    prepare: Callable[[], Run]
+    rates: list[float] = field(default_factory=list)
+    problem: str | None = None
+
+
+#: What stands for the library in rows of scenes of energies, of environments with other keywords, of those
+#: that several threads step, and of what the core can do.
+ENERGIES, VARIED, THREADED = "lag_envs, energies", "lag_envs, varied", "lag_envs, threads"
+CORE = "this core"
+
+
+def measure(
+    rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
+) -> bool:
+    """Fill in the contestants' rates; return False where the user broke it off, keeping what there is."""
+    runs: dict[int, tuple[Run, int]] = {}
+    with progress(len(rows) * (rounds + 1)) as advance:
+        try:
+            for i, row in enumerate(rows):
+                advance(f"{row.library} {row.id} {row.kind} {row.num_envs}")
+                with excused(row):
+                    run = row.prepare()
+                    runs[i] = run, calibrate(run, seconds, clock)
+            for _ in range(rounds):
+                for i, row in enumerate(rows):
+                    advance("measuring")
+                    if row.problem is None:
+                        with excused(row):
+                            row.rates.append(rate(*runs[i], clock) * row.num_envs)
+        except KeyboardInterrupt:
+            return False
+    return True
+
+
+@contextmanager
+def excused(row: Contestant) -> Iterator[None]:
+    """Note in the row what goes wrong with a contestant, so that the others can go on."""
+    try:
+        yield
+    except Exception as error:
+        missing = isinstance(error, ModuleNotFoundError) and error.name == row.library
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        row.problem = "not installed" if missing else f"failed: {text[:200]}"
+
+
+def calibrate(run: Run, seconds: float, clock: Clock) -> int:
+    """Return the number of steps that take about that long."""
+    run(1)  # compiles
+    steps = 1
+    while True:
+        start = clock()
+        taken = run(steps)
+        elapsed = clock() - start
+        if elapsed >= 0.25 * seconds:
+            return max(1, round(taken * seconds / elapsed))
+        steps *= 2
+
+
+def rate(run: Run, steps: int, clock: Clock) -> float:
+    """Return steps per second."""
+    run(1)  # what the others have pushed out of the caches comes back
+    start = clock()
+    taken = run(steps)
+    return taken / (clock() - start)
