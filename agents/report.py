@@ -304,8 +304,8 @@ def _method(data: Data) -> str:
             " between tests.",
             "- *First tests*: a run has 16, so a score may have been reached up to a sixteenth of the run"
             " earlier, and 20 episodes may be lucky ones. Seconds are those of training alone, while as many"
-            " runs as the machine has cores went on side by side. `python -m agents.race` tests more often, one"
-            " run at a time.",
+            " runs as there are cores went on side by side. `python -m agents.race` tests more often, one run"
+            " at a time.",
         ]
     )
 

@@ -21,8 +21,8 @@ from lag_envs.benchmark.environments import stagger_episodes
 from lag_envs.benchmark.measurement import Settings, bench
 from lag_envs.benchmark.peak import PRODUCTS
 from lag_envs.benchmark.results import quartiles, ratios, summary
-from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant, measure
-from lag_envs.benchmark.targets import TARGETS, verdicts
+from lag_envs.benchmark.rounds import CORE, ENERGIES, THREADED, VARIED, Contestant, measure
+from lag_envs.benchmark.targets import SERIES_TARGETS, TARGETS, has_own_flow, verdicts
 from lag_envs.scenes import CartPole
 from lag_envs.stepping.compiling import count_operations, record_block
 from lag_envs.stepping.tracing import Trace
@@ -372,8 +372,25 @@ def test_targets(ratio, met):
     assert results["vector, 64: at least 6 x CartPole-v1"]["met"] is met
     assert results["vector, 64: at least 6 x CartPole-v1"]["measured"] == {ID: ratio}
     assert results["single, made: at least 2 x CartPole-v1"]["met"] is None
+    assert results["Chain(2), vector, 16,384: at least 0.25 x CartPole-v1"]["met"] is None
     assert results["cold start, cache empty: below 2.5 s"]["met"] is True
     assert results["cold start, cache filled: below 0.5 s"]["met"] is False
+
+
+def test_who_has_a_target():
+    """Whoever is stepped by a flow of its own; the general series, where the target names it."""
+
+    def meant(target, **changes):
+        about = {"library": "lag_envs", "id": ID, "kind": target.kind, "num_envs": target.num_envs}
+        return target.meant_for(about | changes)
+
+    assert all(meant(target) for target in TARGETS) and not any(meant(target) for target in SERIES_TARGETS)
+    assert not meant(TARGETS[1], num_envs=1) and not meant(TARGETS[1], library="gymnasium")
+    unknown = [id for id, task in TASKS.items() if task.imperfections]
+    general = [id for id, task in TASKS.items() if task().scene._form is None]
+    assert unknown and general and not any(has_own_flow(id) for id in (*unknown, *general, "Other-v0"))
+    for target in SERIES_TARGETS:
+        assert meant(target, library=ENERGIES, id=target.id) and not meant(target, id=target.id)
 
 
 def report_of(ratios):
@@ -407,8 +424,9 @@ def test_checkout_takes_the_table_over(tmp_path):
     assert "2020-02-20" in text and "took 1.23 s with its cache empty" in text
     for name in ("README.md", "docs/speed.md"):
         text = (tmp_path / name).read_text()
-        assert "alone 2 to 2 times" in text and "2 of 4 targets are missed" in text
-    assert "all targets are met" in docs.claim(report_of([2.0, 6.0, 3.0, 3.0]))
+        assert "| a flow of their own | 2 to 2 | 6 to 6 | 20 to 20 | 1.5 to 1.5 |" in text
+        assert "general series" not in text and "2 of 4 targets are missed" in text
+    assert "All targets are met" in docs.claim(report_of([2.0, 6.0, 3.0, 3.0]))
     assert "| failed: OSError: no luck |" in docs.markdown(report_of([2.0, 6.0, None, 3.0]))
 
 
