@@ -134,8 +134,8 @@ class SwingUp(GuardedTrack, _Bar):
     hyperparameters = {
         "ppo": {**_SCALED, "env_wrapper": [_SHORT], "gamma": 0.99},
         "off_policy": {"env_wrapper": [_SHORT]},
-        # Hanging still, h² has no slope: half of the episodes start anywhere. A critic tells what a drift
-        # towards the track's end costs; seconds pass until it is reached.
+        # Hanging still, h² has no slope: half of the episodes start anywhere. The track's end
+        # is seconds away: what drifting there costs is for the critic to tell.
         "shac": {
             "n_steps": 32,
             "learning_rate": 2e-2,
