@@ -93,6 +93,16 @@ def test_it_swings_the_free_bar_up():
     assert score(FREE, play(FREE, learner.policy, fresh_seeds(100)).mean()) > 0.9
 
 
+@pytest.mark.slow
+def test_it_keeps_the_bar_up_on_a_track():
+    """For ten seconds: a policy that drifts drops it at the track's end and stays below .9."""
+    hyper = hyperparameters("shac", TRACK)
+    learner = shac.Learner(TRACK, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
+    while learner.trained < learner.steps:
+        learner.iterate()
+    assert score(TRACK, play(TRACK, learner.policy, fresh_seeds(100)).mean()) > 0.97
+
+
 @pytest.mark.parametrize(
     ("algo", "env_id", "changes", "message"),
     [
