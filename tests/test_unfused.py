@@ -56,7 +56,7 @@ def check_against_fused(env, seeds):
         first = unfused.reset(seed)
         assert np.allclose(unfused.state, env.state, rtol=1e-15, atol=1e-16)
         assert np.allclose(observation, first, rtol=1e-6, atol=1e-7)
-        steps, over = [], False
+        steps, over = [], [False]
         act = by_agent(env.task) if seed % 2 else at_random(env.task, seed)
         for i in range(int(task.limit)):
             action = act(unfused, i)
@@ -69,22 +69,24 @@ def check_against_fused(env, seeds):
             observation, reward, *over, _ = env.step(action)
             seen, own, *ended = unfused.step(action)
             assert over == ended
-            assert own == pytest.approx(reward, rel=1e-9, abs=1e-9)
-            assert np.allclose(observation, seen, rtol=1e-6, atol=1e-6)
-            by_state, by_control = env.scene.jacobian(before, env.control, env.task.dt)
-            # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
-            moved = by_control @ (np.atleast_1d(unfused.control) - np.atleast_1d(env.control))
-            assert np.abs(moved).max() <= 1e-10
-            steps.append((before, env.state, unfused.state, moved, by_state))
+            row = (reward, own, observation, seen, before, env.state, unfused.state)
+            steps.append([np.atleast_1d(x) for x in (*row, env.control, unfused.control)])
             if any(over):
                 break
         assert any(over)
-        starts, ends, own, moved = (np.array(x) for x in list(zip(*steps, strict=True))[:4])
+        columns = (np.array(column) for column in zip(*steps, strict=True))
+        rewards, own_rewards, seen, own_seen, starts, ends, own, controls, own_controls = columns
+        np.testing.assert_allclose(own_rewards, rewards, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(own_seen, seen, rtol=1e-6, atol=1e-6)
+        by_states, by_controls = env.scene.jacobian(starts, controls, env.task.dt)
+        # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
+        moved = np.einsum("nij,nj->ni", by_controls, own_controls - controls)
+        assert np.abs(moved).max(initial=0.0) <= 1e-10
         sizes = np.maximum(np.abs(starts).max(axis=0), np.abs(ends).max(axis=0))
         sizes[sizes == 0.0] = 1.0
         error = np.max(np.abs(own - ends - moved) / sizes, axis=1)
-        condition = [max(1.0, np.linalg.norm(j / sizes[:, None] * sizes, np.inf)) for *_, j in steps]
-        assert np.max(error / condition) <= 1e-15
+        condition = np.linalg.norm(by_states / sizes[:, None] * sizes, np.inf, axis=(1, 2))
+        assert np.max(error / np.maximum(1.0, condition)) <= 1e-15
 
 
 @pytest.mark.parametrize(
