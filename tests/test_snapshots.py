@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -118,7 +119,8 @@ def test_another_process_goes_on_with_the_same_bits(tmp_path):
         f"env.unwrapped.set_state(pickle.load(open({str(tmp_path / 'snapshot')!r}, 'rb')))\n"
         "sys.stdout.buffer.write(pickle.dumps(t.go_on(env, 40)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    here = Path(__file__).parent
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, cwd=here)
     assert pickle.loads(done.stdout) == go_on(env, 40)
 
 
