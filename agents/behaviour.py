@@ -1,7 +1,7 @@
 """How agents act: when they get there, how far off they end, how fast they cross a line.
 
-``python -m agents.behaviour`` plays the episodes that `docs/agents.md` is about, with the learned policies in
-``leaderboard/submissions`` and with the quick controllers, and writes ``agents/results/behaviour.json``, from
+``python -m agents.behaviour`` plays the episodes that `docs/agents.md` is about, with the quick controllers
+and with our learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, from
 which ``python -m agents.results --redraw`` makes that page's tables of it.
 """
 
@@ -11,7 +11,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,10 +23,11 @@ from lag_envs import TASKS
 from lag_envs.controllers import Constant, build
 from lag_envs.evaluation.rollout import Episodes, Rollout, record
 from lag_envs.evaluation.statistics import rounded
+from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.submission import load
 from lag_envs.store import write
 
-SUBMISSIONS, OUTPUT = ROOT / "leaderboard" / "submissions", ROOT / "agents" / "results" / "behaviour.json"
+BOARD, OUTPUT = ROOT / "leaderboard", ROOT / "agents" / "results" / "behaviour.json"
 EPISODES = 1_000
 
 
@@ -60,18 +60,21 @@ def measures(played: Episodes) -> dict[str, float | None]:
     return found | dict(task.behaviour(played))
 
 
-def agents(env_id: str, submissions: Path = SUBMISSIONS) -> Iterator[tuple[str, list[Any]]]:
+def agents(env_id: str) -> Iterator[tuple[str, list[Any]]]:
     """Yield our quick agents of an environment: name, and policies, one for each training seed."""
     task = TASKS[env_id]()
     for name, found in task.controllers.items():
         agent = None if found.plans else build(task, name)  # to plan takes long
         if agent is not None and not isinstance(agent, Constant):  # which shows nothing
             yield name, [agent]
-    for folder in sorted(submissions.glob(f"{env_id}-*")):
-        found = load(folder)
-        if found.kind == "learned" and list(found.authors) == AUTHORS:
-            names = {label(algo): algo for algo in LEARNERS}
-            yield names[found.name], [policy.agent() for _, policy in found.policies]
+    board, names = Board(BOARD), {label(algo): algo for algo in LEARNERS}
+    for entry in sorted(board.read().entries.values(), key=lambda entry: entry.id):
+        ours = entry.env == env_id and entry.kind == "learned" and list(entry.authors) == AUTHORS
+        if ours and entry.state == "verified":
+            yield (
+                names[entry.name],
+                [policy.agent() for _, policy in load(board.submission(entry.id)).policies],
+            )
 
 
 def measured(env_id: str, episodes: int = EPISODES) -> dict[str, dict[str, list[float | None]]]:
