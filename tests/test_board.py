@@ -13,6 +13,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
+from covering import slow
 from fake_submissions import ENV, write
 
 from lag_envs import scores
@@ -636,9 +637,9 @@ def test_a_log_that_is_replaced_while_one_waits(board):
     [
         ("every_step",),
         ("random_moments", "6"),
-        pytest.param(("random_moments", "200"), marks=pytest.mark.slow),
+        slow(("random_moments", "200")),
         ("at_once", "3", "5"),
-        pytest.param(("at_once", "8", "40"), marks=pytest.mark.slow),
+        slow(("at_once", "8", "40")),
         ("finished_at_once", "3", "4"),
     ],
     ids=" ".join,

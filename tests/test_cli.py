@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
 ID = "PivotedBar-v0"
 FREE = pivoted_bar.SwingUpFree.id
+pytestmark = pytest.mark.usefixtures("unregistered")
 
 
 @pytest.fixture
@@ -34,12 +35,6 @@ def window(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     yield pygame
     pygame.display.quit()
-
-
-@pytest.fixture(autouse=True)
-def own_ids_only():
-    gym.registry.pop("BallOnBeam-v0", None)
-    sys.modules.pop("ball_on_beam", None)
 
 
 def told(capsys, *arguments):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from compiled import needs_compiler, on_processor
-from covering import PERFECT, covering, engine
+from covering import PERFECT, covering, engine, slow
 from driven import at_random
 from gymnasium.error import ResetNeeded
 from own_tasks import TASKS as OWN
@@ -71,7 +71,7 @@ def test_it_has_the_bits_of_the_unfused_step(id):
 
 @pytest.mark.parametrize(
     "kind",
-    [*LEARNED, *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS)],
+    [*LEARNED, *(slow(kind) for kind in OTHERS)],
     ids=lambda k: k.__name__,
 )
 def test_so_it_has_on_users_tasks(kind):

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from covering import slow
 from trainings import go, kill_and_interrupt
 
 import lag_envs
@@ -407,7 +408,7 @@ def test_every_setting_that_may_be_drawn_is_one():
     assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
 
 
-@pytest.mark.parametrize("names", [("fast_ppo",), pytest.param(("fast_ppo", "ppo"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("names", [("fast_ppo",), slow(("fast_ppo", "ppo"))])
 def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys):
     file, picture = tmp_path / "race.jsonl", tmp_path / "race.png"
     short = lambda name, env: hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})  # noqa: E731

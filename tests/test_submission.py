@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from covering import slow
 from safetensors.numpy import save
 
 from lag_envs import sb3_policies
@@ -789,9 +790,7 @@ def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
         ("TD3", {"policy_kwargs": {"net_arch": [16, 16]}}),
         ("TQC", {"kind": sb3_policies.TQC, "policy_kwargs": {"net_arch": [16, 16]}}),
         pytest.param("DDPG", {"policy_kwargs": {"net_arch": [16, 16]}}, marks=SLOW),
-        pytest.param(
-            "TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}, marks=pytest.mark.slow
-        ),
+        slow("TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}),
         ("DQN", {"bins": 9, "normalise": True, "policy_kwargs": {"net_arch": [16, 16]}}),
     ],
 )
