@@ -36,18 +36,10 @@ class DeviceEnvs:
 
     Parameters
     ----------
-    task : str or type
-        Id of an environment, or a task's class.
-    num_envs : int
-        Number of environments.
-    device : str or torch.device
-        Where they are.
-    dtype : torch.dtype
-        Type of states, actions and rewards, float64 or float32.
+    task, num_envs, device, dtype, **options
+        See `lag_envs.torch.TorchVectorEnv`.
     load : callable, optional
         Compiles the kernels' text and returns what starts them.
-    **options
-        What ``gym.make_vec`` takes: `autoreset_mode`, `max_episode_steps`, parameters of scene and task.
 
     Attributes
     ----------

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, known, needs, seconds
+from lag_envs.commands.base import OWN, Command, count, declare_date, known, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
@@ -75,9 +74,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         default="wall",
         help="cpu leaves out what other programs take (default: wall)",
     )
-    parser.add_argument(
-        "--date", default=date.today().isoformat(), help="date to note in the file (default: today)"
-    )
+    declare_date(parser, "in the file")
 
 
 def run_bench(args: argparse.Namespace) -> int:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
-from lag_envs.commands.base import OWN, Command, count, needs
+from lag_envs.commands.base import OWN, Command, count, declare_date, needs
 from lag_envs.errors import UserError, hint
 from lag_envs.own_files import is_file
 
@@ -31,9 +30,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
         "--processes", metavar="N", type=count, default=os.cpu_count() or 1,
         help="jobs side by side (default: one per core); timings always run alone",
     )  # fmt: skip
-    parser.add_argument(
-        "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
-    )
+    declare_date(parser, "on the page")
     parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
 
 
