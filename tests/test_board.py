@@ -580,7 +580,7 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
     id = add(board)
     assert board.read().entry(id).added > "2199-01-01" and board.read().nonce(board.read().entry(id)) is None
     board.log.write_bytes(chained(event | {"at": "2199-12-31T23:59:59.999999+00:00"}))
-    with pytest.raises(BoardError, match=r"this cannot be noted: .* before the year 2200"):
+    with pytest.raises(BoardError, match=r"this cannot be logged: .* before the year 2200"):
         add(board, "TQC")
 
 
@@ -801,7 +801,7 @@ def test_only_plain_files_are_opened(board, place, what):
         uses += [partial(board.withdraw, id, "x"), partial(add, board, "TQC"), partial(board.publish, "m")]
     for use in uses:
         with pytest.raises(
-            BoardError, match=r"it is no plain file.*restore it|cannot be read: Is a directory"
+            BoardError, match=r"it is not a plain file.*restore it|cannot be read: Is a directory"
         ):
             use()
 

@@ -359,5 +359,5 @@ def test_the_adaptive_controller_finds_the_bar():
 def test_the_adaptive_controller_needs_something_to_adapt_to():
     with pytest.raises(ValueError, match="com_distance is drawn"):
         AdaptiveEnergyShapingLQR(make_task("PivotedBar-v0"))
-    with pytest.raises(ValueError, match="late by whole control steps"):
+    with pytest.raises(ValueError, match="late by a whole number of control steps"):
         AdaptiveEnergyShapingLQR(make_task(pivoted_bar.SwingUpUnknown.id, action_delay=0.013))

@@ -429,7 +429,7 @@ REFUSED = [
     ({"randomize": {"damping": (2, 0.5)}}, "low must be below high"),
     ({"randomize": {"damping": (math.nan, 2)}}, "must be finite, got nan"),
     ({"randomize": {"damping": ("a", 2)}}, "must be a real number, got 'a'"),
-    ({"randomize": {"damping": (0.5, 2, "lag")}}, "may stand .*got 'lag'"),
+    ({"randomize": {"damping": (0.5, 2, "lag")}}, "may come .*got 'lag'"),
     ({"randomize": {"damping": (0.5, 2, "log", "uniform")}}, "one excludes the other"),
     ({"randomize": {"damping": (-1, 2)}}, "factors must be at least 0, got -1"),
     ({"randomize": {"damping": (0, 2, "log")}}, "must be above 0, got 0 to 2"),

@@ -205,7 +205,7 @@ def test_bad_input():
         (lambda: on_processor(imperfect, 2), f"{imperfect} cannot be on a GPU: .* take the id without them"),
         (lambda: on_processor(BAR.id, 2, action_delay=0.02), "leave these keywords out"),
         (lambda: on_processor(BAR, 2, damping=[0.0, 0.1]), "give damping one value"),
-        (lambda: on_processor("Pendulum-v1", 2), "no environment of this package"),
+        (lambda: on_processor("Pendulum-v1", 2), "not an environment of this package"),
         (lambda: on_processor(BAR, 2, diagnostics=True), "neither render_mode nor diagnostics"),
         (lambda: on_processor(BAR, 0), "num_envs must be a whole number of at least 1"),
         (lambda: on_processor(BAR, 2, dtype=torch.float16), "dtype must be torch.float32 or torch.float64"),
@@ -300,7 +300,7 @@ def test_without_a_gpu(capsys):
     for given, message in (
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
         (["--device", "gpu"], "--device: Expected one of cpu, cuda"),
-        (["--device", "cuda", "--cold"], "--device takes no other options than"),
+        (["--device", "cuda", "--cold"], "--device goes only with"),
     ):
         assert cli.main(["bench", *given]) == 2
         assert message in capsys.readouterr().err

@@ -157,7 +157,7 @@ def test_what_is_neither_an_id_nor_a_file(command, capsys, tmp_path):
 
 def test_places_that_are_no_python_file(capsys, tmp_path):
     (tmp_path / "notes.txt").write_text("x")
-    assert "is no Python file" in told(capsys, "info", str(tmp_path / "notes.txt"))
+    assert "is not a Python file" in told(capsys, "info", str(tmp_path / "notes.txt"))
     assert "is a folder" in told(capsys, "info", str(tmp_path))
 
 

@@ -351,7 +351,7 @@ def test_five_seeds_are_a_submission(tmp_path):
     np.testing.assert_array_equal(ours.predict(seen)[0], theirs.predict(seen)[0])
     # A file alone does not tell how long it was trained.
     file = tmp_path / "runs" / ENV / ppo.NAME / "seed2" / MODEL
-    with pytest.raises(ExportError, match="not known how long it was trained; --env-steps tells"):
+    with pytest.raises(ExportError, match="not known how long it was trained; give --env-steps"):
         export(find([file]), tmp_path / "other", authors=["A"], license="MIT", env=ENV, seconds=1.0)
 
 
@@ -396,7 +396,8 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     assert output.splitlines()[-5].split()[0] == str(best["number"])  # the row below the head
     given[6] = "512"
     assert (
-        tune.main(given) == 2 and "is of a search with steps 256; choose another" in capsys.readouterr().err
+        tune.main(given) == 2
+        and "belongs to a search with steps 256; choose another" in capsys.readouterr().err
     )
     file.write_text("{}")
     assert tune.main(given) == 2 and "cannot be read" in capsys.readouterr().err

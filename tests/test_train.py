@@ -444,7 +444,7 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
         ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
-        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn numbers the actions of one control"),
+        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn needs a single control with discrete actions"),
     ],
 )
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):

@@ -79,7 +79,7 @@ class DeviceEnvs:
             else LagrangianVectorEnv(task, 1, **options)
         )
         if not isinstance(sample, LagrangianVectorEnv):
-            raise ValueError(f"{name} cannot be on a GPU: it is no environment of this package")
+            raise ValueError(f"{name} cannot be on a GPU: it is not an environment of this package")
         #: One environment on the CPU, which knows task, spaces and modes.
         self.sample: LagrangianVectorEnv = sample
         if sample.render_mode or sample.diagnostics:

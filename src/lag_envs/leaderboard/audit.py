@@ -463,7 +463,7 @@ def audit(
     pin : Path, optional
         What to hold the log against; by default the release's own, if it is of this board.
     everything : bool
-        Whether to verify every result anew, as a whole, and to compare all submissions with each other. By
+        Whether to verify every result again, as a whole, and to compare all submissions with each other. By
         default `SAMPLE` episodes of each policy are played again, and those that were recorded.
     tell : callable
         Told each finding.
@@ -569,7 +569,7 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
 
 
 def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
-    """Verify every result anew, compare all submissions, and play the references."""
+    """Verify every result again, compare all submissions, and play the references."""
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import verify
 

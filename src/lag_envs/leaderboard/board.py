@@ -119,7 +119,7 @@ class Board:
         try:
             return unpacked(content)
         except ValueError as error:
-            raise BoardError(f"{path} is no result: {error}; verify {entry.id} anew") from None
+            raise BoardError(f"{path} is not a result: {error}; verify {entry.id} again") from None
 
     def result_file(self, entry: Entry) -> Path:
         """Return the place of a submission's result under a protocol."""
