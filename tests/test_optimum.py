@@ -230,7 +230,7 @@ def test_unusable_cache_is_an_error(small, tmp_path):
     for name, content, message in (
         (PROGRESS, progress[:30], "JSONDecodeError"),
         (PROGRESS, progress.replace('"steps": 20', '"steps": 19'), "belongs to another problem"),
-        (PROGRESS, progress.replace('"done": 0', '"done": 77'), "done=77 is no step"),
+        (PROGRESS, progress.replace('"done": 0', '"done": 77'), "done=77 is not a step"),
         (VALUES, values[:-1000], "mmap"),
         (VALUES, values[:10_000], ""),
         (VALUES, b"no array", ""),

@@ -548,7 +548,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
                     if not _same_episode(told, made[told["reset_seed"]])
                 ][tolerated:]
         results += 1
-        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} anew" for what in odd]
+        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} again" for what in odd]
     finding.told = f"{played} episodes of {results} results were played again"
     return finding
 
@@ -584,7 +584,7 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
         except (Refused, ValueError) as error:
             finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
             continue
-        finding.wrong += [f"{where} differs in {what}; verify {entry.id} anew" for what in compared.far]
+        finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
         same, bits = same + (not compared.far), bits + compared.same
     finding.told = f"{same} results are what the submissions get, {bits} of them to the bit"
     for what in (*_links(board, found), *_references(found)):

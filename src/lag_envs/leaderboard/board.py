@@ -346,7 +346,7 @@ def current(state: State, what: str) -> Protocol:
     if odd := [name for name, rule in protocol.rules().items() if rule != frozen[name]]:
         raise BoardError(
             f"this version of lag_envs cannot {what} a board of protocol {state.number}: {odd[0]} differ; "
-            "`lag-envs leaderboard open` begins the next protocol, under which all is verified anew"
+            "`lag-envs leaderboard open` begins the next protocol, under which all is verified again"
         )
     return found
 
