@@ -76,7 +76,7 @@ class Learner:
         task = trainable(env_id)
         formulas = task.formulas
         if formulas.choices:
-            raise UserError(f"{NAME} learns actions that are numbers, {env_id} has choices; try fast_ppo")
+            raise UserError(f"{NAME} learns continuous actions, and {env_id} has discrete ones; try fast_ppo")
         self.expert = expert(task, settings.controller)
         self.envs: Any = gym.make_vec(env_id, settings.n_envs, autoreset_mode="SameStep")
         first = 1_000_000 * seed % FIRST_FRESH_SEED  # another seed has other episodes from first to last

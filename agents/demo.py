@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--output", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
     )
-    p.add_argument("--new", action="store_true", help="start anew, overwriting the run in the output folder")
+    p.add_argument("--new", action="store_true", help="start over, overwriting the run in the output folder")
     p.add_argument("--no-video", action="store_true", help="make no video")
     return p
 

@@ -181,7 +181,9 @@ def make_envs(run: Run) -> Any:
     if steps == math.inf:
         raise UserError(f"the episodes of {run.env} have no end; give it a duration, or a TimeLimit to train")
     if bins and (task.formulas.choices or task.formulas.actions > 1):
-        raise UserError(f"{run.algo} numbers the actions of one control, {run.env} has others; try ppo")
+        raise UserError(
+            f"{run.algo} needs a single control with discrete actions, which {run.env} does not have; try ppo"
+        )
     envs = make_vec_env(run.env, int(hyper.get("n_envs", 1)), stagger=int(steps), **options)
     envs = VecMonitor(envs if bins is None else DiscreteActions(envs, bins))
     envs = envs if factor is None else ScaledReward(envs, factor)
@@ -215,11 +217,11 @@ def make_model(run: Run, envs: Any) -> Any:
         try:
             arguments["policy"] = getattr(import_module(module), name)
         except (ImportError, AttributeError, ValueError) as error:
-            raise UserError(f"policy must be a name of {run.algo}'s or of a class, {error}") from error
+            raise UserError(f"policy must be one of {run.algo}'s names or a class: {error}") from error
     noise = run.hyperparameters.get("noise_type")
     if noise not in (None, "normal"):
         raise UserError(
-            f"noise_type must be normal, got {noise!r}: others have a memory, and are not resumed"
+            f"noise_type must be normal, got {noise!r}: other noise has a memory, which resuming would lose"
         )
     if noise:
         sigma = np.full(envs.action_space.shape, float(run.hyperparameters["noise_std"]))

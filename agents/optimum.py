@@ -371,7 +371,7 @@ def compute(env_id: str, folder: Path, *, quick: bool = False, new: bool = False
     """Solve what an environment needs, and return its numbers."""
     own = TASKS[env_id].value_iteration
     if own is None:
-        raise UserError(f"{env_id} has no grid to be solved on; its task may have a value_iteration")
+        raise UserError(f"{env_id} has no grid to solve on; give its task a value_iteration")
     source = own.relaxed or env_id
     problem = solvable()[source]
     levels = [problem.levels[0] / 2, problem.levels[0]] if quick else list(problem.levels)
@@ -539,7 +539,7 @@ def parser() -> argparse.ArgumentParser:
         default=DEFAULT_FOLDER,
         help="where value functions are kept (default %(default)s)",
     )
-    p.add_argument("--new", action="store_true", help="compute anew what is kept there")
+    p.add_argument("--new", action="store_true", help="compute again what is kept there")
     return p
 
 

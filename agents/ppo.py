@@ -403,7 +403,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--first-seed", type=int, default=0, metavar="K", help="the first one (default 0)")
     p.add_argument("--steps", type=int, metavar="N", help="environment steps per seed (default n_timesteps)")
     p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default runs/")
-    p.add_argument("--new", action="store_true", help="start anew, overwriting what these seeds have left")
+    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     group = p.add_argument_group("settings, of which each task has its own")
     for name in OPTIONS:
         field = Settings.model_fields[name]

@@ -58,8 +58,8 @@ def parser() -> argparse.ArgumentParser:
         "--output", type=Path, metavar="FOLDER", help="default: this checkout; with --quick, RUNS/quick"
     )
     p.add_argument("--episodes", type=int, metavar="N", help=f"under each condition (default {EPISODES})")
-    p.add_argument("--changed", type=int, metavar="N", help="at most so many where something is changed")
-    p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether all works")
+    p.add_argument("--changed", type=int, metavar="N", help="at most N where something is changed")
+    p.add_argument("--quick", action="store_true", help=f"{QUICK} episodes, to see whether everything works")
     p.add_argument("--new", action="store_true", help="forget what the summary has of other agents")
     p.add_argument("--redraw", action="store_true", help="measure nothing: figures and page from the summary")
     return p

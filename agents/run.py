@@ -141,7 +141,9 @@ class Run:
                     both = {**value, **(found.get(name) or {})}
                     other = [k for k in both if value.get(k) != (found.get(name) or {}).get(k)]
                     what = f"other hyperparameters ({', '.join(map(str, other))})"
-                raise UserError(f"{file} is of a run with {what}; --new starts over, --output goes elsewhere")
+                raise UserError(
+                    f"{file} belongs to a run with {what}; --new starts over, --output goes elsewhere"
+                )
 
     def foreign(self) -> bool:
         """Tell whether the folder holds files that are not the run's."""
@@ -169,11 +171,11 @@ def read_result(file: Path) -> dict[str, Any]:
         if not isinstance(content, dict) or content.get("schema") != SCHEMA:
             raise ValueError("it was not written by this version")
         if not isinstance(content["evaluation"]["returns"], list):
-            raise ValueError("its returns are no list")
+            raise ValueError("its returns are not a list")
         for name in ("trained", "wall_seconds", "mean_return", "score", "curve", "seed"):
             content[name]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{file} cannot be read ({error}); remove it, or start anew with --new") from error
+        raise UserError(f"{file} cannot be read ({error}); remove it, or start over with --new") from error
     return content
 
 

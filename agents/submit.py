@@ -167,7 +167,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--optimum", type=Path, default=DEFAULT_FOLDER, metavar="FOLDER", help="default %(default)s"
     )
-    p.add_argument("--new", action="store_true", help="make anew what is there")
+    p.add_argument("--new", action="store_true", help="make again what is there")
     return p
 
 

@@ -96,7 +96,7 @@ def parser() -> argparse.ArgumentParser:
         "--config", type=Path, metavar="FILE", help="other hyperparameters, a YAML file of the Zoo"
     )
     p.add_argument("--output", type=Path, default=Path("runs"), metavar="FOLDER", help="default %(default)s")
-    p.add_argument("--new", action="store_true", help="start anew, overwriting what these seeds have left")
+    p.add_argument("--new", action="store_true", help="start over, overwriting what these seeds have left")
     p.add_argument(
         "--ray",
         metavar="ADDRESS",
@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def plan(args: argparse.Namespace, changed: Mapping[str, Any] = MappingProxyType({})) -> list[Run]:
     """Return the runs that are asked for, with some hyperparameters changed; or raise a UserError."""
     if "all" in args.env and len(args.env) > 1:
-        raise UserError(f"all stands alone, got {' '.join(args.env)}")
+        raise UserError(f"all must stand alone, got {' '.join(args.env)}")
     given = list(TASKS) if args.env == ["all"] else list(dict.fromkeys(args.env))
     sources = {own_env(name): "" if name in TASKS else name for name in given}
     if args.ray and any(map(is_file, given)):

@@ -159,7 +159,7 @@ def read(file: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
     if different:
         own = "other settings of the task"
         what = ", ".join(own if name == "changed_from" else f"{name} {data[name]!r}" for name in different)
-        raise UserError(f"{file} is of a search with {what}; choose another --output")
+        raise UserError(f"{file} belongs to a search with {what}; choose another --output")
     return data
 
 

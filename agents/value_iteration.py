@@ -71,7 +71,7 @@ class Grid:
             )
         for j, (axis, period) in enumerate(zip(self.axes, self.periods, strict=True)):
             if len(axis) < 2 or not (np.diff(axis) > 0.0).all():
-                raise ValueError(f"the nodes of axis {j} must be two or more and grow, got {axis}")
+                raise ValueError(f"axis {j} needs at least two nodes, in increasing order, got {axis}")
             if period is not None and not np.isclose(axis[-1] - axis[0], period, rtol=1e-12):
                 raise ValueError(
                     f"axis {j} has the period {period:g}: its last node must lie that far from its first, "
@@ -440,14 +440,14 @@ class Cache:
             if found != self.parameters:
                 raise ValueError("it belongs to another problem")
             if not isinstance(self.done, int) or not 0 <= self.done < shape[0]:
-                raise ValueError(f"done={self.done!r} is no step of the episode")
+                raise ValueError(f"done={self.done!r} is not a step of the episode")
             # Opened to be written, a file that is too short would be made longer.
             kept = np.lib.format.open_memmap(self.folder / VALUES, mode="r")
             if kept.shape != shape or kept.dtype != np.float32:
                 raise ValueError(f"{VALUES} holds {kept.dtype} of shape {kept.shape}")
             self.values = np.lib.format.open_memmap(self.folder / VALUES, mode="r+")
             if zlib.crc32(self.values[self.done]) != check:
-                raise ValueError(f"the check sum of step {self.done} is wrong")
+                raise ValueError(f"the checksum of step {self.done} is wrong")
         except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
             reason = f"{type(error).__name__}: {error}"
             raise CacheError(

@@ -1,12 +1,27 @@
-"""Options of the test command."""
+"""Options of the test command, and fixtures that several files use."""
 
 import signal
+import sys
 
+import gymnasium as gym
 import pytest
 from browsers import browser, browsing  # noqa: F401 (fixtures)
 
 # A shell that starts the tests in the background makes them, and all that they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def unregistered():
+    """Leave nothing of the example, before and after, so that whoever imports it next has it registered."""
+
+    def forget():
+        gym.registry.pop("BallOnBeam-v0", None)
+        sys.modules.pop("ball_on_beam", None)
+
+    forget()
+    yield
+    forget()
 
 
 def pytest_addoption(parser):

@@ -30,6 +30,11 @@ Features = Callable[[type[Task]], frozenset[str]]
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
 
+def slow(*values: Any) -> Any:
+    """Mark a case of a parametrised test as slow."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 @cache
 def features(kind: type[Task]) -> frozenset[str]:
     """Return what code depends on in a task's record, in words."""
@@ -74,4 +79,4 @@ def covering(ids: Iterable[str] = TASKS, of: Features = features) -> list[Any]:
     """Return all ids for the parameters of a test, those outside their covering set marked slow."""
     every = list(ids)
     chosen = quick(every, of)
-    return [pytest.param(i, marks=() if i in chosen else pytest.mark.slow) for i in every]
+    return [i if i in chosen else slow(i) for i in every]

@@ -171,7 +171,7 @@ def test_demo_trains_compares_and_shows(demonstrate, tmp_path):
     assert status == 0 and "switching line" in output and not (folder / "episode.mp4").exists()
     assert (folder / "model.zip").stat().st_mtime_ns == before
     status, output = demonstrate("--env", incline.Brake.id, "--seed", "5", "--steps", "5000")
-    assert status == 2 and "is of a run with seed 0, not 5; --new starts over" in output
+    assert status == 2 and "belongs to a run with seed 0, not 5; --new starts over" in output
 
 
 @pytest.mark.parametrize(

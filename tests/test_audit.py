@@ -226,7 +226,7 @@ def test_part_of_a_result_is_edited(board, change, check, monkeypatch):
     shutil.rmtree(board.folder.parent / ".git")
     assert bool(refused(board)) == (check == "cheap")
     if check == "cheap":
-        assert "line 10: " in refused(board) and ("restore it" in refused(board) or "anew" in refused(board))
+        assert "line 10: " in refused(board) and ("restore it" in refused(board) or "again" in refused(board))
     found = wrong(board, everything=check == "all")
     assert [name for name in found if name not in ("nonces",)] == [
         "results" if check == "cheap" else "scores"

@@ -116,8 +116,8 @@ def test_info_certifies_the_substeps(capsys):
         (["bench", "--checkout", ".", "--quick"], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--checkout", ".", incline.Tilt.id], "leave out IDs, --quick, --cold, --sizes"),
         (["bench", "--threads", "0"], "a whole number of at least 1 is needed, got '0'"),
-        (["bench", "--threads", "10000"], "--threads 10000 needs as many cores, and this process may use"),
-        (["bench", "--checkout", "nowhere"], "nowhere/README.md is not there"),
+        (["bench", "--threads", "10000"], "--threads 10000 needs as many cores; this process may use"),
+        (["bench", "--checkout", "nowhere"], "nowhere/README.md is missing"),
         (["fly"], "invalid choice: 'fly'"),
     ],
 )

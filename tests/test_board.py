@@ -13,6 +13,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
+from covering import slow
 from fake_submissions import ENV, write
 
 from lag_envs import scores
@@ -579,7 +580,7 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
     id = add(board)
     assert board.read().entry(id).added > "2199-01-01" and board.read().nonce(board.read().entry(id)) is None
     board.log.write_bytes(chained(event | {"at": "2199-12-31T23:59:59.999999+00:00"}))
-    with pytest.raises(BoardError, match=r"this cannot be noted: .* before the year 2200"):
+    with pytest.raises(BoardError, match=r"this cannot be logged: .* before the year 2200"):
         add(board, "TQC")
 
 
@@ -636,9 +637,9 @@ def test_a_log_that_is_replaced_while_one_waits(board):
     [
         ("every_step",),
         ("random_moments", "6"),
-        pytest.param(("random_moments", "200"), marks=pytest.mark.slow),
+        slow(("random_moments", "200")),
         ("at_once", "3", "5"),
-        pytest.param(("at_once", "8", "40"), marks=pytest.mark.slow),
+        slow(("at_once", "8", "40")),
         ("finished_at_once", "3", "4"),
     ],
     ids=" ".join,
@@ -800,7 +801,7 @@ def test_only_plain_files_are_opened(board, place, what):
         uses += [partial(board.withdraw, id, "x"), partial(add, board, "TQC"), partial(board.publish, "m")]
     for use in uses:
         with pytest.raises(
-            BoardError, match=r"it is no plain file.*restore it|cannot be read: Is a directory"
+            BoardError, match=r"it is not a plain file.*restore it|cannot be read: Is a directory"
         ):
             use()
 

@@ -7,6 +7,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import slow
 
 from agents import optimum, plans
 from lag_envs.controllers import build, make_controller
@@ -17,11 +18,6 @@ from lag_envs.controllers.mpc import MPC, without_kicks
 from lag_envs.controllers.tracking import Tracking, follow, recorded, search
 from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.tasks import chain, pivoted_bar
-
-
-def slow(*values):
-    return pytest.param(*values, marks=pytest.mark.slow)
-
 
 # They share their formulas; each has programs of its own, which compile for seconds.
 SWING_UPS = (chain.SwingUp, slow(chain.SwingUpWeak), slow(chain.SwingUpTriple))

@@ -25,6 +25,7 @@ ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
 ID = "PivotedBar-v0"
 FREE = pivoted_bar.SwingUpFree.id
+pytestmark = pytest.mark.usefixtures("unregistered")
 
 
 @pytest.fixture
@@ -34,12 +35,6 @@ def window(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     yield pygame
     pygame.display.quit()
-
-
-@pytest.fixture(autouse=True)
-def own_ids_only():
-    gym.registry.pop("BallOnBeam-v0", None)
-    sys.modules.pop("ball_on_beam", None)
 
 
 def told(capsys, *arguments):
@@ -151,13 +146,13 @@ def test_watch_takes_agents_by_name_and_by_file(tmp_path):
     assert watch.load(task.id, task, entries[-1].id, board)[0] == entries[-1].id
     for name, message in (
         ("pppo", "has no agent 'pppo', and there is no such file; did you mean PPO?"),
-        (str(tmp_path), "is no model, nor a folder with model.zip"),
+        (str(tmp_path), "is neither a model nor a folder with model.zip"),
         (str(board / "submissions" / "PivotedBar-v0-ppo-c1dc3900"), "an agent of PivotedBar-v0, not of Piv"),
     ):
         with pytest.raises(UserError, match=re.escape(message)):
             watch.load(task.id, task, name)
     (tmp_path / "broken.zip").write_bytes(b"PK")
-    with pytest.raises(UserError, match="is no model of Stable-Baselines3"):
+    with pytest.raises(UserError, match="is not a model of Stable-Baselines3"):
         watch.load(task.id, task, str(tmp_path / "broken.zip"))
 
 
@@ -213,7 +208,7 @@ def test_watch_writes_a_video(name, tmp_path, capsys):
 
 def test_watch_says_what_is_wrong(capsys, tmp_path, monkeypatch):
     assert "end with .mp4 or .gif, got a.avi" in told(capsys, "watch", ID, "--video", "a.avi")
-    assert "there is no folder for" in told(capsys, "watch", ID, "--video", str(tmp_path / "no" / "a.gif"))
+    assert "the folder of" in told(capsys, "watch", ID, "--video", str(tmp_path / "no" / "a.gif"))
     assert "--seed must be at least 0, got -1" in told(capsys, "watch", ID, "--seed", "-1")
     assert "did you mean" in told(capsys, "watch", "PivotedBra-v0")
     assert "show_trail must lie between 0 and 60 s" in told(capsys, "watch", ID, "--trail", "100")
@@ -320,14 +315,14 @@ def test_new_writes_what_runs(name, elsewhere, capsys):
 
 def test_new_says_what_is_wrong(elsewhere, capsys):
     (elsewhere / "there.py").write_text("mine")
-    assert "there.py is there already" in told(capsys, "new", "there.py")
+    assert "there.py already exists" in told(capsys, "new", "there.py")
     assert (elsewhere / "there.py").read_text() == "mine"
     assert "must end with .py, as in swing.py" in told(capsys, "new", "swing")
     assert "one that Python can import" in told(capsys, "new", "my-scene.py")
     assert "one that Python can import" in told(capsys, "new", "class.py")
     assert "there is no folder" in told(capsys, "new", "no/my_scene.py")
     (elsewhere / "folder.py").mkdir()
-    assert "is there already" in told(capsys, "new", "folder.py")
+    assert "already exists" in told(capsys, "new", "folder.py")
 
 
 # --- completion ---

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import quick
+from covering import quick, slow
 from rollouts import SINGLE
 
 from agents import tune
@@ -34,10 +34,6 @@ SEED = 1_000_000_000
 BAR, FREE, BALANCE = "PivotedBar-v0", pivoted_bar.SwingUpFree.id, pivoted_bar.Balance.id
 INCLINE, BRAKE = incline.Tilt.id, incline.Brake.id
 SHELL, PUMP, DAMPING = (getattr(cylinder_in_cylinder, name).id for name in ("Tilt", "Pump", "Damping"))
-
-
-def slow(*values):
-    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 # --- what they reach: mean returns over 1,000 episodes, as the agents' results have them ---
@@ -363,5 +359,5 @@ def test_the_adaptive_controller_finds_the_bar():
 def test_the_adaptive_controller_needs_something_to_adapt_to():
     with pytest.raises(ValueError, match="com_distance is drawn"):
         AdaptiveEnergyShapingLQR(make_task("PivotedBar-v0"))
-    with pytest.raises(ValueError, match="late by whole control steps"):
+    with pytest.raises(ValueError, match="late by a whole number of control steps"):
         AdaptiveEnergyShapingLQR(make_task(pivoted_bar.SwingUpUnknown.id, action_delay=0.013))

@@ -579,7 +579,7 @@ def two_controls_of_one_coordinate():
     return Bad
 
 
-@mistake("", "'motor'", "reaches nothing", "u.motor")
+@mistake("", "'motor'", "has no effect", "u.motor")
 def control_that_is_not_used():
     class Bad(Good):
         controls = {"force": "N", "motor": "N"}

@@ -9,6 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 import sympy
+from covering import slow
 
 from lag_envs.mechanics.algebra import evaluate
 from lag_envs.mechanics.equations import place, velocity
@@ -40,7 +41,7 @@ SLOW = [(Chain, {"bars": n}) for n in (4, 5, 6)]
 IDS = ["-".join([s.__name__, *(f"{v}" for v in k.values())]) for s, k in [*CASES, *SLOW]]
 scenes = pytest.mark.parametrize(
     "case",
-    [*CASES, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)],
+    [*CASES, *(slow(case) for case in SLOW)],
     ids=IDS,
 )
 
@@ -261,9 +262,7 @@ def test_held_rate_carries_what_stays_continuous():
 STEPPED = [(CartPole, {}), (contract_scenes.RotatingFrame, {}), (contract_scenes.ElasticPendulum, {})]
 
 
-@pytest.mark.parametrize(
-    "case", [*STEPPED, *(pytest.param(case, marks=pytest.mark.slow) for case in CASES if case not in STEPPED)]
-)
+@pytest.mark.parametrize("case", [*STEPPED, *(slow(case) for case in CASES if case not in STEPPED)])
 def test_energy_balance_of_a_step(case):
     """The change of energy over a step by the general series is the work done in it, by quadrature."""
     scene = complete(case)

@@ -64,9 +64,9 @@ def test_an_episode_that_begins_is_believed_anew():
     [
         ({}, "needs a task with noise on every entry of the observation"),
         ({"observation_noise": {"cos(theta)": 0.01}}, "noise on every entry"),
-        ({"observation_noise": 0.01, "action_delay": 0.02}, "neither late nor rare"),
-        ({"observation_noise": 0.01, "observation_every": 2}, "neither late nor rare"),
-        ({"observation_noise": 0.01, "randomize": {"damping": (0.5, 2.0)}}, "for known parameters"),
+        ({"observation_noise": 0.01, "action_delay": 0.02}, "every observation on time"),
+        ({"observation_noise": 0.01, "observation_every": 2}, "every observation on time"),
+        ({"observation_noise": 0.01, "randomize": {"damping": (0.5, 2.0)}}, "needs known parameters"),
     ],
 )
 def test_a_filter_is_refused_where_it_would_be_wrong(options, message):

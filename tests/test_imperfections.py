@@ -13,7 +13,9 @@ import pytest
 
 import lag_envs
 from lag_envs import replay
-from lag_envs.envs.imperfect import PURPOSES, numbers_of, program_of
+from lag_envs.envs.imperfect.draws import PURPOSES
+from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import Program, constants_of
 from lag_envs.envs.unfused import Unfused
 from lag_envs.envs.vector import LagrangianVectorEnv
@@ -150,7 +152,7 @@ def test_what_is_off_leaves_everything_as_it_is():
 
 def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch):
     # Not a line of their own is left: no row, no constant, no key.
-    import lag_envs.envs.program as module
+    import lag_envs.envs.lines as module
 
     printed: list[str] = []
     monkeypatch.setattr(module, "compile_function", lambda name, source, *rest: printed.append(source))
@@ -427,7 +429,7 @@ REFUSED = [
     ({"randomize": {"damping": (2, 0.5)}}, "low must be below high"),
     ({"randomize": {"damping": (math.nan, 2)}}, "must be finite, got nan"),
     ({"randomize": {"damping": ("a", 2)}}, "must be a real number, got 'a'"),
-    ({"randomize": {"damping": (0.5, 2, "lag")}}, "may stand .*got 'lag'"),
+    ({"randomize": {"damping": (0.5, 2, "lag")}}, "may come .*got 'lag'"),
     ({"randomize": {"damping": (0.5, 2, "log", "uniform")}}, "one excludes the other"),
     ({"randomize": {"damping": (-1, 2)}}, "factors must be at least 0, got -1"),
     ({"randomize": {"damping": (0, 2, "log")}}, "must be above 0, got 0 to 2"),

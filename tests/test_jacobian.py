@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import sympy
 from contract_scenes import ChargedParticle, RotatingHoop, Trolley
+from covering import slow
 from mpmath.libmp import to_rational
 from reference import flow, random_cases
 
@@ -51,9 +52,7 @@ def exact_step(scene, state, control, dt, moved=None):
 FAST = ("cart_pole", "turning plane", "turning shell")
 
 
-@pytest.mark.parametrize(
-    "case", [case if case in FAST else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
-)
+@pytest.mark.parametrize("case", [case if case in FAST else slow(case) for case in CASES])
 def test_jacobian_is_the_derivative(case):
     scene, state, control, dt = CASES[case]
     a, b = scene.jacobian(state, control, dt) if control else scene.jacobian(state, dt=dt)
@@ -93,7 +92,7 @@ def oracle(case):
         ("task", 3),
         ("damped", 3),
         ("stiff", 4),
-        *(pytest.param(kind, 40, marks=pytest.mark.slow) for kind in ("damped", "stiff")),
+        *(slow(kind, 40) for kind in ("damped", "stiff")),
     ],
 )
 def test_exact_flows(kind, n):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from compiled import needs_compiler, on_processor
-from covering import PERFECT, covering, engine
+from covering import PERFECT, covering, engine, slow
 from driven import at_random
 from gymnasium.error import ResetNeeded
 from own_tasks import TASKS as OWN
@@ -71,7 +71,7 @@ def test_it_has_the_bits_of_the_unfused_step(id):
 
 @pytest.mark.parametrize(
     "kind",
-    [*LEARNED, *(pytest.param(kind, marks=pytest.mark.slow) for kind in OTHERS)],
+    [*LEARNED, *(slow(kind) for kind in OTHERS)],
     ids=lambda k: k.__name__,
 )
 def test_so_it_has_on_users_tasks(kind):
@@ -205,7 +205,7 @@ def test_bad_input():
         (lambda: on_processor(imperfect, 2), f"{imperfect} cannot be on a GPU: .* take the id without them"),
         (lambda: on_processor(BAR.id, 2, action_delay=0.02), "leave these keywords out"),
         (lambda: on_processor(BAR, 2, damping=[0.0, 0.1]), "give damping one value"),
-        (lambda: on_processor("Pendulum-v1", 2), "no environment of this package"),
+        (lambda: on_processor("Pendulum-v1", 2), "not an environment of this package"),
         (lambda: on_processor(BAR, 2, diagnostics=True), "neither render_mode nor diagnostics"),
         (lambda: on_processor(BAR, 0), "num_envs must be a whole number of at least 1"),
         (lambda: on_processor(BAR, 2, dtype=torch.float16), "dtype must be torch.float32 or torch.float64"),
@@ -300,7 +300,7 @@ def test_without_a_gpu(capsys):
     for given, message in (
         (["--device", "cuda"], "--device: there is no device 'cuda' here"),
         (["--device", "gpu"], "--device: Expected one of cpu, cuda"),
-        (["--device", "cuda", "--cold"], "--device takes no other options than"),
+        (["--device", "cuda", "--cold"], "--device goes only with"),
     ):
         assert cli.main(["bench", *given]) == 2
         assert message in capsys.readouterr().err

@@ -15,6 +15,7 @@ import numpy as np
 import own_tasks
 import pytest
 from contract_scenes import Functions, Trolley
+from covering import slow
 from test_imperfections import played
 from test_series import advance_in_python, in_python
 
@@ -235,9 +236,7 @@ def in_pieces(scene, state, applied, command, lag, dt, pieces):
             *(Functions(), [0.4, 0.3, 0.2, -0.5], [0.5, 1.0], [-0.3, -2.0]),  # a place
             marks=pytest.mark.slow,
         ),
-        pytest.param(
-            *(Chain(bars=2), [0.0, 0.1, 1.0, 2.0, -1.0, 3.0], [3.0], [-5.0]), marks=pytest.mark.slow
-        ),
+        slow(Chain(bars=2), [0.0, 0.1, 1.0, 2.0, -1.0, 3.0], [3.0], [-5.0]),
     ],
     ids=["Trolley", "Functions", "Chain"],
 )
@@ -410,9 +409,7 @@ def test_control_without_lag_is_held():
     )
 
 
-@pytest.mark.parametrize(
-    "name", ["bar", *(pytest.param(name, marks=pytest.mark.slow) for name in CASES if name != "bar")]
-)
+@pytest.mark.parametrize("name", ["bar", *(slow(name) for name in CASES if name != "bar")])
 def test_shortest_and_longest_lag(name):
     case = CASES[name]
     scene, commands = case.scene, [case.command] * 3

@@ -125,7 +125,7 @@ def test_withdraw(run):
     run("add", "a", "--nonce", "n")
     (id,) = ids()
     status, _, err = run("withdraw", id, "--reason", "wrong\x1b[2J numbers")
-    assert status == 2 and "this cannot be noted: withdrawn.reason: it holds the invisible U+001B" in err
+    assert status == 2 and "this cannot be logged: withdrawn.reason: it holds the invisible U+001B" in err
     assert run("withdraw", id, "--reason", "wrong numbers")[0] == 0
     assert f"{id} withdrawn: wrong numbers" in run("list")[1]
     assert run("withdraw", id, "--reason", "x") == (2, "", f"lag-envs: error: {id} was withdrawn before\n")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from lag_envs.generated import replaced
+
 ROOT = Path(__file__).parents[1]
 SPEC = util.spec_from_file_location("run_libraries", ROOT / "tools" / "libraries" / "__main__.py")
 tool = util.module_from_spec(SPEC)
@@ -93,7 +95,8 @@ def test_results_of_all_kinds_are_shown(monkeypatch, home):
 
 def test_the_page_shows_the_results_of_every_library():
     found = json.loads(tool.RESULTS.read_text())
-    assert f"{tool.BEGIN}\n{tool.table(found)}\n{tool.END}" in tool.PAGE.read_text()
+    page = tool.PAGE.read_text()
+    assert replaced(page, "libraries", tool.table(found)) == page
     rows = [(row["key"], row["what"]) for row in found["rows"]]
     assert rows == [(n, run["what"]) for n, library in tool.libraries().items() for run in library["runs"]]
 

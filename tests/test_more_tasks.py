@@ -7,6 +7,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import slow
 from rollouts import actions, make
 
 from lag_envs.controllers import ILQR, build, make_controller
@@ -83,9 +84,7 @@ def best(env_id):
     return known_returns(env_id).best
 
 
-@pytest.mark.parametrize(
-    "env_id", [CartPoleSwingUp.id, pytest.param(CartPoleContinuous.id, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("env_id", [CartPoleSwingUp.id, slow(CartPoleContinuous.id)])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_leaving_does_not_pay(env_id, side):
     assert play(env_id, Constant(side), range(20)).max() < 0.2 * best(env_id)

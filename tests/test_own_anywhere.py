@@ -1,7 +1,6 @@
 """The example of the tutorial in the hands of other libraries: videos, workers, learners, clusters."""
 
 import os
-import sys
 import threading
 from pathlib import Path
 
@@ -19,19 +18,10 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 2, 1)).astype(np.floa
 
 
 @pytest.fixture(autouse=True)
-def example(monkeypatch):
+def example(monkeypatch, unregistered):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     for folder in (Path(__file__).parent, EXAMPLES):  # for processes that are started
         monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-    forget()
-    yield
-    forget()
-
-
-def forget():
-    """Leave nothing of the example, so that whoever imports it next has it registered."""
-    gym.registry.pop("BallOnBeam-v0", None)
-    sys.modules.pop("ball_on_beam", None)
 
 
 def rolled(envs):

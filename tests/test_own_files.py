@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
 #: Two controls, a choice among three, and nothing that acts.
 SEVERAL = str(ROOT / "tests" / "own_tasks.py")
+pytestmark = pytest.mark.usefixtures("unregistered")
 
 SCENE = """
 from lag_envs.scenes import Scene, parameter
@@ -54,13 +55,6 @@ class Pump(Task):
     def reward(self, before, after, control, target, dt, xp):
         return -xp.cos(after.theta)
 """
-
-
-@pytest.fixture(autouse=True)
-def own_ids_only():
-    """Forget what other tests, or pages that are run, have registered of the example."""
-    gym.registry.pop("BallOnBeam-v0", None)
-    sys.modules.pop("ball_on_beam", None)
 
 
 @pytest.fixture
@@ -163,7 +157,7 @@ def test_what_is_neither_an_id_nor_a_file(command, capsys, tmp_path):
 
 def test_places_that_are_no_python_file(capsys, tmp_path):
     (tmp_path / "notes.txt").write_text("x")
-    assert "is no Python file" in told(capsys, "info", str(tmp_path / "notes.txt"))
+    assert "is not a Python file" in told(capsys, "info", str(tmp_path / "notes.txt"))
     assert "is a folder" in told(capsys, "info", str(tmp_path))
 
 

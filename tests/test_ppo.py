@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from covering import slow
 from trainings import go, kill_and_interrupt
 
 import lag_envs
@@ -350,7 +351,7 @@ def test_five_seeds_are_a_submission(tmp_path):
     np.testing.assert_array_equal(ours.predict(seen)[0], theirs.predict(seen)[0])
     # A file alone does not tell how long it was trained.
     file = tmp_path / "runs" / ENV / ppo.NAME / "seed2" / MODEL
-    with pytest.raises(ExportError, match="not known how long it was trained; --env-steps tells"):
+    with pytest.raises(ExportError, match="not known how long it was trained; give --env-steps"):
         export(find([file]), tmp_path / "other", authors=["A"], license="MIT", env=ENV, seconds=1.0)
 
 
@@ -395,7 +396,8 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     assert output.splitlines()[-5].split()[0] == str(best["number"])  # the row below the head
     given[6] = "512"
     assert (
-        tune.main(given) == 2 and "is of a search with steps 256; choose another" in capsys.readouterr().err
+        tune.main(given) == 2
+        and "belongs to a search with steps 256; choose another" in capsys.readouterr().err
     )
     file.write_text("{}")
     assert tune.main(given) == 2 and "cannot be read" in capsys.readouterr().err
@@ -407,7 +409,7 @@ def test_every_setting_that_may_be_drawn_is_one():
     assert tune.drawn(1) == tune.drawn(1) != tune.drawn(2)
 
 
-@pytest.mark.parametrize("names", [("fast_ppo",), pytest.param(("fast_ppo", "ppo"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("names", [("fast_ppo",), slow(("fast_ppo", "ppo"))])
 def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys):
     file, picture = tmp_path / "race.jsonl", tmp_path / "race.png"
     short = lambda name, env: hyperparameters(name, env) | SHORT | ({"n_steps": 8} if name == "ppo" else {})  # noqa: E731

@@ -78,9 +78,9 @@ def altered(field, value):
 @pytest.mark.parametrize(
     "link, told",
     [
-        ("", "no link of a drive"),
-        ("https://example.org/", "no link of a drive"),
-        ("#drive=", "no link of a drive"),
+        ("", "not a link to a drive"),
+        ("https://example.org/", "not a link to a drive"),
+        ("#drive=", "not a link to a drive"),
         ("#drive=1~x", "has 2 fields, not 7"),
         (altered(0, "2"), "version '2'"),
         (altered(1, "PivotedBra-v0"), "did you mean PivotedBar"),
@@ -159,13 +159,13 @@ def test_best_drives_are_recomputed_and_sorted(tmp_path):
 @pytest.mark.parametrize(
     "line, told",
     [
-        ("{link}", "a link, a blank and a name"),
+        ("{link}", "a link, a space and a name"),
         ("{link} " + "x" * 61, "at most 60"),
-        ("{link} Ada\u202e", "a link, a blank and a name"),
-        ("nonsense Ada", "line 1: 'nonsense' is no link"),
+        ("{link} Ada\u202e", "a link, a space and a name"),
+        ("nonsense Ada", "line 1: 'nonsense' is not a link"),
         ("{false} Ada", "line 1: the claim is false"),
         ("{short} Ada", "stops before its episode's end"),
-        ("{link} Ada\n{link} Eve", "line 2: this drive is there already"),
+        ("{link} Ada\n{link} Eve", "line 2: this drive is already listed"),
     ],
 )
 def test_what_is_wrong_with_a_line_is_told(tmp_path, line, told):

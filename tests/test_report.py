@@ -173,10 +173,10 @@ def test_command_line_errors(tmp_path, capsys):
         (["report", str(tmp_path)], "holds other things"),
         (["report", str(tmp_path / "thesis.txt")], "thesis.txt"),
         (["report", "--sections", "stabilty", str(tmp_path / "new")], "did you mean stability?"),
-        (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs takes a whole report"),
+        (["report", "--quick", "--docs", ".", str(tmp_path / "new")], "--docs needs a whole report"),
         (
             ["report", "--sections", "bound", "--docs", ".", str(tmp_path / "new")],
-            "--docs takes a whole report",
+            "--docs needs a whole report",
         ),
     ):
         assert main(arguments) == 2

@@ -112,7 +112,7 @@ def test_it_keeps_the_bar_up_on_a_track():
         ("shac", FREE, {"start_ranges": {"phi": 1.0}}, "has no state 'phi'; it has theta, theta_dot"),
         ("shac", cart_pole.CartPoleExact.id, {}, "shac needs gradients: CartPoleExact has a list of actions"),
         ("shac", pivoted_bar.SwingUpUnknown.id, {}, "needs gradients: SwingUpUnknown has imperfect"),
-        ("cloning", cart_pole.CartPoleExact.id, {}, "has choices; try fast_ppo"),
+        ("cloning", cart_pole.CartPoleExact.id, {}, "has discrete ones; try fast_ppo"),
         ("cloning", FREE, {"controller": "LQG"}, "no controller 'LQG'"),
         ("cloning", FREE, {"batch_size": 0}, "settings of cloning: batch_size: "),
     ],

@@ -12,7 +12,7 @@ from itertools import product
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import PERFECT, covering
+from covering import PERFECT, covering, slow
 from mpmath import mp, mpf
 from reference import (
     EPS,
@@ -346,9 +346,7 @@ def pendulum_errors(theta, omega, drive, dt):
     return *(float(abs(a - b)) / (1e-12 * s) for a, b, s in zip(end[:2], exact, size, strict=True)), substeps
 
 
-@pytest.mark.parametrize(
-    "decay", [79.0, 83.0, *(pytest.param(x, marks=pytest.mark.slow) for x in (110.0, 800.0))]
-)
+@pytest.mark.parametrize("decay", [79.0, 83.0, *(slow(x) for x in (110.0, 800.0))])
 @pytest.mark.parametrize("share", [0.999e-3, 1.001e-3, 1e-5])
 def test_heavy_damping_at_its_thresholds(decay, share):
     """field = share gamma², gamma dt = decay: on both sides of where the slow manifold is used."""
@@ -383,9 +381,7 @@ def test_heavy_damping_of_a_fast_drive(decay, share):
 
 
 @pytest.mark.parametrize("dt", [1.0, 0.1, 0.02])
-@pytest.mark.parametrize(
-    "spin", [100.0, 700.0, 1e4, *(pytest.param(x, marks=pytest.mark.slow) for x in (333.0, 1650.0, 2500.0))]
-)
+@pytest.mark.parametrize("spin", [100.0, 700.0, 1e4, *(slow(x) for x in (333.0, 1650.0, 2500.0))])
 @pytest.mark.parametrize("control", [0.0, -3000.0])
 def test_heavy_drag_in_a_turning_shell(spin, dt, control):
     """Without gravity the motion is linear, whatever the shell's rate: θ = ψ' (t - (1 - e^(-Γt))/Γ)."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from covering import slow
 from safetensors.numpy import save
 
 from lag_envs import sb3_policies
@@ -251,7 +252,7 @@ def test_writing_refuses_and_leaves_nothing(tmp_path):
 def test_no_folder(tmp_path):
     refused(tmp_path / "nothing", "cannot be read")
     (tmp_path / "file").write_text("x")
-    refused(tmp_path / "file", "no folder")
+    refused(tmp_path / "file", "not a folder")
 
 
 def test_linked_folder(folder, tmp_path):
@@ -279,22 +280,22 @@ def test_no_toml(folder):
 def test_linked_file(folder, tmp_path, name):
     (folder / name).rename(tmp_path / name)
     (folder / name).symlink_to(tmp_path / name)
-    refused(folder, f"{name} is no plain file")
+    refused(folder, f"{name} is not a plain file")
 
 
 @pytest.mark.parametrize("target", ["../../../../etc/passwd", "/dev/zero", "nowhere"])
 def test_link_to_elsewhere(folder, target):
     (folder / "policy_1.safetensors").symlink_to(target)
-    refused(folder, "no plain file")
+    refused(folder, "not a plain file")
 
 
 def test_folder_and_pipe_for_a_file(folder):
     (folder / "policy_1.safetensors").mkdir()
-    refused(folder, "no plain file")
+    refused(folder, "not a plain file")
     (folder / "policy_1.safetensors").rmdir()
     if hasattr(os, "mkfifo"):
         os.mkfifo(folder / "policy_1.safetensors")
-        refused(folder, "no plain file")
+        refused(folder, "not a plain file")
 
 
 @pytest.mark.parametrize(
@@ -338,7 +339,7 @@ def test_file_exchanged_while_it_is_read(folder, tmp_path, monkeypatch):
         return real(path, *args, **kwargs)
 
     monkeypatch.setattr(os, "open", exchange)
-    refused(folder, r"policy_0.safetensors changed while it was read: it is no plain file")
+    refused(folder, r"policy_0.safetensors changed while it was read: it is not a plain file")
 
 
 def test_file_that_grows_while_it_is_read(folder, monkeypatch):
@@ -359,19 +360,19 @@ def test_file_that_grows_while_it_is_read(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"\xff\xfe", "no UTF-8"),
-        (b"\x80\x04\x95", "no UTF-8"),
-        (b"a = ", "no TOML"),
-        (b"a = 1\na = 2", "no TOML"),
-        (b"a = 1979-13-45", "no TOML"),
+        (b"\xff\xfe", "not UTF-8"),
+        (b"\x80\x04\x95", "not UTF-8"),
+        (b"a = ", "not valid TOML"),
+        (b"a = 1\na = 2", "not valid TOML"),
+        (b"a = 1979-13-45", "not valid TOML"),
         (b"a = " + b"1" * 5000, "more than 1000 characters"),
-        (b"a = " + b"[" * 990, "nested too deep"),
-        (b"a = " + b"[\n" * 30_000, "nested too deep"),
-        (b"a = " + b"{a = " * 190, "no TOML|nested too deep"),
+        (b"a = " + b"[" * 990, "nested too deeply"),
+        (b"a = " + b"[\n" * 30_000, "nested too deeply"),
+        (b"a = " + b"{a = " * 190, "not valid TOML|nested too deeply"),
         (b".".join([b"a"] * 30_000) + b" = 1", "more than 1000 characters"),
         (b"\n".join(b"[[a.b]]" for _ in range(8_000)), "schema is missing"),
         (b"\n".join(b".".join([b"a"] * 400) + b".b%d = 1" % i for i in range(70)), "schema is missing"),
-        (b"\x00" * 1000, "no TOML"),
+        (b"\x00" * 1000, "not valid TOML"),
         (b"", "schema is missing"),
     ],
     ids=range(14),
@@ -390,7 +391,7 @@ def test_text_that_is_no_toml_or_a_bomb(folder, content, reason):
         ("schema = 1", "schema = 1979-05-27", "schema: Input should be "),
         ("schema = 1", "schema = 1\nprotocol = 0", "protocol: Input should be "),
         ("schema = 1", 'schema = 1\nprotocol = "1"', "protocol: Input should be "),
-        ("schema = 1", "schema = 1\nschema = 1", "no TOML"),
+        ("schema = 1", "schema = 1\nschema = 1", "not valid TOML"),
         ("schema = 1", "schema = 1\nprotocol = 9999-12-31", "protocol: Input should be "),
         ("schema = 1", f"schema = 0x{'f' * 900}", "schema: "),
         (f'env = "{ENV}"', 'env = "Nothing-v0"', "env: (there is no such board|Input should be a valid str)"),
@@ -498,8 +499,8 @@ def test_training_and_network_with_something_wrong(nets, old, new, reason):
     ("curve", "reason"),
     [
         ("seed = 9\nsteps = [1]\nreturns = [1.0]", "seed must be one of"),
-        ("seed = 0\nsteps = [1, 1]\nreturns = [1.0, 2.0]", "steps must grow"),
-        ("seed = 0\nsteps = [1, 2]\nreturns = [1.0]", "as many as"),
+        ("seed = 0\nsteps = [1, 1]\nreturns = [1.0, 2.0]", "steps must increase"),
+        ("seed = 0\nsteps = [1, 2]\nreturns = [1.0]", "one for each return"),
         ("seed = 0\nsteps = [1]\nreturns = [nan]", "returns.0: Input should be "),
         ('seed = 0\nsteps = [1]\nreturns = ["a"]', "returns.0: Input should be "),
         ("seed = 0\nsteps = []\nreturns = []", "steps: List should have at least 1 item"),
@@ -611,8 +612,8 @@ TABLE = {"architecture": "table", "kind": "action", "axes": ["x", "w"]}
         ({"mirror": "time"}, {}, "mirror must be one of the axes"),
         ({"mirror": "phi"}, {}, "mirror must be one of the axes"),
         ({"mirror": [1]}, {}, "mirror: Input should be a valid string"),
-        ({}, {"axis_0": np.array([1.0, -1.0])}, "nodes of axis_0 must grow"),
-        ({}, {"axis_0": np.array([1.0, 1.0])}, "nodes of axis_0 must grow"),
+        ({}, {"axis_0": np.array([1.0, -1.0])}, "nodes of axis_0 must increase"),
+        ({}, {"axis_0": np.array([1.0, 1.0])}, "nodes of axis_0 must increase"),
         ({}, {"axis_0": np.array([1.0])}, r"axis_0 must have the shape \(2\)"),
         ({}, {"axis_0": np.array([1.0, 2.0, 3.0])}, r"table must have the shape \(3, 3\)"),
         ({}, {"table": np.zeros((2, 3, 1))}, "table must have 2 axes"),
@@ -657,7 +658,7 @@ def numpy_file():
 def test_what_runs_code_is_not_even_looked_at(folder, tmp_path, monkeypatch, content):
     monkeypatch.chdir(tmp_path)
     (folder / "policy_0.safetensors").write_bytes(content)
-    refused(folder, "no safetensors file")
+    refused(folder, "not a safetensors file")
     assert not (tmp_path / "ran-code").exists()
 
 
@@ -676,13 +677,13 @@ BOTH = {"gain": GAIN, "offset": OFFSET}
     ("content", "reason"),
     [
         (header(BOTH, size=2**63), "at most 16384 bytes"),
-        (header(BOTH, size=10_000), "no JSON"),
+        (header(BOTH, size=10_000), "not JSON"),
         (header(b" " * 20_000, size=20_000), "at most 16384 bytes"),
-        (header(b"{" * 100), "no JSON"),
-        (header(b"[" * 16_000), "no JSON"),
-        (header(b'{"a":' * 3_000), "no JSON"),
-        (header(b'{"gain": ' + b"9" * 9_000 + b"}"), "no JSON"),
-        (header(b"\xff\xff"), "no JSON"),
+        (header(b"{" * 100), "not JSON"),
+        (header(b"[" * 16_000), "not JSON"),
+        (header(b'{"a":' * 3_000), "not JSON"),
+        (header(b'{"gain": ' + b"9" * 9_000 + b"}"), "not JSON"),
+        (header(b"\xff\xff"), "not JSON"),
         (header([]), "invalid type: sequence"),
         (header({}), "not fully covered"),
         (header(b'{"gain": {}, "gain": {}}'), "occurs twice"),
@@ -789,9 +790,7 @@ def model(algo, seed=0, bins=0, normalise=False, env_id=ENV, **options):
         ("TD3", {"policy_kwargs": {"net_arch": [16, 16]}}),
         ("TQC", {"kind": sb3_policies.TQC, "policy_kwargs": {"net_arch": [16, 16]}}),
         pytest.param("DDPG", {"policy_kwargs": {"net_arch": [16, 16]}}, marks=SLOW),
-        pytest.param(
-            "TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}, marks=pytest.mark.slow
-        ),
+        slow("TQC", {"use_sde": True, "policy_kwargs": {"net_arch": [16, 16]}}),
         ("DQN", {"bins": 9, "normalise": True, "policy_kwargs": {"net_arch": [16, 16]}}),
     ],
 )
@@ -877,13 +876,13 @@ def test_command_exports_files(runs, tmp_path):
     files = [runs / f"seed{s}" / "model.zip" for s in range(5)]
     norms = [file.with_name("vecnormalize.pkl") for file in files]
     given = [*files, "--author", "A", "--license", "MIT", "--output", tmp_path / "out"]
-    with pytest.raises(UserError, match="--env tells"):
+    with pytest.raises(UserError, match="give --env"):
         export_command(*given, "--normalise", *norms)
     given += ["--env", ENV]
-    with pytest.raises(UserError, match="--seconds tells"):
+    with pytest.raises(UserError, match="give --seconds"):
         export_command(*given, "--normalise", *norms)
     given += ["--seconds", 5]
-    with pytest.raises(UserError, match="one file for each file"):
+    with pytest.raises(UserError, match="one file for each path"):
         export_command(*given, "--normalise", norms[0])
     with pytest.raises(UserError, match=f"do not fit {incline.Brake.id}"):
         export_command(*given, "--env", incline.Brake.id)
@@ -892,7 +891,7 @@ def test_command_exports_files(runs, tmp_path):
     assert not (tmp_path / "out").exists()
     export_command(*given, "--normalise", *norms, "--name", "Mine")
     assert load(tmp_path / "out").name == "Mine"
-    with pytest.raises(UserError, match="there already"):
+    with pytest.raises(UserError, match="already exists"):
         export_command(*given)
 
 
@@ -903,10 +902,10 @@ def test_models_that_cannot_be_exported(runs, tmp_path):
     made, _ = model("PPO", policy_kwargs={"activation_fn": torch.nn.Hardswish})
     with pytest.raises(ExportError, match="all activations must be one of"):
         convert(made)
-    with pytest.raises(ExportError, match="is no model, nor a folder"):
+    with pytest.raises(ExportError, match="is neither a model nor a folder"):
         find([tmp_path])
     (tmp_path / "x.zip").write_bytes(b"no zip")
-    with pytest.raises(ExportError, match="no model of Stable-Baselines3"):
+    with pytest.raises(ExportError, match="not a model of Stable-Baselines3"):
         export([Source(tmp_path / "x.zip")], tmp_path / "a", authors=["A"], license="MIT", env=ENV, seconds=1)
     with pytest.raises(ExportError, match="at least 5 policies"):
         export(find([runs / "seed0"]), tmp_path / "a", authors=["A"], license="MIT")
@@ -1039,7 +1038,7 @@ def test_copies_of_one_policy_are_refused(tmp_path, nets):
 
 def test_networks_have_a_limit_together(tmp_path, monkeypatch):
     monkeypatch.setattr(protocol, "ALL_NUMBERS", 90)
-    with pytest.raises(Refused, match="have 95 numbers together, 90 are the most"):
+    with pytest.raises(Refused, match="have 95 numbers together, at most 90 are accepted"):
         learned(tmp_path / "it")
 
 

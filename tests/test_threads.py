@@ -11,6 +11,7 @@ import threading
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import slow
 from rollouts import ANY_BAR, actions
 
 from lag_envs.envs import sharing
@@ -44,10 +45,10 @@ def digest(envs, steps, seed=3):
     [
         {},
         {"autoreset_mode": "SameStep"},
-        pytest.param({"observation_noise": 0.01, "action_delay": 0.013}, marks=pytest.mark.slow),
-        pytest.param({"randomize": {"damping": (0.1, 10.0)}}, marks=pytest.mark.slow),
-        pytest.param({"mass": np.linspace(0.1, 0.3, MANY)}, marks=pytest.mark.slow),
-        pytest.param({"env_id": cart_pole.CartPoleExact.id}, marks=pytest.mark.slow),
+        slow({"observation_noise": 0.01, "action_delay": 0.013}),
+        slow({"randomize": {"damping": (0.1, 10.0)}}),
+        slow({"mass": np.linspace(0.1, 0.3, MANY)}),
+        slow({"env_id": cart_pole.CartPoleExact.id}),
     ],
     ids=["plain", "same step", "imperfect", "drawn", "each its own", "series"],
 )

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from covering import slow
 from rollouts import one_by_one
 from trainings import go, kill_and_interrupt
 
@@ -75,7 +76,7 @@ def config(tmp_path):
 @pytest.mark.parametrize(
     "algo",
     # TQC is SAC with another critic, and the slowest.
-    [pytest.param(a, marks=pytest.mark.slow) if a == "tqc" else a for a in ALGORITHMS],
+    [slow(a) if a == "tqc" else a for a in ALGORITHMS],
 )
 def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
     cut = make_run(tmp_path / "cut", algo, normalize=True)
@@ -414,12 +415,12 @@ def beside_the_example(monkeypatch):
 @pytest.mark.parametrize(
     ("given", "env_id"),
     [
-        pytest.param(str(BALL), "BallOnBeam-v0", marks=pytest.mark.slow),
-        pytest.param("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0", marks=pytest.mark.slow),
+        slow(str(BALL), "BallOnBeam-v0"),
+        slow("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0"),
         # It chooses among three actions.
-        pytest.param(f"{SEVERAL}:Switched", "OwnSwitched-v0", marks=pytest.mark.slow),
+        slow(f"{SEVERAL}:Switched", "OwnSwitched-v0"),
         # It has two controls and two targets. Quick is fast PPO's training in test_add_task.py.
-        pytest.param(f"{SEVERAL}:Deliver", "OwnCrane-v0", marks=pytest.mark.slow),
+        slow(f"{SEVERAL}:Deliver", "OwnCrane-v0"),
     ],
 )
 def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_example, tmp_path):
@@ -443,11 +444,7 @@ def test_ppo_trains_on_an_environment_of_ones_own(given, env_id, beside_the_exam
         (["ball_on_beam:Other-v0"], "there is no environment 'ball_on_beam:Other-v0'"),
         ([str(BALL), "--ray", "local"], "a file is not on the other machines"),
         ([f"{SEVERAL}:Switched", "--algo", "sac"], "sac does not take the hyperparameters of OwnSwitched-v0"),
-        pytest.param(
-            [f"{SEVERAL}:Deliver", "--algo", "dqn"],
-            "dqn numbers the actions of one control",
-            marks=pytest.mark.slow,
-        ),
+        slow([f"{SEVERAL}:Deliver", "--algo", "dqn"], "dqn needs a single control with discrete actions"),
     ],
 )
 def test_mistakes_with_ones_own_are_named(arguments, message, beside_the_example, tmp_path, capsys):

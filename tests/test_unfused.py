@@ -7,7 +7,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import PERFECT, covering
+from covering import PERFECT, covering, slow
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 
@@ -36,7 +36,7 @@ def test_unfused_is_the_environments_step_to_rounding(id):
 
 @pytest.mark.parametrize(
     "task",
-    [OWN[0], *(pytest.param(task, marks=pytest.mark.slow) for task in OWN[1:])],
+    [OWN[0], *(slow(task) for task in OWN[1:])],
     ids=lambda task: task.__name__,
 )
 def test_users_tasks_too(task):
@@ -89,9 +89,7 @@ def check_against_fused(env, seeds):
         assert np.max(error / np.maximum(1.0, condition)) <= 1e-15
 
 
-@pytest.mark.parametrize(
-    "task", [*OWN, pytest.param(Six, marks=pytest.mark.slow)], ids=lambda task: task.__name__
-)
+@pytest.mark.parametrize("task", [*OWN, slow(Six)], ids=lambda task: task.__name__)
 def test_motion_has_the_bits_of_the_compiled_unfused_step(task):
     outer = made(task)
     scene = outer.scene

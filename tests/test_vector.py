@@ -10,7 +10,7 @@ from itertools import pairwise
 import gymnasium as gym
 import numpy as np
 import pytest
-from covering import covering, engine, quick
+from covering import covering, engine, quick, slow
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -121,7 +121,7 @@ def test_same_bits(env_id, n, steps):
 
 @each_id
 @each_mode
-@pytest.mark.parametrize(("n", "steps"), [(7, 700), pytest.param(65, 150, marks=pytest.mark.slow), (130, 80)])
+@pytest.mark.parametrize(("n", "steps"), [(7, 700), slow(65, 150), (130, 80)])
 def test_same_bits_in_every_mode(env_id, mode, n, steps):
     native, sync = pair(env_id, n, mode, **lasting(env_id, 50))
     assert_same(native.reset(seed=3), sync.reset(seed=3))

@@ -35,9 +35,9 @@ EXAMPLES = """examples:
   lag-envs info PivotedBar-v0        all about one of them
   lag-envs play PivotedBar-v0        drive it
   lag-envs watch PivotedBar-v0       see how it is done
-  lag-envs new my_scene.py           begin one of your own
-  lag-envs bench --quick             how fast they are beside others
-  lag-envs report --quick            how wrong they are beside others
+  lag-envs new my_scene.py           start one of your own
+  lag-envs bench --quick             how fast they are, beside others
+  lag-envs report --quick            how accurate they are, beside others
   lag-envs leaderboard list          who is best at them
   lag-envs bench --help              more about one command"""
 

@@ -36,18 +36,10 @@ class DeviceEnvs:
 
     Parameters
     ----------
-    task : str or type
-        Id of an environment, or a task's class.
-    num_envs : int
-        Number of environments.
-    device : str or torch.device
-        Where they are.
-    dtype : torch.dtype
-        Type of states, actions and rewards, float64 or float32.
+    task, num_envs, device, dtype, **options
+        See `lag_envs.torch.TorchVectorEnv`.
     load : callable, optional
         Compiles the kernels' text and returns what starts them.
-    **options
-        What ``gym.make_vec`` takes: `autoreset_mode`, `max_episode_steps`, parameters of scene and task.
 
     Attributes
     ----------
@@ -87,7 +79,7 @@ class DeviceEnvs:
             else LagrangianVectorEnv(task, 1, **options)
         )
         if not isinstance(sample, LagrangianVectorEnv):
-            raise ValueError(f"{name} cannot be on a GPU: it is no environment of this package")
+            raise ValueError(f"{name} cannot be on a GPU: it is not an environment of this package")
         #: One environment on the CPU, which knows task, spaces and modes.
         self.sample: LagrangianVectorEnv = sample
         if sample.render_mode or sample.diagnostics:

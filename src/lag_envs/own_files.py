@@ -59,7 +59,7 @@ def load(path: str) -> ModuleType:
     if not file.is_file():
         raise UserError(f"there is no file {path}")
     if file.suffix != ".py":
-        raise UserError(f"{path} is no Python file; its name must end with .py")
+        raise UserError(f"{path} is not a Python file; its name must end with .py")
     file = file.resolve()
     name = _name(file)
     spec = importlib.util.spec_from_file_location(name, file)
@@ -77,7 +77,7 @@ def load(path: str) -> ModuleType:
     except SystemExit as error:
         del sys.modules[name]
         raise UserError(
-            f'{path} ends the program; put what is to run only as a script behind if __name__ == "__main__":'
+            f'{path} exits when it is loaded; what is only for a script goes under if __name__ == "__main__":'
         ) from error
     return module
 

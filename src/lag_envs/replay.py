@@ -117,7 +117,7 @@ def read_link(link: str) -> Drive:
     fields = text.split("~")
     if MARK not in link or len(fields) < 2:
         raise LinkError(
-            f"{_short(link)} is no link of a drive: it must hold #{MARK} and what follows; copy all of it"
+            f"{_short(link)} is not a link to a drive: it must hold #{MARK} and what follows; copy all of it"
         )
     if fields[0] != str(VERSION):
         raise LinkError(f"the link has version {_short(fields[0])}, this program reads version {VERSION}")
@@ -125,7 +125,7 @@ def read_link(link: str) -> Drive:
         raise LinkError(f"the link is damaged: it has {len(fields)} fields, not 7; copy all of it")
     before, _, check = text.rpartition("~")
     if check != f"{zlib.crc32(before.encode()):08x}":
-        raise LinkError("the link is damaged: its check does not fit; copy it once more, whole")
+        raise LinkError("the link is damaged: its checksum does not match; copy all of it again")
     _, id, seed, keys, claimed, step, _ = fields
     if not re.fullmatch(r"\d{1,20}", seed) or int(seed) >= 2**64:
         raise LinkError(f"the link's seed must be a whole number below 2^64, got {_short(seed)}")
@@ -240,7 +240,7 @@ def unpack(text: str, controls: int) -> list[tuple[int, ...]]:
     try:
         packed = base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
     except binascii.Error as error:
-        raise LinkError(f"the link's keys are no base64url: {error}") from error
+        raise LinkError(f"the link's keys are not base64url: {error}") from error
     numbers, value, shift = [], 0, 0
     for byte in packed:
         value += (byte % 128) << shift

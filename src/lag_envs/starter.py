@@ -23,7 +23,7 @@ def start(path: Path) -> Path:
     if path.suffix != ".py":
         raise UserError(f"{path}: the file's name must end with .py, as in {path.stem or 'my_scene'}.py")
     if path.exists() or path.is_symlink():
-        raise UserError(f"{path} is there already; choose another name, or remove it first")
+        raise UserError(f"{path} already exists; choose another name, or remove it first")
     if not path.stem.isidentifier() or keyword.iskeyword(path.stem):
         raise UserError(f"{path}: the name must be one that Python can import, such as my_scene.py")
     if not path.absolute().parent.is_dir():

@@ -279,7 +279,9 @@ class Video:
         if path.suffix.lower() not in VIDEOS:
             raise UserError(f"a video's name must end with {' or '.join(VIDEOS)}, got {path}")
         if path.is_dir() or not path.absolute().parent.is_dir():
-            raise UserError(f"there is no folder for {path}" if not path.is_dir() else f"{path} is a folder")
+            raise UserError(
+                f"the folder of {path} does not exist" if not path.is_dir() else f"{path} is a folder"
+            )
         self.path, self.rate = path, rate
         self._gif = path.suffix.lower() == ".gif"
         #: Of pictures that come faster than they can be shown, each `every`-th is kept.

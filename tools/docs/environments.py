@@ -7,7 +7,6 @@ from the task, from ``measured.json``, from the board and from the accuracy repo
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 import math
 import re
@@ -25,11 +24,12 @@ from lag_envs.scenes import Scene
 from lag_envs.scenes.declaring import complete
 from lag_envs.scores import share_of_privileged
 from lag_envs.stepping.series import TOLERANCE
+from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
 from tools.docs import equations
-from tools.docs.markdown import cell, described, number, plus_minus, sections, table
+from tools.docs.markdown import cell, described, first_line, number, plus_minus, sections
 
 ROOT = Path(__file__).parents[2]
 HEADINGS = (
@@ -117,7 +117,7 @@ def overview(link: Callable[[str], str]) -> str:
         rows.append(
             [
                 f"[{env_id}]({link(env_id)})",
-                _first(type(task)),
+                first_line(type(task)),
                 "; ".join(_range(task, acting) for acting in task.formulas.acting),
                 *(
                     plus_minus(row["mean"], row["error"]) if row else "not measured yet"
@@ -125,7 +125,7 @@ def overview(link: Callable[[str], str]) -> str:
                 ),
             ]
         )
-    return table(["environment", "what to do", "control", "random", "best known"], rows)
+    return markdown_table(["environment", "what to do", "control", "random", "best known"], rows)
 
 
 def by_scene(source: Callable[[str], str]) -> str:
@@ -137,12 +137,10 @@ def by_scene(source: Callable[[str], str]) -> str:
     for file, ids in files.items():
         scenes = dict.fromkeys(TASKS[env_id].scene for env_id in ids)
         named = ", ".join(f"`{kind.__name__}`" for kind in scenes)
-        rows.append([f"[{named}]({file})", "; ".join(map(_first, scenes)), ", ".join(f"`{i}`" for i in ids)])
-    return table(["scene", "", "environments"], rows)
-
-
-def _first(kind: type) -> str:
-    return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
+        rows.append(
+            [f"[{named}]({file})", "; ".join(map(first_line, scenes)), ", ".join(f"`{i}`" for i in ids)]
+        )
+    return markdown_table(["scene", "", "environments"], rows)
 
 
 def _range(task: Task, acting: Any) -> str:
@@ -183,7 +181,7 @@ def _summary(env_id: str, task: Task) -> str:
         ["Observation space", f"`{shown[1]}`"],
         ["Step, episode", f"{number(task.dt)} s, {number(task.limit)} steps"],
     ]
-    return table(rows[0], rows[1:])
+    return markdown_table(rows[0], rows[1:])
 
 
 def _box(space: Any) -> str:
@@ -209,7 +207,7 @@ def _actions(task: Task) -> str:
         "Unit",
         *(("Values, by action", "") if listed else (f"At {number(-top)}", f"At {number(top)}")),
     ]
-    return table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _observation(task: Task) -> str:
@@ -220,7 +218,7 @@ def _observation(task: Task) -> str:
     for i, (name, low, high) in enumerate(zip(task.observation, space.low, space.high, strict=True)):
         unit, meaning = task.quantities.get(name, (known.get(name, ""), ""))
         rows.append([str(i), f"`{name}`", meaning, unit, _bound(low), _bound(high)])
-    return table(["Num", "Observation", "Meaning", "Unit", "Min", "Max"], rows)
+    return markdown_table(["Num", "Observation", "Meaning", "Unit", "Min", "Max"], rows)
 
 
 def _bound(value: Any) -> str:
@@ -241,7 +239,7 @@ def _start(task: Task) -> str:
             targets[0].name if len(targets) == 1 else f"[{', '.join(t.name for t in targets)}]"
         )
     text = f"Each entry is drawn uniformly. `reset(options={{{given}}})` sets them."
-    return f"{text}\n\n{table(['Entry', 'Unit', 'Centre', 'To either side'], rows)}"
+    return f"{text}\n\n{markdown_table(['Entry', 'Unit', 'Centre', 'To either side'], rows)}"
 
 
 def _end(task: Task) -> str:
@@ -279,7 +277,7 @@ def arguments(task: Task) -> str:
     )
     own = ", ".join(f"`{name}={value!r}`" for name, value in type(task).imperfections.items())
     also += f", of which {own} are on here." if own else "."
-    return f"{table(['Keyword', 'Default', 'Unit', 'Range', 'Meaning'], rows)}\n\n{also}"
+    return f"{markdown_table(['Keyword', 'Default', 'Unit', 'Range', 'Meaning'], rows)}\n\n{also}"
 
 
 def parameters(kind: type[Scene]) -> list[Any]:
@@ -366,7 +364,7 @@ def _returns(env_id: str) -> str:
         if (row := found["measured"].get(name))
     ]
     text = "Mean return ± standard error, as `python -m agents.scale` measured them:"
-    return f"{text}\n\n{table(['Policy', 'Return', 'Episodes'], rows)}"
+    return f"{text}\n\n{markdown_table(['Policy', 'Return', 'Episodes'], rows)}"
 
 
 def _open(env_id: str) -> str:
@@ -385,7 +383,7 @@ def _open(env_id: str) -> str:
         [name, budget, plus_minus(row["mean"], row["error"]) if (row := found.get(name)) else ""]
         for name, budget in task.open.tried.items()
     ]
-    return f"{text}What was tried:\n\n{table(['Method', 'Budget', 'Return'], rows)}"
+    return f"{text}What was tried:\n\n{markdown_table(['Method', 'Budget', 'Return'], rows)}"
 
 
 def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
@@ -399,7 +397,7 @@ def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
         texts += [
             "The top of the leaderboard (0 is random actions, 1 the best policy known when the protocol "
             "began):",
-            table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
+            markdown_table(["Rank", "Agent", "Kind", "Score", "95 % interval"], rows),
             f"[Watch them, and see the whole ranking](../board/{env_id}.html). [Agents](../agents.md#"
             f"{env_id.lower()}) has their robustness and learning curves.",
         ]

@@ -1,26 +1,16 @@
-"""Small parts of Markdown pages: tables, docstrings cut at their headings, numbers."""
+"""Small parts of Markdown pages: docstrings cut at their headings, numbers."""
 
 from __future__ import annotations
 
 import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    r"""Return a table.
-
-    Examples
-    --------
-    >>> print(table(["a", "b"], [["1", "x | y"]]))
-    | a | b |
-    | --- | --- |
-    | 1 | x \| y |
-    """
-    lines = [list(head), ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+def first_line(kind: type) -> str:
+    """Return the first line of a class's docstring, without its full stop."""
+    return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
 
 
 def sections(kind: type) -> dict[str, str]:

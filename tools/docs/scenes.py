@@ -7,9 +7,10 @@ import re
 import sys
 
 from lag_envs.scenes import SCENES, Scene
+from lag_envs.tables import markdown_table
 from tools.docs.environments import derivation, parameters
 from tools.docs.equations import mathml, symbol
-from tools.docs.markdown import cell, described, table
+from tools.docs.markdown import cell, described, first_line
 
 
 def page() -> str:
@@ -20,7 +21,7 @@ def page() -> str:
         "this page follows from them: SymPy derives the formulas below from the energies that are "
         "stepped. [Physics](physics.md) says more about the first three, [the tutorial](tutorial.md) how "
         "to write one.",
-        table(["scene", "", "state", "control"], [_row(kind) for kind in SCENES]),
+        markdown_table(["scene", "", "state", "control"], [_row(kind) for kind in SCENES]),
     ]
     for kind in SCENES:
         parts += [f"## {kind.__name__}", *_scene(kind)]
@@ -31,14 +32,10 @@ def _row(kind: type[Scene]) -> list[str]:
     scene = kind()
     return [
         f"[{kind.__name__}](#{kind.__name__.lower()})",
-        _summary(kind),
+        first_line(kind),
         ", ".join(f"`{name}`" for name in scene.state_names),
         ", ".join(f"`{name}`" for name in scene.control_names),
     ]
-
-
-def _summary(kind: type[Scene]) -> str:
-    return (inspect.getdoc(kind) or "").partition("\n")[0].rstrip(".")
 
 
 def _scene(kind: type[Scene]) -> list[str]:
@@ -52,11 +49,11 @@ def _scene(kind: type[Scene]) -> list[str]:
         )
     units = zip(scene.control_names, scene.control_units, strict=True)
     return [
-        f"{_summary(kind)}.",
+        f"{first_line(kind)}.",
         f"```text\n{_drawing(kind)}\n```",
         _notes(kind),
         f"Controls: {', '.join(f'`{name}` [{unit}]' for name, unit in units)}.",
-        table(["parameter", "symbol", "default", "unit", "meaning"], rows),
+        markdown_table(["parameter", "symbol", "default", "unit", "meaning"], rows),
         derivation(scene),
         f"[API](api/scenes.md#lag_envs.scenes.{kind.__name__})",
     ]

@@ -23,11 +23,13 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from lag_envs.generated import replaced
+from lag_envs.tables import markdown_table
+
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 HOME = ROOT / ".venv-libraries"
 RESULTS, PAGE = ROOT / "docs" / "libraries.json", ROOT / "docs" / "libraries.md"
-BEGIN, END = "<!-- libraries:begin -->", "<!-- libraries:end -->"
 #: Longest time of one run [s].
 PATIENCE = 1200.0
 #: No windows, no accounts, nothing written to the home folder.
@@ -224,24 +226,19 @@ def outcome(row: dict[str, Any]) -> str:
 
 def table(found: dict[str, Any]) -> str:
     """Return the results as the page shows them."""
-    lines = [
-        f"Python {found['python']}, {found['system']}, {found['date']}; `make test-libraries`.",
-        "",
-        "| library | version | Gymnasium | what was run | result |",
-        "| --- | --- | --- | --- | --- |",
+    about = f"Python {found['python']}, {found['system']}, {found['date']}; `make test-libraries`."
+    rows = [
+        [row["library"], row["version"], row["gymnasium"], row["what"], outcome(row)] for row in found["rows"]
     ]
-    for row in found["rows"]:
-        cells = [row["library"], row["version"], row["gymnasium"], row["what"], outcome(row)]
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-    return "\n".join(lines)
+    head = ["library", "version", "Gymnasium", "what was run", "result"]
+    return f"{about}\n\n{markdown_table(head, rows)}"
 
 
 def write_page(found: dict[str, Any]) -> None:
     """Write the results, and the table in the documentation."""
     RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    after = rest.partition(END)[2]
-    PAGE.write_text(f"{before}{BEGIN}\n{table(found)}\n{END}{after}", encoding="utf-8")
+    page = PAGE.read_text(encoding="utf-8")
+    PAGE.write_text(replaced(page, "libraries", table(found)), encoding="utf-8")
 
 
 def main(arguments: list[str] | None = None) -> int:

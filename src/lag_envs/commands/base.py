@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from datetime import date
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -48,6 +49,12 @@ def needs(extra: str, *packages: str) -> None:
     for package in packages:
         if find_spec(package) is None:
             raise UserError(f'{package} is missing: pip install "lag-envs[{extra}]"')
+
+
+def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
+    """Declare the option of a date, which is noted there."""
+    today = date.today().isoformat()
+    parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
 
 
 def count(text: str) -> int:

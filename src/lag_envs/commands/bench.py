@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
 from lag_envs import TASKS
-from lag_envs.commands.base import OWN, Command, count, known, needs, seconds
+from lag_envs.commands.base import OWN, Command, count, declare_date, known, needs, seconds
 from lag_envs.errors import UserError
 from lag_envs.host import usable_cores
 from lag_envs.own_files import is_file
@@ -35,7 +34,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checkout",
         metavar="FOLDER",
-        help="take everything over into docs/speed.json, docs/speed.md and README.md of this checkout",
+        help="write everything into docs/speed.json, docs/speed.md and README.md of this checkout",
     )
     parser.add_argument(
         "--with",
@@ -53,12 +52,12 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         type=count,
         default=1,
-        help="measure also how much quicker N threads step a batch, on N cores",
+        help="also measure how much faster N threads step a batch, on N cores",
     )
     parser.add_argument(
         "--device",
         metavar="DEVICE",
-        help="measure on a GPU, cuda, in place of the processor (default sizes: 4096,1048576)",
+        help="measure on a GPU, cuda, instead of the processor (default sizes: 4096,1048576)",
     )
     parser.add_argument(
         "--rounds", metavar="N", type=count, help="samples of each row (default: 31, or 9 with --quick)"
@@ -73,11 +72,9 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--clock",
         choices=["wall", "cpu"],
         default="wall",
-        help="cpu leaves out what other programs take (default: wall)",
+        help="cpu leaves out the time that other programs take (default: wall)",
     )
-    parser.add_argument(
-        "--date", default=date.today().isoformat(), help="date to note in the file (default: today)"
-    )
+    declare_date(parser, "in the file")
 
 
 def run_bench(args: argparse.Namespace) -> int:
@@ -100,12 +97,12 @@ def run_bench(args: argparse.Namespace) -> int:
         for name in ("README.md", "docs/speed.json", "docs/speed.md"):
             if not os.access(Path(args.checkout, name), os.W_OK):
                 raise UserError(
-                    f"--checkout: {Path(args.checkout, name)} is not there, or cannot be written to"
+                    f"--checkout: {Path(args.checkout, name)} is missing, or cannot be written to"
                 )
     if args.threads > (cores := usable_cores()):
-        raise UserError(f"--threads {args.threads} needs as many cores, and this process may use {cores}")
+        raise UserError(f"--threads {args.threads} needs as many cores; this process may use {cores}")
     if args.threads > 1 and args.clock == "cpu":
-        raise UserError("--threads needs --clock wall: the other adds up the time of all threads")
+        raise UserError("--threads needs --clock wall: cpu adds up the time of all threads")
     quick = {"rounds": 9, "seconds": 0.02, "cold_starts": 3 if args.cold else 0} if args.quick else {}
     given = {
         name: getattr(args, name)
@@ -133,7 +130,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
     """Measure on a GPU."""
     others = ("cold", "checkout", "keywords", "output")
     if args.threads > 1 or args.clock == "cpu" or any(getattr(args, name) for name in others):
-        raise UserError("--device takes no other options than --quick, --sizes, --rounds, --seconds")
+        raise UserError("--device goes only with --quick, --sizes, --rounds, --seconds; leave out the others")
     needs("torch", "torch")
     from lag_envs.benchmark.device import rates, table
     from lag_envs.device import checked_device
@@ -197,7 +194,7 @@ examples:
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
   lag-envs bench --quick --with action_delay=0.013   what keywords cost
-  lag-envs bench --quick --threads 2                 what a second thread brings
+  lag-envs bench --quick --threads 2                 how much a second thread gains
   lag-envs bench --quick --device cuda               on a GPU, in both precisions
   lag-envs bench --cold                              only the cold start
   lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",

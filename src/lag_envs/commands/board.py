@@ -68,7 +68,7 @@ examples:
 REPLAY = Command(
     "replay",
     "recompute a drive from its link",
-    """Recompute a drive, which the leaderboard's page made a link of, from its seed and keys, by
+    """Recompute a drive, given as a link by the leaderboard's page, from its seed and keys, by
 arithmetic that has the same bits on every machine, and say whether the return that the link claims is true.
 The status is 0 where it is, 1 where it is not, 2 for a link that is damaged.
 
@@ -83,7 +83,7 @@ LEADERBOARD = Command(
     "keep the leaderboard",
     """Keep a leaderboard: take submissions in, recompute their scores, show and publish the ranking. A
 submission is verified with a nonce that was published after it was added: `add` takes it in, `nonce`
-publishes one and verifies what waits. After Ctrl-C, or a kill, `add` without a folder goes on.
+publishes one and verifies what waits. After Ctrl-C, or a kill, `add` without a folder resumes.
 
 examples:
   lag-envs leaderboard add my-submission             take it in; it waits for the next nonce

@@ -10,7 +10,7 @@ from lag_envs.tables import columns
 
 def declare_cache(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``cache``."""
-    parser.add_argument("--clear", action="store_true", help="remove all that is kept")
+    parser.add_argument("--clear", action="store_true", help="remove everything that is kept")
 
 
 def run_cache(args: argparse.Namespace) -> int:
@@ -40,13 +40,13 @@ def run_cache(args: argparse.Namespace) -> int:
 
 CACHE = Command(
     "cache",
-    "show or clear what is compiled",
+    "show or clear the compiled code",
     """Show where compiled code is kept, how much of it there is, and whether it is whole. It is kept in
 the user's folder for caches, or in the one that the environment variable NUMBA_CACHE_DIR names.
 
 examples:
   lag-envs cache            what there is
-  lag-envs cache --clear    remove it; what is needed is compiled anew""",
+  lag-envs cache --clear    remove it; what is needed is compiled again""",
     declare_cache,
     run_cache,
 )

@@ -100,8 +100,8 @@ examples:
 )
 INFO = Command(
     "info",
-    "tell about one environment",
-    """Tell about one environment: state, control, observation bounds, start, parameters, accuracy.
+    "describe one environment",
+    """Describe one environment: state, control, observation bounds, start, parameters, accuracy.
 
 examples:
   lag-envs info PivotedBar-v0

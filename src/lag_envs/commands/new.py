@@ -30,7 +30,7 @@ def run_new(args: argparse.Namespace) -> int:
 NEW = Command(
     "new",
     "write a scene and a task to start from",
-    """Write a file with a scene and a task of your own to start from, with comments. A file that is there
+    """Write a file with a scene and a task of your own to start from, with comments. An existing file
 is left as it is.
 
 examples:

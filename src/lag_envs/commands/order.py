@@ -38,7 +38,7 @@ ORDER = Command(
     "order",
     "find the order of the series that steps a task fastest",
     """Measure the time of a step by each order of the series, under random actions in a task's own
-episodes, and tell which one to write into the task. With any order each step is certified alike.
+episodes, and tell which one to write into the task. Steps of any order are certified alike.
 
 examples:
   lag-envs order ball_on_beam.py             a task of your own; this runs the file

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from datetime import date
 from pathlib import Path
 
-from lag_envs.commands.base import OWN, Command, count, needs
+from lag_envs.commands.base import OWN, Command, count, declare_date, needs
 from lag_envs.errors import UserError, hint
 from lag_envs.own_files import is_file
 
@@ -31,9 +30,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
         "--processes", metavar="N", type=count, default=os.cpu_count() or 1,
         help="jobs side by side (default: one per core); timings always run alone",
     )  # fmt: skip
-    parser.add_argument(
-        "--date", default=date.today().isoformat(), help="date to note on the page (default: today)"
-    )
+    declare_date(parser, "on the page")
     parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
 
 
@@ -48,7 +45,9 @@ def run_report(args: argparse.Namespace) -> int:
 
         for option in ("sections", "docs"):
             if getattr(args, option):
-                raise UserError(f"--{option} is for the report about this package: leave out it, or {file}")
+                raise UserError(
+                    f"--{option} is for the report about this package: leave out --{option} or {file}"
+                )
         own.subjects(file)  # what is wrong with the file is said before anything is measured
         made = Settings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
         try:
@@ -60,7 +59,7 @@ def run_report(args: argparse.Namespace) -> int:
         if name not in SECTIONS:
             raise UserError(f"there is no section {name!r}; {hint(name, SECTIONS)}")
     if args.docs and (args.quick or names != SECTIONS):
-        raise UserError("--docs takes a whole report: leave out --quick and --sections")
+        raise UserError("--docs needs a whole report: leave out --quick and --sections")
     settings = Settings(folder, args.quick, names, args.processes, args.date)
     try:
         if not make_report(settings):
@@ -79,7 +78,7 @@ def _places(places: Sequence[str]) -> tuple[str, str]:
     files = [place for place in places if is_file(place) and not Path(place).is_dir() and ".py" in place]
     folders = [place for place in places if place not in files]
     if len(files) > 1 or len(folders) > 1:
-        raise UserError(f"one FILE and one FOLDER at most, got {' '.join(places)}")
+        raise UserError(f"at most one FILE and one FOLDER, got {' '.join(places)}")
     if files:
         from lag_envs.own_files import split
 

@@ -48,7 +48,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         "--episodes", metavar="N", type=count, help="how many (default: 1 in a video, else endless)"
     )
     parser.add_argument(
-        "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif in place of opening a window"
+        "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif instead of opening a window"
     )
     parser.add_argument(
         "--board",
@@ -85,7 +85,7 @@ def run_watch(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UserError(str(error)) from error
     except Error as error:
-        raise UserError(f"{error}, and --video FILE neither") from error
+        raise UserError(f"{error}, nor does --video FILE") from error
     return 0
 
 
@@ -93,10 +93,10 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
     """Declare what all that shows an environment takes."""
     parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
     parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
-    parser.add_argument("--steps", metavar="N", type=count, help="end after so many steps")
+    parser.add_argument("--steps", metavar="N", type=count, help="end after N steps")
     parser.add_argument("--arrows", action="store_true", help="show forces too")
     parser.add_argument(
-        "--trail", metavar="S", type=seconds, default=0.0, help="show the way of so many seconds"
+        "--trail", metavar="S", type=seconds, default=0.0, help="show the path of the last S seconds"
     )
     parser.add_argument("--readout", action="store_true", help="show time, score, controls and state below")
 
@@ -124,8 +124,8 @@ PLAY = Command(
     "play",
     "drive an environment by keys or gamepad",
     """Drive an environment in a window, in real time: the arrow keys are for the first two controls,
-a, d, s and w for two more; the sticks of a gamepad do the same, little by little. At an episode's end it
-tells the return, and the score on the leaderboard's scale.
+a, d, s and w for two more; the sticks of a gamepad do the same, in proportion. At an episode's end it
+shows the return, and the score on the leaderboard's scale.
 
 examples:
   lag-envs play PivotedBar-v0

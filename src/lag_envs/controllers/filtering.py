@@ -60,7 +60,7 @@ class Filtered:
         if found is None or not all(found.observation_noise or [0.0]):
             raise ValueError("a Kalman filter needs a task with noise on every entry of the observation")
         if found.observation_delay or any(found.action_delay) or found.drawn or found.observation_every > 1:
-            raise ValueError("this filter is for known parameters, and for what is neither late nor rare")
+            raise ValueError("this filter needs known parameters, and every observation on time")
         self.task, self.controller = task, controller
         self.read, self.model = ObservationDecoder(task), Model(task)
         self.noise = np.diag(np.square(found.observation_noise))

@@ -145,7 +145,8 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     free, full = (task.coefficients([0.0, 0.0], [c], np) for c in (0.0, task.limit_control))
     if not free.acceleration > 0.0:
         raise ValueError(
-            f"tilt={task.scene.tilt:g} rad and gravity={task.scene.gravity:g} m/s² pull nothing to the line"
+            f"nothing is pulled to the line by tilt={task.scene.tilt:g} rad and "
+            f"gravity={task.scene.gravity:g} m/s²; give both above 0"
         )
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 

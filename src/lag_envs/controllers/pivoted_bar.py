@@ -179,7 +179,7 @@ class AdaptiveEnergyShapingLQR:
             raise ValueError("this controller is for a bar on a track whose com_distance is drawn")
         late = task.imperfections.action_delay
         if late[0] != late[1] or late[0] % 1.0:
-            raise ValueError(f"actions must be late by whole control steps, got {late}")
+            raise ValueError(f"actions must be late by a whole number of control steps, got {late}")
         self.delay = int(late[0])
         self.task, self.catch, self.lose, self.pump, self.centring = task, catch, lose, pump, centring
         self.fade, self.weight = fade, (1.0 - fade) / noise**2

@@ -24,9 +24,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs import sharing
-from lag_envs.stepping.compiling import BLOCK, compile_function
-from lag_envs.stepping.flows import section, split
-from lag_envs.stepping.tracing import Trace
+from lag_envs.envs.lines import block, draw, function, indent, load, next_episode, recorded, store
+from lag_envs.stepping.compiling import BLOCK
+from lag_envs.stepping.flows import split
 
 DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
 SLOW = -3  #: status of a step that the fast formula does not cover
@@ -142,7 +142,7 @@ class Program:
             return state + formulas.sample_targets(draws[states:], numbers)
 
         def lines(formula: Callable, inputs: Sequence, outputs: Sequence[str]) -> list[str]:
-            return _lines(formula, inputs, outputs, formulas.trace)
+            return recorded(formula, inputs, outputs, formulas.trace)
 
         top = formulas.largest
         self.clip = [
@@ -161,13 +161,13 @@ class Program:
         self.last = lines(last, step, ["r"]) if formulas.has_last else []
         draws, kicked = [f"draw{i}" for i in range(formulas.draws)], [f"e{i}" for i in range(width)]
         self.kick = (
-            _draw(draws, "np.uint64(n)") + lines(kick, [*draws, *self.z, *given], kicked) if draws else []
+            draw(draws, "np.uint64(n)") + lines(kick, [*draws, *self.z, *given], kicked) if draws else []
         )
         self.moved = kicked if draws else self.z
         self.move = [f"{a} = {b}" for a, b in zip(self.y, self.moved, strict=True)]
         self.observe = lines(observe, [*self.g, *self.y, *given], self.o)
         draws, names = ([f"{name}{i}" for i in range(states + targets)] for name in ("draw", "s"))
-        self.sample = _draw(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
+        self.sample = draw(draws, "np.uint64(0)") + lines(start, [*draws, *given], names)
         self.lift = formulas.lift("y")
 
     @property
@@ -187,14 +187,14 @@ class Program:
         """
         at = self._at_one
         body = [
-            *self._constants_one(), *_load(at, [*self.y, *self.g, "n"]),
+            *self._constants_one(), *load(at, [*self.y, *self.g, "n"]),
             *([f"a0 = {'a' if len(self.a) == 1 else 'a[0]'}"] if self.a else []),
             *(f"{name} = a[{i}]" for i, name in enumerate(self.a) if i > 0),
-            *self.control, *self.fast, *self._advance_one, *_store(at, self.u),
+            *self.control, *self.fast, *self._advance_one, *store(at, self.u),
             *self._finish_one(),
         ]  # fmt: skip
         helpers = [self.advance] if self.general else []
-        return _function("step_one", "f, obs, a, ids", body, *helpers)
+        return function("step_one", "f, obs, a, ids", body, *helpers)
 
     @property
     def _advance_one(self) -> list[str]:
@@ -203,31 +203,31 @@ class Program:
             f"return 0.0, {SLOW}",
         ]
         if not self.general:
-            return ["if not within:", *_indent(slow)]
+            return ["if not within:", *indent(slow)]
         call = ", ".join([*self.y, *self.u, "dt", str(self._x), *self._stepper.constants])
         first = len(self.kept + self.scratch) + len(self.uniform)
         return [
             f"{', '.join(self.z)}, status = advance(f[{first}:], {call})",
-            "if status < 0:", *_indent(slow),
+            "if status < 0:", *indent(slow),
         ]  # fmt: skip
 
     @cached_property
     def finish_one(self) -> Callable:
         """``finish_one(f, obs, ids)``: the rest of a step whose rows ``z`` were filled in by `advance`."""
-        rows = _load(self._at_one, [*self.y, *self.z, *self.g, *self.u, "n"])
-        return _function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
+        rows = load(self._at_one, [*self.y, *self.z, *self.g, *self.u, "n"])
+        return function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
 
     @cached_property
     def start_one(self) -> Callable:
         """``start_one(f, obs, ids, state_given, target_given)``: begin an episode, sampling the rest."""
         rows = [*self.y[: self.n_state], *self.g]
         body = [
-            *self._constants_one(), *_load(self._at_one, rows),
-            *_next_episode("0", "1", "2"), *self._start, *self.observe,
-            *_store(self._at_one, [*self.y, *self.g, *self.u, "n", *self.drawn]),
+            *self._constants_one(), *load(self._at_one, rows),
+            *next_episode("0", "1", "2"), *self._start, *self.observe,
+            *store(self._at_one, [*self.y, *self.g, *self.u, "n", *self.drawn]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
         ]  # fmt: skip
-        return _function("start_one", "f, obs, ids, state_given, target_given", body)
+        return function("start_one", "f, obs, ids, state_given, target_given", body)
 
     @cached_property
     def advance(self) -> Callable:
@@ -253,18 +253,18 @@ class Program:
             *(f"{a} = actions[i, {j}]" for j, a in enumerate(self.a)),
             *(f"{g} = targets[i, {j}]" for j, g in enumerate(self.g)),
             *self.control, *self.fast,
-            *(step if self.general else ["if not within:", *_indent(step)]),
-            *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            *(step if self.general else ["if not within:", *indent(step)]),
+            *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             *(f"ends[i, {j}] = z{j}" for j in range(n)),
             "rewards[i] = r", "ended[i] = over > 0.0",
         ]  # fmt: skip
         body = [
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             *([f"rows = np.zeros({self._stepper.scratch})"] if self.general else []),
-            "for i in range(states.shape[0]):", *_indent(row),
+            "for i in range(states.shape[0]):", *indent(row),
             "return 0",
         ]  # fmt: skip
-        return _function("model", "states, actions, targets, par, ends, rewards, ended", body, self.advance)
+        return function("model", "states, actions, targets, par, ends, rewards, ended", body, self.advance)
 
     @property
     def _rows(self) -> list[str]:
@@ -287,14 +287,14 @@ class Program:
     def _constants_one(self) -> list[str]:
         first = len(self.kept + self.scratch)
         uniform = [f"k_{name} = f[{first + j}]" for j, name in enumerate(self.uniform)]
-        return uniform + _load(self._at_one, [f"k_{name}" for name in self.varying])
+        return uniform + load(self._at_one, [f"k_{name}" for name in self.varying])
 
     def _finish_one(self) -> list[str]:
         return [
-            *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+            *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
             "n = n + 1.0", *(["key = ids[2]"] if self.kick else []), *self.kick, *self.move,
             "if n >= k_limit:", "    over = over + 2.0",
-            *self.observe, *_store(self._at_one, [*self.y, "n"]),
+            *self.observe, *store(self._at_one, [*self.y, "n"]),
             *(f"obs[{j}] = {o}" for j, o in enumerate(self.o)),
             "return r, np.int64(over)",
         ]  # fmt: skip
@@ -303,7 +303,7 @@ class Program:
     def _start(self) -> list[str]:
         return [
             *self.sample,
-            "if not state_given:", *_indent([f"y{i} = s{i}" for i in range(self.n_state)]),
+            "if not state_given:", *indent([f"y{i} = s{i}" for i in range(self.n_state)]),
             *(
                 ["if not target_given:", *(f"    {g} = s{self.n_state + i}" for i, g in enumerate(self.g))]
                 if self.g
@@ -324,28 +324,28 @@ class Program:
         """A step of the environments of the blocks that a thread claims, see `sharing.compile_step_all`."""
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
-        inputs = _load(_at, [*varying, *y, *self.g, "n"])
+        inputs = load(_at, [*varying, *y, *self.g, "n"])
         results = ["n", "over", "r", "ordinary", *self.o]
         key = ["key = ids[last + first + i]"] if self.kick else []
-        controls = [*_load(_at, self.a), *self.control]
+        controls = [*load(_at, self.a), *self.control]
         if self.general:
             rows = dict(zip(self._stepper.rows, self.flow, strict=True))
             # The status of a lane that is to be restarted tells that it is not to be stepped.
             before = [
                 *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
-                *_store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
+                *store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
             ]  # fmt: skip
             after = [f"{name} = {_at(rows[name])}" for name in self._stepper.results]
             start, dt = f"np.int64({len(self.uniform)})", "k_dt"
             call = f"advance_block(par, {start}, size, {dt}, np.int64({self._x}))"
-            moving = [*_block(lane, before), call]
-            move = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
-            again = [*_load(_at, self.u), *self.fast, *after, *self._stepper.finish]
+            moving = [*block(lane, before), call]
+            move = [*load(_at, self.u), *self.fast, *after, *self._stepper.finish, "within = status > 0.0"]
+            again = [*load(_at, self.u), *self.fast, *after, *self._stepper.finish]
             helpers = [self._stepper.compile_block()]
         else:
             moving, move = [], [*controls, *self.fast]
             call = ", ".join([*y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
-            again = [*_load(_at, self.u), f"{', '.join(z)}, status = advance({call})"]
+            again = [*load(_at, self.u), f"{', '.join(z)}, status = advance({call})"]
             helpers = [self.advance]
         # Where the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
         special = " and not over > 0.0" if self.last else ""
@@ -356,34 +356,34 @@ class Program:
             "n = n + 1.0", "over = select(n >= k_limit, over + 2.0, over)", *key, *self.kick,
             *(f"y{i} = select(plain, {value}, y{i})" for i, value in enumerate(self.moved)),
             "n = select(plain, select(over > 0.0, -over, n), n - 1.0)",
-            *self.observe, *_store(_at, [*y, *([] if self.general else self.u), *results]),
+            *self.observe, *store(_at, [*y, *([] if self.general else self.u), *results]),
         ]  # fmt: skip
         redo = [
             f"if {_at('ordinary')} == 0.0:",
-            *_indent([
+            *indent([
                 *inputs, *again,
                 "if status < 0:",
                 "    refused = max(refused, first + i + np.uint64(1))",
                 f"    {_at('over')} = 0.0",
                 "else:",
-                *_indent([
-                    *self.outcome, *(["if over > 0.0:", *_indent(self.last)] if self.last else []),
+                *indent([
+                    *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
                     "n = n + 1.0",
                     "if n >= k_limit:", "    over = over + 2.0",
                     *key, *self.kick, *self.move, *self.observe,
                     "if over > 0.0:", "    n = -over",
-                    *_store(_at, [*y, "n", "over", "r", *self.o]),
+                    *store(_at, [*y, "n", "over", "r", *self.o]),
                 ]),
             ]),
         ]  # fmt: skip
         restart = [
             f"if {_at('ordinary')} == 2.0:",
-            *_indent([
-                *_load(_at, [*varying, *self.g]),
-                *_next_episode("first + i", "second + first + i", "last + first + i"),
+            *indent([
+                *load(_at, [*varying, *self.g]),
+                *next_episode("first + i", "second + first + i", "last + first + i"),
                 "state_given, target_given = False, False", *self._start, "r = 0.0", "over = 0.0",
                 *self.observe,
-                *_store(_at, [*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
+                *store(_at, [*y, *self.g, *self.u, "n", *self.drawn, "over", "r", *self.o]),
             ]),
         ]  # fmt: skip
         output = [
@@ -401,16 +401,16 @@ class Program:
                 *(
                     line
                     for j, a in enumerate(self.a)
-                    for line in _block(lane, [f"{_at(a)} = action[{self._action(j)}]"])
+                    for line in block(lane, [f"{_at(a)} = action[{self._action(j)}]"])
                 ),
                 *moving,
-                *_block(lane, main),
-                *_block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
-                "if slow > 0:", *_indent(_block(lane, redo)),
-                "if restarts > 0:", *_indent(_block(lane, restart)),
-                *_block(lane, output),
+                *block(lane, main),
+                *block(lane, [f"slow += {_at('ordinary')} == 0.0", f"restarts += {_at('ordinary')} == 2.0"]),
+                "if slow > 0:", *indent(block(lane, redo)),
+                "if restarts > 0:", *indent(block(lane, restart)),
+                *block(lane, output),
                 # One loop per entry: one that writes to many arrays would have to check them for overlap.
-                *(line for entry in _observations(self.o) for line in _block(lane, [entry])),
+                *(line for entry in _observations(self.o) for line in block(lane, [entry])),
             ]),
         ]  # fmt: skip
         return self._batch("step_blocks", STEP_BLOCKS, body, *helpers, *sharing.claiming())
@@ -422,7 +422,7 @@ class Program:
             "overs, refused, taken = np.uint64(0), np.uint64(0), np.uint64(0)",
             claim.format("np.uint64(0)"),
             "while block < blocks:",
-            *_indent([*self._place, *body, "taken += np.uint64(1)", claim.format("tried")]),
+            *indent([*self._place, *body, "taken += np.uint64(1)", claim.format("tried")]),
             "hand_in(ids, at, taken, overs, refused)",
         ]  # fmt: skip
 
@@ -439,9 +439,9 @@ class Program:
             "    bad += not (abs(action[i]) < math.inf)",
             "if bad > 0:",
             "    for i in range(count):",
-            *_indent([line for test in found for line in (test, "    return -(i + 1)")], 2),
+            *indent([line for test in found for line in (test, "    return -(i + 1)")], 2),
         ]  # fmt: skip
-        return _function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
+        return function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
 
     def _action(self, j: int) -> str:
         """Return where action j of the environment at hand lies in the batch's array."""
@@ -457,13 +457,13 @@ class Program:
         varying = [f"k_{name}" for name in self.varying]
         start = [
             "if mask[first + i] or whole:",
-            *_indent([
-                *_load(_at, [*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
+            *indent([
+                *load(_at, [*dict.fromkeys([*varying, *self.y, *self.g, *self.u, "n", *self.drawn])]),
                 "if mask[first + i]:",
-                *_indent([
-                    *_next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
+                *indent([
+                    *next_episode("first + i", "second + first + i", "last + first + i"), *self._start,
                 ]),
-                *self.observe, *_store(_at, [*self.y, *self.g, *self.u, "n", *self.drawn]),
+                *self.observe, *store(_at, [*self.y, *self.g, *self.u, "n", *self.drawn]),
                 *_observations(self.o, "{}"),
             ]),
         ]  # fmt: skip
@@ -471,7 +471,7 @@ class Program:
             *(f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)),
             "second, last = np.uint64(count), np.uint64(2 * count)",
             f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
-            *_indent([*self._place, self._base, *_block("for i in range(size):", start)]),
+            *indent([*self._place, self._base, *block("for i in range(size):", start)]),
         ]  # fmt: skip
         return self._batch(
             "start_all", "f, ids, par, obs, mask, whole, state_given, target_given, count", body
@@ -487,7 +487,7 @@ class Program:
 
         # Indices are unsigned: a signed one might be negative, which by NumPy's rules makes a branch.
         lines = [re.sub(r"row_(\w+)\[i\]", place, line) for line in body]
-        return _function(name, arguments, lines, *helpers)
+        return function(name, arguments, lines, *helpers)
 
     @property
     def _place(self) -> list[str]:
@@ -511,41 +511,3 @@ def _at(row: str) -> str:
 def _observations(names: Sequence[str], value: str = _at("{}")) -> list[str]:
     """Put the observation's numbers into the batch's array, one row per entry."""
     return [f"obs[{j}, first + i] = {value.format(o)}" for j, o in enumerate(names)]
-
-
-def _next_episode(key: str, episode: str, episode_key: str) -> list[str]:
-    return [
-        f"ids[{episode}] += np.uint64(1)",
-        f"key = episode_key(ids[{key}], ids[{episode}])",
-        f"ids[{episode_key}] = key",
-    ]
-
-
-def _block(head: str, body: Sequence[str]) -> list[str]:
-    return [head, *_indent(body)]
-
-
-def _lines(formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], trace: type[Trace]) -> list[str]:
-    """Record a formula; outputs that turned out constant are assigned as well."""
-    lines, values = section(formula, inputs, outputs, trace)
-    return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
-
-
-def _draw(names: Sequence[str], step: str) -> list[str]:
-    return [f"{name} = uniform(key, {step}, np.uint64({i}))" for i, name in enumerate(names)]
-
-
-def _load(at: Callable, rows: Sequence[str]) -> list[str]:
-    return [f"{row} = {at(row)}" for row in rows]
-
-
-def _store(at: Callable, rows: Sequence[str]) -> list[str]:
-    return [f"{at(row)} = {row}" for row in rows]
-
-
-def _indent(lines: Sequence[str], levels: int = 1) -> list[str]:
-    return ["    " * levels + line for line in lines]
-
-
-def _function(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
-    return compile_function(name, "\n".join([f"def {name}({arguments}):", *_indent(body), ""]), *helpers)

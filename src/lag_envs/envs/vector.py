@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from lag_envs.envs import sharing, snapshots
 from lag_envs.envs.actions import Actions, single_number
-from lag_envs.envs.imperfect import numbers_of, program_of
+from lag_envs.envs.imperfect.numbers import numbers_of
+from lag_envs.envs.imperfect.programs import program_of
 from lag_envs.envs.program import BLOCK
 from lag_envs.envs.single import (
     FLOAT32,

@@ -463,7 +463,7 @@ def audit(
     pin : Path, optional
         What to hold the log against; by default the release's own, if it is of this board.
     everything : bool
-        Whether to verify every result anew, as a whole, and to compare all submissions with each other. By
+        Whether to verify every result again, as a whole, and to compare all submissions with each other. By
         default `SAMPLE` episodes of each policy are played again, and those that were recorded.
     tell : callable
         Told each finding.
@@ -548,7 +548,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
                     if not _same_episode(told, made[told["reset_seed"]])
                 ][tolerated:]
         results += 1
-        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} anew" for what in odd]
+        finding.wrong += [f"{where} has {plain(what)}; verify {entry.id} again" for what in odd]
     finding.told = f"{played} episodes of {results} results were played again"
     return finding
 
@@ -569,7 +569,7 @@ def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
 
 
 def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
-    """Verify every result anew, compare all submissions, and play the references."""
+    """Verify every result again, compare all submissions, and play the references."""
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import verify
 
@@ -584,7 +584,7 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
         except (Refused, ValueError) as error:
             finding.wrong.append(f"{where} cannot be verified again: {plain(error)}; withdraw {entry.id}")
             continue
-        finding.wrong += [f"{where} differs in {what}; verify {entry.id} anew" for what in compared.far]
+        finding.wrong += [f"{where} differs in {what}; verify {entry.id} again" for what in compared.far]
         same, bits = same + (not compared.far), bits + compared.same
     finding.told = f"{same} results are what the submissions get, {bits} of them to the bit"
     for what in (*_links(board, found), *_references(found)):

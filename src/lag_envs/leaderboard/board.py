@@ -119,7 +119,7 @@ class Board:
         try:
             return unpacked(content)
         except ValueError as error:
-            raise BoardError(f"{path} is no result: {error}; verify {entry.id} anew") from None
+            raise BoardError(f"{path} is not a result: {error}; verify {entry.id} again") from None
 
     def result_file(self, entry: Entry) -> Path:
         """Return the place of a submission's result under a protocol."""
@@ -346,7 +346,7 @@ def current(state: State, what: str) -> Protocol:
     if odd := [name for name, rule in protocol.rules().items() if rule != frozen[name]]:
         raise BoardError(
             f"this version of lag_envs cannot {what} a board of protocol {state.number}: {odd[0]} differ; "
-            "`lag-envs leaderboard open` begins the next protocol, under which all is verified anew"
+            "`lag-envs leaderboard open` begins the next protocol, under which all is verified again"
         )
     return found
 

@@ -29,7 +29,7 @@ lag-envs leaderboard list PivotedBar-v0""",
 lag-envs leaderboard show PivotedBar-v0-ppo-c1dc3900 --json""",
     "withdraw": 'lag-envs leaderboard withdraw PivotedBar-v0-ppo-c1dc3900 --reason "asked for"',
     "audit": """lag-envs leaderboard audit
-lag-envs leaderboard audit --all                     every result anew""",
+lag-envs leaderboard audit --all                     every result again""",
     "pin": "lag-envs leaderboard pin",
     "open": "lag-envs leaderboard open",
     "build": "lag-envs leaderboard build site",
@@ -62,7 +62,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
 
     def source(one: argparse.ArgumentParser) -> None:
         one.add_argument(
-            "--source", metavar="URL", default="", help="https address at which anybody finds the nonce"
+            "--source", metavar="URL", default="", help="https address where anybody finds the nonce"
         )
 
     def parallel_options(one: argparse.ArgumentParser) -> None:
@@ -89,8 +89,8 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "value",
         metavar="VALUE",
         nargs="?",
-        help="best one that nobody can choose, such as the next pulse of a public beacon (default: the hash"
-        " of the last commit, which has to hold the board as it is)",
+        help="ideally one that nobody can choose, such as the next pulse of a public beacon (default: the"
+        " hash of the last commit, which has to hold the board as it is)",
     )
     source(one)
     parallel_options(one)
@@ -100,24 +100,24 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--json", action="store_true", help="as JSON, with curves, profile and replays")
     one.add_argument(
-        "--protocol", metavar="N", type=_positive, help="on the board of this one (default: the current)"
+        "--protocol", metavar="N", type=_positive, help="on the board of this protocol (default: the current)"
     )
     one = action("withdraw", "take a submission off the board", _withdraw)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--reason", metavar="TEXT", required=True, help="shown on the page")
-    one = action("audit", "check that everything is what was noted when it came onto the board", _audit)
+    one = action("audit", "check that nothing has changed since it came onto the board", _audit)
     one.add_argument(
-        "--all", action="store_true", help="verify every result anew, in place of a few episodes (minutes)"
+        "--all", action="store_true", help="verify every result again, instead of a few episodes (minutes)"
     )
     one.add_argument(
-        "--pin", metavar="FILE", type=Path, help="what to hold the log against (default: the release's)"
+        "--pin", metavar="FILE", type=Path, help="what to check the log against (default: the release's)"
     )
     one = action("pin", "write the log's head into a file that a release carries", _pin)
     one.add_argument("file", metavar="FILE", nargs="?", type=Path, help="default: that of this package")
     one = action(
         "open",
         "open boards of environments that have none; else begin the next protocol: freeze the scale as "
-        "it is now, and verify all anew under it",
+        "it is now, and verify all again under it",
         _open,
     )
     one = action("build", "write the page", _build)

@@ -47,7 +47,7 @@ def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
         link, _, name = line.strip().partition(" ")
         name = name.strip()
         if not name or len(name) > NAME or not name.isprintable():
-            raise BoardError(f"{where}: write a link, a blank and a name of at most {NAME} characters")
+            raise BoardError(f"{where}: write a link, a space and a name of at most {NAME} characters")
         try:
             drive = read_link(link)
             played = replay(drive)
@@ -61,7 +61,7 @@ def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
             raise BoardError(f"{where}: the drive stops before its episode's end; remove the line")
         anchor = f"#{link.rpartition('#')[2]}"
         if anchor in seen:
-            raise BoardError(f"{where}: this drive is there already; remove the line")
+            raise BoardError(f"{where}: this drive is already listed; remove the line")
         seen.add(anchor)
         entry = {"name": name, "link": anchor, "return": played.total, "score": played.score}
         found.setdefault(drive.id, []).append(entry)

@@ -72,7 +72,9 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
         For each of the paths, if all are files, the pickled ``VecNormalize``.
     """
     if normalise and (len(normalise) != len(paths) or any(p.is_dir() for p in paths)):
-        raise ExportError(f"{len(normalise)} normalisations for {len(paths)} paths: one file for each file")
+        raise ExportError(
+            f"{len(normalise)} normalisations for {len(paths)} paths: give one file for each path"
+        )
     found: list[Source] = []
     for i, path in enumerate(paths):
         if path.is_file():
@@ -80,7 +82,7 @@ def find(paths: Sequence[Path], normalise: Sequence[Path] = ()) -> list[Source]:
             continue
         folders = [path] if (path / MODEL).exists() else sorted(f.parent for f in path.glob(f"*/{MODEL}"))
         if not folders:
-            raise ExportError(f"{path} is no model, nor a folder with {MODEL} in it or one level below")
+            raise ExportError(f"{path} is neither a model nor a folder with {MODEL} in it or one level below")
         for folder in folders:
             result, norm = folder / RESULT, folder / NORMALISATION
             found.append(
@@ -97,7 +99,7 @@ def _json(file: Path) -> Mapping[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
-            raise ValueError("it holds no object")
+            raise ValueError("it does not hold an object")
     except (OSError, ValueError) as error:
         raise ExportError(f"{file} cannot be read: {error}") from error
     return content
@@ -113,11 +115,11 @@ def _algorithm(source: Source) -> str:
             data = json.loads(archive.read("data"))
         module = data["policy_class"]["__module__"]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise ExportError(f"{file} is no model of Stable-Baselines3: {error}") from error
+        raise ExportError(f"{file} is not a model of Stable-Baselines3: {error}") from error
     names = [name for name, (*_, known) in ALGORITHMS.items() if known == module]
     if not names:
         raise ExportError(
-            f"{file} has a policy of {module}, which is not known; --algo says what it is like: "
+            f"{file} has a policy of {module}, which is not known; name one that it is like with --algo: "
             + ", ".join(ALGORITHMS)
         )
     return "a2c" if "a2c" in names and "n_epochs" not in data else names[0]
@@ -208,14 +210,14 @@ def convert(
     linear, activations = layers[::2], layers[1::2]
     names = {type(a).__name__ for a in activations}
     if any(type(a).__name__ != "Linear" for a in linear) or len(linear) != len(activations) + 1:
-        raise ExportError(f"the network must be of linear layers and activations by turns, got {layers}")
+        raise ExportError(f"the network must alternate linear layers and activations, got {layers}")
     if len(names) > 1 or not names <= set(ACTIVATIONS):
         raise ExportError(
             f"all activations must be one of {', '.join(ACTIVATIONS)}, got {', '.join(sorted(names))}"
         )
     for a in activations:
         if getattr(a, "alpha", 1.0) != 1.0 or getattr(a, "negative_slope", 0.01) != 0.01:
-            raise ExportError(f"{a} has another parameter than PyTorch's usual one")
+            raise ExportError(f"{a} has a parameter other than PyTorch's default")
     arrays = {}
     for k, layer in enumerate(linear):
         arrays[f"weight_{k}"] = layer.weight.detach().numpy().copy()
@@ -351,9 +353,9 @@ def export(
     if env not in protocol.boards():
         raise ExportError(f"there is no environment {env!r}; there are {', '.join(protocol.boards())}")
     if os.path.lexists(folder):
-        raise ExportError(f"{folder} is there already; remove it, or choose another place")
+        raise ExportError(f"{folder} already exists; remove it, or choose another place")
     if seconds is None and any("wall_seconds" not in (s.result or {}) for s in sources):
-        raise ExportError("it is not known how long a training took; --seconds tells")
+        raise ExportError("it is not known how long a training took; give --seconds")
     tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
     for number, source in enumerate(sources):
         model, normalise = None, None
@@ -378,7 +380,7 @@ def export(
             )
         result = source.result or {}
         if model is None and env_steps is None and "trained" not in result:
-            raise ExportError(f"{source.model}: it is not known how long it was trained; --env-steps tells")
+            raise ExportError(f"{source.model}: it is not known how long it was trained; give --env-steps")
         seed = result.get("seed", getattr(model, "seed", None))
         seed = number if seed is None or int(seed) in arrays else int(seed)
         if seed in arrays:
@@ -410,7 +412,7 @@ def export(
 
 def _same(what: str, values: Sequence[Any], option: str) -> Any:
     if not values or None in values:
-        raise ExportError(f"the {what} is not known; {option} tells")
+        raise ExportError(f"the {what} is not known; give {option}")
     if len(set(values)) > 1:
         raise ExportError(
             f"the models are of more than one {what}: {', '.join(map(str, sorted(set(values))))}"
@@ -454,12 +456,12 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
         "--normalise", metavar="PKL", nargs="+", type=Path, default=[],
         help="pickled VecNormalize, one for each MODEL that is a file",
     )  # fmt: skip
-    add("--algo", choices=list(ALGORITHMS), help="default: found out")
+    add("--algo", choices=list(ALGORITHMS), help="default: detected")
     add("--code", metavar="URL", default="", help="https address of the code it was trained with")
     add("--description", metavar="TEXT", default="", help="a line about it")
-    add("--env-steps", metavar="N", type=int, help="steps of one training (default: what is known)")
-    add("--seconds", metavar="S", type=float, help="wall time of one training (default: what is known)")
-    add("--hardware", metavar="TEXT", help="what it was trained on (default: what is known; this machine)")
+    add("--env-steps", metavar="N", type=int, help="steps of one training (default: as recorded)")
+    add("--seconds", metavar="S", type=float, help="wall time of one training (default: as recorded)")
+    add("--hardware", metavar="TEXT", help="what it was trained on (default: as recorded, else this machine)")
 
 
 def run_export(args: argparse.Namespace) -> int:

@@ -46,4 +46,4 @@ def read_plain(path: Path, most: int) -> bytes:
 
 
 def _not_plain() -> OSError:
-    return OSError(errno.EINVAL, "it is no plain file; links, pipes, folders and devices are not read")
+    return OSError(errno.EINVAL, "it is not a plain file; links, pipes, folders and devices are not read")

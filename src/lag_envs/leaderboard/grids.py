@@ -98,7 +98,7 @@ class Table(Architecture):
         axes = [arrays[f"axis_{j}"] for j in range(len(self.axes))]
         for j, axis in enumerate(axes):
             if not (axis[1:] > axis[:-1]).all():
-                raise Refused(f"the nodes of axis_{j} must grow")
+                raise Refused(f"the nodes of axis_{j} must increase")
         grid = _Grid(self, axes, arrays["table"])
         if self.kind == "action":
             return _LookUp(self.task, grid)

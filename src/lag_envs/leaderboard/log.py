@@ -199,12 +199,12 @@ def load_json(content: bytes) -> Any:
         return found
 
     def constant(name: str) -> Any:
-        raise ValueError(f"{name} is no number of JSON")
+        raise ValueError(f"{name} is not a number in JSON")
 
     try:
         return json.loads(content.decode(), object_pairs_hook=once, parse_constant=constant)
     except RecursionError:
-        raise ValueError("it is nested too deep") from None
+        raise ValueError("it is nested too deeply") from None
 
 
 @dataclass(frozen=True)
@@ -461,7 +461,7 @@ def _change(state: State, event: Verified | Rejected | Withdrawn) -> None:
         raise ValueError(f"{event.id} is {event.event}, and was never added; restore the line that adds it")
     if isinstance(event, Withdrawn):
         if known.state == "withdrawn":
-            raise ValueError(f"{event.id} is withdrawn, and was so before")
+            raise ValueError(f"{event.id} is withdrawn, but was withdrawn already")
         state.entries[event.id] = replace(known, state="withdrawn", reason=event.reason)
         return
     if known.state != "pending":
@@ -578,7 +578,7 @@ def write_event(log: int, told: dict[str, Any]) -> Line:
     try:
         event = checked(_EVENTS, told)
     except ValueError as error:
-        raise BoardError(f"this cannot be noted: {error}") from None
+        raise BoardError(f"this cannot be logged: {error}") from None
     line += json.dumps(told, ensure_ascii=False).encode() + b"\n"
     try:
         if os.write(log, line) < len(line):

@@ -124,7 +124,7 @@ class Curve(Strict):
     @model_validator(mode="after")
     def _fit(self) -> Self:
         if len(self.steps) != len(self.returns) or any(b <= a for a, b in pairwise(self.steps)):
-            raise ValueError("steps must grow, and be as many as the returns")
+            raise ValueError("steps must increase, one for each return")
         return self
 
 
@@ -189,7 +189,7 @@ def load(folder: Path | str) -> Submission:
     numbers = sum(array.size for _, policy in policies for array in policy.arrays.values())
     if made.counts_as == "learned" and numbers > protocol.ALL_NUMBERS:
         raise Refused(
-            f"the networks have {numbers:,} numbers together, {protocol.ALL_NUMBERS:,} are the most"
+            f"the networks have {numbers:,} numbers together, at most {protocol.ALL_NUMBERS:,} are accepted"
         )
     if told.kind == "learned":
         _check_different(policies)
@@ -238,7 +238,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
     """
     try:
         if not stat.S_ISDIR(os.lstat(folder).st_mode):
-            raise Refused(f"{shown(str(folder))} is no folder (links are not followed)")
+            raise Refused(f"{shown(str(folder))} is not a folder (links are not followed)")
         with os.scandir(folder) as entries:
             names = [entry.name for entry, _ in zip(entries, range(protocol.MOST_POLICIES + 2), strict=False)]
     except OSError as error:
@@ -259,7 +259,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
         except OSError as error:
             raise Refused(f"{name} cannot be read: {error.strerror}") from error
         if not stat.S_ISREG(about.st_mode):
-            raise Refused(f"{name} is no plain file; links, folders and devices are refused")
+            raise Refused(f"{name} is not a plain file; links, folders and devices are refused")
         most = protocol.TOML_BYTES if name == TOML else protocol.POLICY_BYTES
         if about.st_size > most:
             raise Refused(f"{name} has {about.st_size} bytes, at most {most} are accepted")
@@ -289,16 +289,16 @@ def _parse(content: bytes) -> dict[str, Any]:
     try:
         text = content.decode()
     except UnicodeDecodeError as error:
-        raise Refused(f"{TOML} is no UTF-8 text (byte {error.start})") from error
+        raise Refused(f"{TOML} is not UTF-8 text (byte {error.start})") from error
     # Reading keys of many parts takes time in proportion to the square of their number.
     if any(len(line) > protocol.LINE for line in text.split("\n")):
         raise Refused(f"{TOML} has a line of more than {protocol.LINE} characters; break it")
     try:
         return tomllib.loads(text)
     except RecursionError as error:
-        raise Refused(f"{TOML} is nested too deep") from error
+        raise Refused(f"{TOML} is nested too deeply") from error
     except Exception as error:  # not only TOMLDecodeError: numbers of too many digits, dates
-        raise Refused(f"{TOML} is no TOML: {shown(str(error))}") from error
+        raise Refused(f"{TOML} is not valid TOML: {shown(str(error))}") from error
 
 
 def _training(told: Training, found: list[int]) -> dict[str, Any]:
@@ -359,7 +359,9 @@ def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[
         _check_header(content)
         found = read(content)
     except (SafetensorError, ValueError, KeyError) as error:
-        raise Refused(f"{name} is no safetensors file as needed here: {plain(error)[:200]}") from error
+        raise Refused(
+            f"{name} is not a safetensors file of the kind needed here: {plain(error)[:200]}"
+        ) from error
     _check_shapes(name, {key: array.shape for key, array in found.items()}, made)
     arrays = {}
     for key, array in found.items():
@@ -385,7 +387,7 @@ def _check_header(content: bytes) -> None:
     try:
         header = json.loads(content[8 : 8 + size].decode(), object_pairs_hook=once)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"its header is no JSON ({error})") from error
+        raise ValueError(f"its header is not JSON ({error})") from error
     for key, entry in header.items() if isinstance(header, dict) else ():
         if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
             raise ValueError(f"{plain(key)} must have dtype, shape and data_offsets and nothing else")
@@ -466,7 +468,7 @@ def write(
 
     folder, arrays = Path(folder), arrays or {}
     if os.path.lexists(folder):
-        raise FileExistsError(f"{folder} is there already")
+        raise FileExistsError(f"{folder} already exists")
     # The oldest that knows such policies, so that what is written stays what it is.
     schema = architecture(env, policy).schema if env in protocol.boards() else 1
     told: dict[str, Any] = {

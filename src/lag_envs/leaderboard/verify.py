@@ -270,7 +270,7 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
     try:
         found = load_json(read_plain(file, UNPACKED))
         if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
-            raise ValueError("it is no list of results")
+            raise ValueError("it is not a list of results")
         told = ({key: value for key, value in r.items() if key != "folder"} for r in found)
         return {r["digest"]: check(r) for r in told if "refused" not in r}
     except (OSError, ValueError, KeyError) as error:

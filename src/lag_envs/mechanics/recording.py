@@ -201,7 +201,7 @@ def single(value: Any, what: str = "") -> Expr:
     try:
         return Expr.of(value)
     except FormulaError:
-        raise FormulaError(f"{what}returns {value!r:.60}, which is no real number") from None
+        raise FormulaError(f"{what}returns {value!r:.60}, which is not a real number") from None
 
 
 def record(scene: Any, layout: Layout) -> Record:
@@ -287,7 +287,7 @@ def _check_controls(scene: Any, layout: Layout, found: Record) -> None:
     for name in layout.controls:
         if name not in used and name not in moving:
             raise FormulaError(
-                f"{type(scene).__name__}: the control {name!r} reaches nothing; use u.{name} in applied or "
+                f"{type(scene).__name__}: the control {name!r} has no effect; use u.{name} in applied or "
                 "dissipation, or name it s_ddot, s_dot or s after a prescribed coordinate s"
             )
 

@@ -174,7 +174,9 @@ def check_parameters(scene: Any, parameters: Sequence[str]) -> tuple[str, ...]:
         if name in found[:i]:
             raise ValueError(f"the parameter {name!r} is named twice")
         if not math.isfinite(getattr(scene, name)):
-            raise ValueError(f"{name}={getattr(scene, name)}: by what is infinite there are no derivatives")
+            raise ValueError(
+                f"{name}={getattr(scene, name)} is infinite, and has no derivatives; leave it out"
+            )
     return found
 
 

@@ -86,7 +86,7 @@ def _check_class(cls: type, base: type) -> None:
         raise FormulaError(f"{of}.{faults[0]}")
     if not cls.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         raise FormulaError(
-            f"{of} is no frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)"
+            f"{of} is not a frozen dataclass; write @dataclasses.dataclass(frozen=True, kw_only=True)"
         )
 
 

@@ -229,7 +229,7 @@ def _name(symbol: Any) -> str:
         return symbol.func.__name__
     if isinstance(symbol, sympy.Symbol):
         return symbol.name
-    raise FormulaError(f"{symbol!r} is no SymPy symbol or function of time; it cannot be a name")
+    raise FormulaError(f"{symbol!r} is neither a SymPy symbol nor a function of time; it cannot be a name")
 
 
 def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:

@@ -150,7 +150,7 @@ class Number:
         whole = not isinstance(exponent, bool) and isinstance(exponent, numbers.Real)
         if not whole or float(exponent) != int(float(exponent)):
             raise TypeError(
-                f"the power {exponent!r} is no whole number; write xp.exp(p * xp.log(x)) for others"
+                f"the power {exponent!r} is not a whole number; write xp.exp(p * xp.log(x)) for others"
             )
         power: Any = 1.0
         for bit in bin(abs(int(float(exponent))))[2:]:

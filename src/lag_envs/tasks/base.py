@@ -599,7 +599,7 @@ class TaskFormulas:
         if self.choices and len(self.choices) != self.actions:
             raise FormulaError(
                 f"{type(task).__name__}.action mixes lists of values with ranges; "
-                "give each control one or each the other"
+                "give every control a list, or every control a range"
             )
         self.clipped = not self.choices
         #: The action of the largest control.

@@ -309,14 +309,14 @@ def _draw(task: Task, name: str, given: Any) -> Draw:
         raise ValueError(f"{where}: it cannot be drawn, {why}; what can be is {', '.join(numbers)}")
     if not isinstance(given, Sequence) or isinstance(given, str) or len(given) < 2:
         raise ValueError(
-            f'{where} must be (low, high), with "log" and "absolute" behind where they are meant, got '
+            f'{where} must be (low, high), followed by "log" and "absolute" where they are meant, got '
             f"{shown(given)}"
         )
     words = list(given[2:])
     for word in words:
         if word not in ("log", "uniform", "absolute", "relative") or words.count(word) > 1:
             raise ValueError(
-                f'{where}: behind low and high may stand "log" or "uniform" and "absolute" or "relative", '
+                f'{where}: after low and high may come "log" or "uniform" and "absolute" or "relative", '
                 f"got {shown(word)}"
             )
     if {"log", "uniform"} <= set(words) or {"absolute", "relative"} <= set(words):

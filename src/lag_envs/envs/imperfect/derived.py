@@ -1,0 +1,125 @@
+"""Constants that follow from drawn parameters."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import Any
+
+from lag_envs.envs.imperfect.twice import Functions, Twice, rounded
+from lag_envs.mechanics.algebra import evaluate
+from lag_envs.mechanics.recording import formula as naming
+from lag_envs.mechanics.recording import parameter, twin
+from lag_envs.stepping.compiling import record_block
+from lag_envs.stepping.elementary import ElementaryTrace
+from lag_envs.stepping.tracing import Number
+from lag_envs.tasks.base import Task
+
+
+class DerivedConstants:
+    """Which constants follow from the drawn parameters, and the lines that compute them.
+
+    They are computed with twice the digits, from the drawn values and the others, and rounded once: an
+    environment has the bits of one that is made with the values.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str]) -> None:
+        drawn = task.drawn
+        assert drawn is not None
+        self._task, self._draws, self._made = drawn.inner, drawn.draws, drawn.made
+        self._scene = self._task.scene
+        self._lags = bool(task.imperfections and task.imperfections.lag)
+        inner = {name: getattr(self._scene, name) for name in self._scene._numbers()}
+        trace = ElementaryTrace()
+        for d in self._draws:
+            inner[d.name] = trace.inputs(d.name)[0]
+        self._follow(inner)
+        parameters = {n for n, x in inner.items() if isinstance(x, Number)}
+        found = self._starts(inner) | {f"self_{n}": x for n, x in inner.items()}
+        found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
+        #: Constants that differ from episode to episode.
+        self.changed = [name for name, x in found.items() if isinstance(x, Number)]
+        self._parameters = parameters
+
+    def _follow(self, numbers: dict[str, Any]) -> None:
+        """Replace the parameters that follow from others."""
+        for name, made in self._made.items():
+            with naming(self._scene, name):
+                numbers[name] = made(twin(self._scene, numbers))
+
+    def _starts(self, numbers: dict[str, Any]) -> dict[str, Any]:
+        """Return centres and half widths of the start."""
+        k = SimpleNamespace(**self._task.formulas.constants())
+        vars(k).update({f"self_{name}": x for name, x in numbers.items()})
+        found = {}
+        with naming(self._task, "start"):
+            given = dict(self._task.formulas._self(k).start)
+        for i, name in enumerate(self._scene.state_names):
+            if name in given:
+                pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
+                found[f"centre{i}"], found[f"half{i}"] = pair
+        return found
+
+    def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
+        """Return the constants of the motion that depend on parameters that change."""
+        form, scene = self._scene._form, self._scene
+        below = {s.name for s in form.inertia.symbols()} if form else set()
+        wanted = dict(form.expressions if form else scene._stepper.expressions())
+        wanted = {n: e for n, e in wanted.items() if changed & ({s.name for s in e.symbols()} | below)}
+        lagged = scene._lagged.expressions() if self._lags else {}
+        lagged = {f"lagged_{n}": e for n, e in lagged.items() if changed & {s.name for s in e.symbols()}}
+        values = {
+            parameter(name): Twice(x) if isinstance(x, Number) else Fraction(x)
+            for name, x in numbers.items()
+            if isinstance(x, Number) or math.isfinite(x)
+        }
+        functions = Functions(trace)
+        found = evaluate(list(wanted.values()), values, functions)
+        if form:
+            (inertia,) = evaluate([form.inertia], values, functions)
+            found = [x / inertia for x in found]
+        found += evaluate(list(lagged.values()), values, functions)
+        return {name: rounded(x) for name, x in zip([*wanted, *lagged], found, strict=True)}
+
+    def lines(self, constants: dict[str, Any]) -> list[str]:
+        """Return the lines that draw parameters from ``share0``, ... and fill in the constants."""
+        trace = ElementaryTrace()
+        outputs: dict[str, Any] = {}
+        for j, d in enumerate(self._draws):
+            given = (constants[f"draw_{name}{j}"] for name in ("base", "low", "high"))
+            base, low, high = (trace.inputs(x)[0] if isinstance(x, str) else x for x in given)
+            (share,) = trace.inputs(f"share{j}")
+            if d.log:
+                factor = trace.exp(trace.log(low) + share * (trace.log(high) - trace.log(low)))
+            else:
+                factor = low + share * (high - low)
+            outputs[f"p_{d.name}"] = base * trace.minimum(trace.maximum(factor, low), high)
+        code, values = record_block(trace, outputs, fused=False)
+        code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
+        # Those that follow are made as Python makes them: one rounding for each operation.
+        trace = ElementaryTrace()
+        numbers = self._given(trace, constants)
+        self._follow(numbers)
+        follow = {f"p_{n}": numbers[n] for n in self._made if n in self._parameters}
+        if follow:
+            more, _ = record_block(trace, follow, fused=False)
+            code += more
+        trace = ElementaryTrace()
+        numbers = self._given(trace, constants) | {n: trace.inputs(f"p_{n}")[0] for n in self._parameters}
+        found = self._starts(numbers) | {f"self_{n}": x for n, x in numbers.items()}
+        found |= self._motion(trace, numbers, self._parameters)
+        results = {f"k_{name}": found[name] for name in self.changed}
+        last, values = record_block(trace, results)
+        rename = [f"{n} = {v}" for n, v in zip(results, values, strict=True) if n != v]
+        return [*code, *last, *rename]
+
+    def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
+        """Return all parameters as inputs; what is zero as zero."""
+        numbers: dict[str, Any] = {}
+        for name in self._scene._numbers():
+            at = constants[f"self_{name}"]
+            numbers[name] = trace.inputs(at)[0] if isinstance(at, str) else 0.0
+        for d in self._draws:
+            numbers[d.name] = trace.inputs(f"p_{d.name}")[0]
+        return numbers

@@ -1,0 +1,64 @@
+"""Random numbers for imperfections: a key for each purpose, uniform numbers, normal noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lag_envs.envs.lines import recorded
+from lag_envs.envs.program import DRAWS
+from lag_envs.stepping.tracing import Trace
+
+#: What has draws of its own, by the number that its key is made with.
+PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
+
+
+def key_of(purpose: str) -> str:
+    """Return the key of an episode's draws for a purpose."""
+    return f"episode_key(key, np.uint64({PURPOSES[purpose]}))"
+
+
+def noise(
+    values: Sequence[str],
+    purpose: str,
+    sigmas: Mapping[str, float],
+    constants: Mapping[str, Any],
+    trace: type[Trace],
+) -> list[str]:
+    """Return the lines that add normal draws to values; each two share a pair of uniform ones.
+
+    Parameters
+    ----------
+    values : sequence of str
+        What gets noise.
+    purpose : str
+        One of `PURPOSES`.
+    sigmas : mapping of str to float
+        For each value the name of its standard deviation among the constants, and its size, which decides
+        whether there is any noise; none for no noise at all.
+    constants : mapping
+        Name, or zero, of each constant.
+    trace : type of Trace
+        What formulas are recorded with.
+    """
+    if not sigmas:
+        return []
+
+    def normals(xp: Any, first: Any, second: Any) -> list:
+        radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
+        return [radius * xp.cos(angle), radius * xp.sin(angle)]
+
+    lines = [f"key_{purpose} = {key_of(purpose)}"]
+    per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step has that many times `DRAWS`
+    names = list(sigmas)
+    for i in range(0, len(values), 2):
+        pair = [j for j in (i, i + 1) if j < len(values) and sigmas[names[j]] > 0.0]
+        if pair:
+            lines += [
+                f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
+                for x, j in zip(("first", "second"), (i, i + 1), strict=True)
+            ]
+            lines += recorded(normals, ["first", "second"], ["normal0", "normal1"], trace)
+            lines += [f"{values[j]} += {constants[names[j]]} * normal{j - i}" for j in pair]
+    return lines

@@ -1,0 +1,44 @@
+"""The numbers that the compiled functions of an environment take."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from lag_envs.envs.program import constants_of
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import seen_box
+
+
+def numbers_of(task: Task) -> dict[str, float]:
+    """Return every number that an environment's compiled functions take, by name."""
+    found = task.imperfections
+    if found is None:
+        return constants_of(task)
+    numbers = dict(constants_of(task.drawn.inner if task.drawn else task))
+    for name, values in (
+        ("sigma", found.observation_noise),
+        ("shake", found.action_noise),
+        ("slew", found.slew),
+        ("push", found.push),
+        ("draw_base", [d.base for d in found.drawn]),
+        ("draw_low", [d.low for d in found.drawn]),
+        ("draw_high", [d.high for d in found.drawn]),
+        ("rest", _listed(task.formulas.rest_action) if task.formulas.acting else []),
+        *zip(("seen_low", "seen_high"), seen_box(task), strict=True),
+    ):
+        numbers |= {f"{name}{i}": float(value) for i, value in enumerate(values)}
+    # Pushes that come at a rate: the chance that there is one in a step.
+    numbers["push_chance"] = -math.expm1(-found.push_rate * task.dt)
+    numbers["late_low"], numbers["late_high"] = found.action_delay
+    if found.lag:
+        scene = (task.drawn.inner if task.drawn else task).scene
+        numbers |= {f"lagged_{name}": x for name, x in scene._constants(lagged=True).items()}
+        numbers |= {f"decay{i}": x for i, x in enumerate(found.lag)}
+        numbers["lagged_order"] = scene._limit(task.dt, lagged=True)
+    numbers["shown_at"] = (1.0 - found.observation_delay % 1.0) * task.dt
+    return numbers | {"every": float(found.observation_every)}
+
+
+def _listed(values: Any) -> list[Any]:
+    return list(values) if isinstance(values, list | tuple) else [values]

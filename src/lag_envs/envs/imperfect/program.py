@@ -1,0 +1,255 @@
+"""Steps with imperfect sensors or actuators, one environment at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+from lag_envs.envs import sharing
+from lag_envs.envs.imperfect.actuators import Actuators
+from lag_envs.envs.imperfect.drawn import DrawnProgram
+from lag_envs.envs.imperfect.motion import Held, Lagged
+from lag_envs.envs.imperfect.pushes import pushes
+from lag_envs.envs.imperfect.rows import Rows
+from lag_envs.envs.imperfect.sensors import Sensors
+from lag_envs.envs.lines import function, indent, load, next_episode, store
+from lag_envs.envs.program import SLOW, STEP_BLOCKS
+from lag_envs.stepping.compiling import BLOCK
+from lag_envs.tasks.base import Task
+
+
+class ImperfectProgram(DrawnProgram):
+    """The compiled functions of a task with imperfections; parameters as those of `Program`.
+
+    Rows that are kept besides are those of `Sensors` and `Actuators`.
+    """
+
+    def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
+        super().__init__(task, absent, varying)
+        self.scratch = [*self.a, *self.o, *self.held]
+        self._where = Rows(self.kept)
+
+    @property
+    def _printed(self) -> list[str]:
+        names = ("late_low", "late_high", "shown_at", "every", "push_chance")
+        inside = (self._actuators.perturb, self._sensors.sense, self._pushes)
+        commands = (self._actuators.at_rest, self._actuators.command)
+        more = (*inside, *commands, [f"k_{name}" for name in names], self._motion.constants)
+        return [*super()._printed, *(line for part in more for line in part)]
+
+    def _record(self, formulas: Any, constants: dict[str, Any]) -> None:
+        super()._record(formulas, constants)
+        found, scene, trace = self.options, self._source.scene, formulas.trace
+        self._sensors = Sensors(found, self.o, self.observe, self._bounded, constants, trace)
+        self._actuators = Actuators(found, formulas, self.a, self.y, self.u, self.clip, constants)
+        self._pushes = pushes(found, constants)
+        self._lagged: Any = None
+        self._motion: Held | Lagged
+        if found.lag:
+            lagged = {n.removeprefix("lagged_"): x for n, x in constants.items() if n.startswith("lagged_")}
+            self._lagged = scene._lagged.code(frozenset(n for n, x in lagged.items() if x == 0.0))
+            lift = formulas.lift("z")
+            self._motion = Lagged(self._lagged, lift, self.n_state, self.y, self.z, self.u, constants)
+        else:
+            self._motion = Held(self._stepper, self.y, self.z, self.u, self._x)
+        sensors, actuators = self._sensors, self._actuators
+        self.own = [
+            *self.own, *actuators.reached, *sensors.shown, *actuators.ring.names, *sensors.ring.names,
+        ]  # fmt: skip
+
+    def _bound_observations(self) -> None:
+        """Leave what is observed as it is: what is shown follows later."""
+
+    # --- one environment, alone or in a batch ---------------------------------------------------------------
+
+    @property
+    def _parameters(self) -> list[str]:
+        return [f"k_{name} = par[{j}]" for j, name in enumerate(self.uniform)]
+
+    @property
+    def _rows_of_constants(self) -> list[str]:
+        return [f"k_{name}" for name in self.varying]
+
+    @cached_property
+    def take(self) -> Callable:
+        """``take(f, base, stride, par, work, room, key)`` to (reward, over): a step of one environment.
+
+        `work` has the action; it gets what is shown, or the controls of a step that is refused.
+        """
+        n_act, rows, actuators, sensors = len(self.a), self._where, self._actuators, self._sensors
+        body = [
+            *self._parameters,
+            *load(rows.at, [*self._rows_of_constants, *self.y, *self.g, *actuators.reached, "n"]),
+            *(f"a{i} = work[{i}]" for i in range(n_act)),
+            *actuators.perturb, *actuators.send(rows), *self._through,
+            *self.outcome, *(["if over > 0.0:", *indent(self.last)] if self.last else []),
+            "n = n + 1.0", *self.kick, *self.move, *self._pushes,
+            "if n >= k_limit:", "    over = over + 2.0",
+            *sensors.read(rows),
+            *(f"work[{n_act + i}] = {rows.at(h)}" for i, h in enumerate(sensors.shown)),
+            *store(rows.at, [*self.y, *actuators.reached, "n"]),
+            *(f"{rows.at(u)} = last_{u}" for u in self.u),
+            "return r, np.int64(over)",
+        ]  # fmt: skip
+        advance = self._lagged.compile() if self._lagged else self.advance
+        return function("take", "f, base, stride, par, work, room, key", body, advance)
+
+    @property
+    def _through(self) -> list[str]:
+        """The lines that go through a step: from ``y`` to ``z``, with the mean controls in ``u``."""
+        within, motion, actuators = self.options.within, self._motion, self._actuators
+        move = [
+            "h = end - t", *motion.move,
+            "if status < 0:",
+            *(f"    work[{len(self.a) + len(self.o) + j}] = {u}" for j, u in enumerate(self.u)),
+            f"    return 0.0, {SLOW}",
+            *motion.behind,
+            *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
+            "t = end",
+        ]  # fmt: skip
+        # Where nothing changes within the step it is one piece, and its mean control is the control.
+        whole = ["h, t, end = k_dt, 0.0, k_dt", *actuators.command, *motion.mean, *move]
+        commands = [*actuators.choose(self._where), "h = switch - t", *actuators.command, *motion.mean]
+        pieces = [
+            "t, switch = 0.0, 0.0",
+            "while t < k_dt:",
+            *indent([
+                "if t == switch:", *indent(["switch = k_dt", *commands]),
+                "end = switch",
+                *(["if t < k_shown_at < end:", "    end = k_shown_at"] if within else []),
+                *move,
+                *(self._sensors.watch if within else []),
+            ]),
+        ]  # fmt: skip
+        return [
+            *(f"b_{y} = {y}" for y in self.y), *(f"mean_{u} = 0.0" for u in self.u),
+            *motion.begin(self._where),
+            *(pieces if within or actuators.ring.slots else whole),
+            *(f"{y} = b_{y}" for y in self.y),
+            *(f"last_{u}, {u} = {now}, mean_{u}" for u, now in zip(self.u, motion.reached, strict=True)),
+        ]  # fmt: skip
+
+    @property
+    def room(self) -> int:
+        """Numbers that the series needs."""
+        return self._lagged.scratch if self._lagged else super().room
+
+    @cached_property
+    def launch(self) -> Callable:
+        """``launch(f, base, stride, par, key, state_given, target_given)``: begin an episode."""
+        rows, actuators = self._where, self._actuators
+        undrawn = [row for row in self._rows_of_constants if row not in self.drawn]
+        body = [
+            *self._parameters,
+            *load(rows.at, [*undrawn, *self.y[: self.n_state], *self.g]),
+            *self._start, *actuators.begin(rows), *self._sensors.begin(rows),
+            *store(rows.at, [*self.y, *self.g, *self.u, *actuators.reached, "n", *self.drawn]),
+        ]  # fmt: skip
+        return function("launch", "f, base, stride, par, key, state_given, target_given", body)
+
+    # --- the functions of `Program` ------------------------------------------------------------------------
+
+    def _slices(self, at: int, work: int) -> list[str]:
+        """Return the lines that cut constants, the room of a step, and that of the series out of an array."""
+        return [
+            f"par = memory[{at}:]",
+            f"work = memory[{work}:]",
+            f"room = memory[{max(at + len(self.uniform), work + len(self.scratch))}:]",
+        ]
+
+    @cached_property
+    def step_one(self) -> Callable:
+        """See `Program.step_one`."""
+        first, n = len(self.kept), len(self.a)
+        body = [
+            "memory = f", *self._slices(first + len(self.scratch), first),
+            *(f"work[{i}] = {'a' if n == 1 else f'a[{i}]'}" for i in range(n)),
+            "r, over = take(f, np.int64(0), np.int64(1), par, work, room, ids[2])",
+            *(f"obs[{j}] = work[{n + j}]" for j in range(len(self.o))),
+            "return r, over",
+        ]  # fmt: skip
+        return function("step_one", "f, obs, a, ids", body, self.take)
+
+    @cached_property
+    def start_one(self) -> Callable:
+        """See `Program.start_one`."""
+        first = len(self.kept)
+        body = [
+            "memory = f", *self._slices(first + len(self.scratch), first), *next_episode("0", "1", "2"),
+            "launch(f, np.int64(0), np.int64(1), par, key, state_given, target_given)",
+            *(f"obs[{j}] = f[{self.kept.index(f'h{j}')}]" for j in range(len(self.o))),
+        ]  # fmt: skip
+        return function("start_one", "f, obs, ids, state_given, target_given", body, self.launch)
+
+    def _each(self, body: Sequence[str]) -> list[str]:
+        """Return the loop over the environments of a block."""
+        return [
+            "for lane in range(np.int64(first), np.int64(first + size)):",
+            f"    base = (lane // {BLOCK}) * {BLOCK * len(self.kept)} + lane % {BLOCK}",
+            *indent(body),
+        ]
+
+    @property
+    def _show(self) -> list[str]:
+        at = (f"f[base + {self.kept.index(f'h{j}') * BLOCK}]" for j in range(len(self.o)))
+        return [f"obs[{j}, lane] = {h}" for j, h in enumerate(at)]
+
+    @property
+    def room_of_all(self) -> int:
+        """Numbers that `step_all` needs behind the constants."""
+        return len(self.scratch) + self.room
+
+    @cached_property
+    def step_blocks(self) -> Callable:
+        """See `Program.step_blocks`."""
+        n, stride = len(self.a), f"np.int64({BLOCK})"
+        held = n + len(self.o)
+        step = [
+            *(f"work[{j}] = action[lane * {n} + {j}]" for j in range(n)),
+            f"r, over = take(f, base, {stride}, par, work, room, ids[2 * count + lane])",
+            f"if over == {SLOW}:",
+            "    refused, over = max(refused, np.uint64(lane + 1)), 0",
+            *(f"    {self._at_lane(u)} = work[{held + j}]" for j, u in enumerate(self.u)),
+            "if over > 0:",
+            f"    {self._at_lane('n')} = -np.float64(over)",
+            "    overs += np.uint64(1)",
+        ]
+        restart = [
+            *next_episode("lane", "count + lane", "2 * count + lane"),
+            f"launch(f, base, {stride}, par, key, False, False)",
+            "r, over = 0.0, 0",
+        ]
+        body = [
+            "memory = par", *self._slices(0, len(self.uniform)),
+            *self._claimed(self._each([
+                f"if {self._at_lane('n')} < 0.0:", *indent(restart), "else:", *indent(step),
+                "reward[lane] = r",
+                "terminated[lane] = (over == 1) | (over == 3)", "truncated[lane] = over >= 2",
+                *self._show,
+            ])),
+        ]  # fmt: skip
+        return function("step_blocks", STEP_BLOCKS, body, self.take, self.launch, *sharing.claiming())
+
+    def _at_lane(self, row: str) -> str:
+        return f"f[base + {self.kept.index(row) * BLOCK}]"
+
+    @cached_property
+    def start_all(self) -> Callable:
+        """See `Program.start_all`."""
+        begin = [
+            *next_episode("lane", "count + lane", "2 * count + lane"),
+            f"launch(f, base, np.int64({BLOCK}), par, key, state_given, target_given)",
+        ]
+        body = [
+            f"for block in range(np.uint64((count + {BLOCK - 1}) // {BLOCK})):",
+            *indent([
+                *self._place,
+                *self._each([
+                    "if mask[lane]:", *indent(begin),
+                    "if mask[lane] or whole:", *indent(self._show),
+                ]),
+            ]),
+        ]  # fmt: skip
+        arguments = "f, ids, par, obs, mask, whole, state_given, target_given, count"
+        return function("start_all", arguments, body, self.launch)

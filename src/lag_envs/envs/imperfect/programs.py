@@ -1,0 +1,31 @@
+"""Which program an environment or a batch has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lag_envs.envs.imperfect.drawn import DrawnProgram
+from lag_envs.envs.imperfect.program import ImperfectProgram
+from lag_envs.envs.program import Program, program_for
+from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import Imperfections
+
+
+def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
+    """Return the program of an environment, or of a batch of tasks that have these constants."""
+    absent = frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
+    varying = frozenset(
+        name for name in constants[0] if any(c[name] != constants[0][name] for c in constants)
+    )
+    if task.imperfections is None:
+        return program_for(task, absent, varying)
+    key = (type(task), type(task.scene), task.formulas.key, task.imperfections.structure, absent, varying)
+    if task.drawn:
+        key = (*key, task.drawn.inner.formulas.key, *task.drawn.made)
+    if key not in _programs:
+        only_drawn = Imperfections(drawn=task.imperfections.drawn) == task.imperfections
+        _programs[key] = (DrawnProgram if only_drawn else ImperfectProgram)(task, absent, varying)
+    return _programs[key]
+
+
+_programs: dict[tuple, DrawnProgram] = {}

@@ -1,0 +1,50 @@
+"""Rows of one environment, alone or in a batch: row r lies at ``f[base + r * stride]``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+
+class Ring(NamedTuple):
+    """Rows that are kept several times, in slots that are used in turn."""
+
+    rows: Sequence[str]
+    slots: int
+
+    @property
+    def names(self) -> list[str]:
+        """The rows of all slots, one slot behind the other."""
+        return [f"{row}_{slot}" for slot in range(self.slots) for row in self.rows]
+
+
+class Rows:
+    """Where rows lie.
+
+    Parameters
+    ----------
+    kept : sequence of str
+        All rows, in their order.
+    """
+
+    def __init__(self, kept: Sequence[str]) -> None:
+        self._kept = list(kept)
+
+    def at(self, row: str) -> str:
+        """Return where a row lies."""
+        return f"f[base + {self._kept.index(row)} * stride]"
+
+    def in_slot(self, ring: Ring, row: str) -> str:
+        """Return where a row of a ring lies, in the slot whose number is ``slot``."""
+        first = self._kept.index(f"{row}_0")
+        return f"f[base + ({first} + slot * {len(ring.rows)}) * stride]"
+
+    def put(self, ring: Ring, values: Mapping[str, str]) -> list[str]:
+        """Return the lines that write values into a slot."""
+        return [f"{self.in_slot(ring, row)} = {value}" for row, value in values.items()]
+
+    def fill(self, ring: Ring, values: Mapping[str, str]) -> list[str]:
+        """Return the lines that write values into all slots."""
+        if not ring.slots:
+            return []
+        return [f"for slot in range({ring.slots}):", *("    " + line for line in self.put(ring, values))]

@@ -1,0 +1,78 @@
+"""What is shown of what is observed: late, with noise, and not after every step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lag_envs.envs.imperfect.draws import noise
+from lag_envs.envs.imperfect.rows import Ring, Rows
+from lag_envs.envs.lines import indent
+from lag_envs.stepping.tracing import Trace
+from lag_envs.tasks.imperfections import Imperfections
+
+
+class Sensors:
+    """Prints what sensors do.
+
+    Rows of its own are what was shown last ``h``, and observations that are still to be seen ``seen``.
+
+    Parameters
+    ----------
+    options : Imperfections
+        What the sensors are like.
+    observed : sequence of str
+        What a perfect sensor shows.
+    observe, bounded : sequence of str
+        The lines that compute that, and those that keep it within its bounds.
+    constants : mapping
+        Name, or zero, of each constant.
+    trace : type of Trace
+        What formulas are recorded with.
+    """
+
+    def __init__(
+        self,
+        options: Imperfections,
+        observed: Sequence[str],
+        observe: Sequence[str],
+        bounded: Sequence[str],
+        constants: Mapping[str, Any],
+        trace: type[Trace],
+    ) -> None:
+        self._options, self._o, self._observe, self._every = options, observed, observe, constants["every"]
+        self.shown = [f"h{i}" for i in range(len(observed))]
+        self._seen = {f"seen{i}": o for i, o in enumerate(observed)}
+        self.ring = Ring([*self._seen], options.readings)
+        sigmas = {f"sigma{i}": x for i, x in enumerate(options.observation_noise)}
+        #: The lines that add noise.
+        self.sense = [*noise(observed, "observation", sigmas, constants, trace), *bounded]
+
+    @property
+    def watch(self) -> list[str]:
+        """The lines that note, within a step, what will be shown."""
+        seen = [*self._observe, *(f"m{i} = {o}" for i, o in enumerate(self._o))]
+        return ["if t == k_shown_at:", *indent(seen)]
+
+    def begin(self, rows: Rows) -> list[str]:
+        """Return the lines that show a start, as if it had stood there for long."""
+        return [*self._observe, *rows.fill(self.ring, self._seen), *self.sense, *self._show(rows)]
+
+    def read(self, rows: Rows) -> list[str]:
+        """Return the lines that show what is observed at the end of a step."""
+        lines, found = [*self._observe], self._options
+        if found.readings:
+            values = {row: f"m{i}" for i, row in enumerate(self._seen)} if found.within else self._seen
+            lines += [
+                f"slot = np.int64(n) % {found.readings}",
+                *rows.put(self.ring, values),
+                f"slot = (slot + 1) % {found.readings}",
+                *(f"{o} = {rows.in_slot(self.ring, row)}" for row, o in self._seen.items()),
+            ]
+        show = [*self.sense, *self._show(rows)]
+        if found.observation_every > 1:
+            return [*lines, f"if np.int64(n) % np.int64({self._every}) == 0:", *indent(show)]
+        return [*lines, *show]
+
+    def _show(self, rows: Rows) -> list[str]:
+        return [f"{rows.at(h)} = {o}" for h, o in zip(self.shown, self._o, strict=True)]

@@ -1,0 +1,57 @@
+"""Lines of Python, of which the compiled functions of an environment are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lag_envs.stepping.compiling import compile_function
+from lag_envs.stepping.flows import section
+from lag_envs.stepping.tracing import Trace
+
+
+def recorded(
+    formula: Callable, inputs: Sequence[Any], outputs: Sequence[str], trace: type[Trace]
+) -> list[str]:
+    """Record a formula; outputs that turned out constant are assigned as well."""
+    lines, values = section(formula, inputs, outputs, trace)
+    return lines + [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if value != name]
+
+
+def draw(names: Sequence[str], step: str) -> list[str]:
+    """Draw uniform numbers of a step."""
+    return [f"{name} = uniform(key, {step}, np.uint64({i}))" for i, name in enumerate(names)]
+
+
+def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
+    """Count the episode and make its key, in ``ids`` at these places."""
+    return [
+        f"ids[{episode}] += np.uint64(1)",
+        f"key = episode_key(ids[{key}], ids[{episode}])",
+        f"ids[{episode_key}] = key",
+    ]
+
+
+def load(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
+    """Read rows; `at` says where one lies."""
+    return [f"{row} = {at(row)}" for row in rows]
+
+
+def store(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
+    """Write rows; `at` says where one lies."""
+    return [f"{at(row)} = {row}" for row in rows]
+
+
+def block(head: str, body: Sequence[str]) -> list[str]:
+    """Put lines under a head."""
+    return [head, *indent(body)]
+
+
+def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
+    """Move lines to the right."""
+    return ["    " * levels + line for line in lines]
+
+
+def function(name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
+    """Compile a function of these lines."""
+    return compile_function(name, "\n".join([f"def {name}({arguments}):", *indent(body), ""]), *helpers)
