@@ -1,8 +1,8 @@
 """How agents act: when they get there, how far off they end, how fast they cross a line.
 
 ``python -m agents.behaviour`` plays the episodes that `docs/agents.md` is about, with the quick controllers
-and with our learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, from
-which ``python -m agents.results --redraw`` makes that page's tables of it.
+and with our learned policies that are verified on the board. It writes ``agents/results/behaviour.json``, and
+``python -m agents.results --redraw`` makes that page's tables of it.
 """
 
 from __future__ import annotations
