@@ -107,7 +107,13 @@ class AcrobotExact(Task):
         )
     }
     reference = "switch"
-    hyperparameters = {"ppo": {"gamma": 0.99}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.99},
+        "dqn": {  # near the RL Zoo's for Gymnasium's
+            "learning_rate": 6.3e-4, "batch_size": 128, "buffer_size": 50_000, "target_update_interval": 250,
+            "gradient_steps": 4, "exploration_fraction": 0.12, "exploration_final_eps": 0.1,
+        },
+    }  # fmt: skip
     examples = Examples(
         start={"state": [0.5, -1.0, 0.8, 1.0]},
         moving=[1.0, 3.0, -1.0, 5.0],

@@ -140,7 +140,14 @@ class CartPoleExact(_OnTrack):
         )
     }
     reference = "LQR"
-    hyperparameters = {"ppo": {"gamma": 0.99}}
+    hyperparameters = {
+        "ppo": {"gamma": 0.99},
+        "dqn": {  # the RL Zoo's for Gymnasium's
+            "n_timesteps": 5e4, "learning_rate": 2.3e-3, "batch_size": 64, "target_update_interval": 10,
+            "train_freq": 16, "gradient_steps": 128, "exploration_fraction": 0.16,
+            "exploration_final_eps": 0.04,
+        },
+    }  # fmt: skip
     examples = Examples(
         start={"state": [0.1, -0.2, 0.05, 0.1]},
         moving=[0.5, 2.0, 0.1, -3.0],
