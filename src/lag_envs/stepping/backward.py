@@ -44,11 +44,15 @@ class Backward(Series):
                     if w in self._active:
                         self._factor(a)
         self.slots = len(self._slots)
-        #: Slots of cotangents: of each node's or matrix entry's sum of products; and by slot those of velocities
-        #: and known series, which come from several orders.
+        #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to which
+        #: several orders add, or which are known, and so wanted at the end.
         self._sums = {key: self.slots + i for i, key in enumerate(self._pairs)}
-        first = self.slots + len(self._sums)
-        kept = [slot for (kind, i), slot in self._slots.items() if kind == "v" or self._is_known(kind, i)]
+        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self._pairs.values() if a.back}
+        kept = [
+            slot
+            for (kind, i), slot in self._slots.items()
+            if kind == "v" or slot in rates or self._is_known(kind, i)
+        ]
         self._bars = {slot: first + i for i, slot in enumerate(kept)}
         self._cells = {key: i for i, key in enumerate([*record.mass, *self._active])}
 
@@ -118,11 +122,11 @@ class Backward(Series):
 
     def _clear(self, t: Target, order: Any) -> None:
         zero = t.number(0.0)
-        known = [self._bars[slot] for key, slot in self._slots.items() if self._is_known(*key)]
 
         def clear(k: Any, carried: Sequence) -> list:
-            for bar in known:
-                t.store(bar, k, zero)
+            for (kind, _), slot in self._slots.items():
+                if kind == "x" and slot in self._bars:
+                    t.store(self._bars[slot], k, zero)
             return []
 
         t.loop(t.index(0), order, [], clear)
@@ -159,7 +163,8 @@ class Backward(Series):
                 total = dict(zip(factors, carried, strict=True))
                 for key, (a, b) in some:
                     bar = t.load(self._sums[key], m)
-                    total[a] = t.fma(bar, value[b], total[a])
+                    if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
+                        total[a] = t.fma(bar, value[b], total[a])
                     total[b] = t.fma(bar, value[a], total[b])
                 return list(total.values())
 
@@ -197,8 +202,11 @@ class Backward(Series):
         found = self._gather(t, k, order)
         bars: dict[int, Any] = {}
         for n in self._live:
-            if ("x", n) in self._slots and (bar := found.get(Factor(self._slots["x", n]))) is not None:
-                bars[n] = bar
+            slot = self._slots.get(("x", n), -1)
+            if slot in self._bars and record.nodes[n].op not in KNOWN:
+                bars[n] = t.load(self._bars[slot], k)
+            elif Factor(slot) in found:
+                bars[n] = found[Factor(slot)]
             if ("d", n) in self._slots and (bar := found.get(Factor(self._slots["d", n]))) is not None:
                 more = t.mul(t.real(k), bar)
                 bars[n] = t.add(bars[n], more) if n in bars else more
@@ -286,7 +294,7 @@ class Backward(Series):
         gathered = self._gather(t, first, order, first=True)
         bars: dict[int, Any] = {}
         for (kind, i), slot in self._slots.items():
-            if self._is_known(kind, i):
+            if kind == "x" and slot in self._bars:
                 bars[i] = t.load(self._bars[slot], first)
             elif kind == "x" and Factor(slot) in gathered:
                 bars[i] = gathered[Factor(slot)]

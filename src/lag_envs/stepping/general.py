@@ -351,21 +351,22 @@ class SeriesTangent:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
         by_start, by_end = self._linear(dt)
-        moving, count = len(self._moving), len(states)
-        seeds = cotangents @ by_end
-        given = (
-            np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
-        )
-        values = np.empty((len(self._given) + moving, count))
-        values[: len(self._given)] = self._constants[:, None]
+        moving, given, width = len(self._moving), len(self._given), states.shape[1] + controls.shape[1]
+        # Entry by entry and not row by row: as `_pull` takes them, and quick to multiply.
+        start = by_start[:, :width] @ np.concatenate([states.T, controls.T])
+        seeds = by_end.T @ cotangents.T
+        values = np.empty((given + moving, len(states)))
+        values[:given] = self._constants[:, None]
         for i, name in enumerate([*self._given, *self._moving]):
             if name in self._rows:
-                values[i] = given[:, self._rows.index(name)]
-        found = np.empty((moving + len(self._sources), count))
-        refused = self._pull(values, np.ascontiguousarray(seeds[:, :moving].T), found, dt, order)
-        if not refused and not np.isfinite(found).all():
-            refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
-        return seeds[:, moving:] + found.T @ by_start[self._pulled], refused
+                values[i] = start[self._rows.index(name)]
+        found = np.empty((moving + len(self._sources), len(states)))
+        refused = self._pull(values, seeds[:moving], found, dt, order)
+        slopes = seeds[moving:]
+        slopes += by_start[self._pulled].T @ found
+        if not refused and not np.isfinite(slopes).all():
+            refused = int(np.argmin(np.isfinite(slopes).all(axis=0))) + 1
+        return slopes.T, refused
 
     def _linear(self, dt: float) -> tuple[Any, Any]:
         """Return what the series starts from by states, controls and parameters; and its end's effect.
