@@ -158,7 +158,8 @@ class Backward(Series):
             some = pairs[begin : begin + GROUP]
             factors = list(dict.fromkeys(factor for _, pair in some for factor in pair))
 
-            def later(m: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
+            def later(i: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
+                m = t.minus(order, i)  # what was found last is added last
                 value = {factor: factor.load(t, t.minus(m, k)) for factor in factors}
                 total = dict(zip(factors, carried, strict=True))
                 for key, (a, b) in some:
@@ -168,7 +169,7 @@ class Backward(Series):
                     total[b] = t.fma(bar, value[a], total[b])
                 return list(total.values())
 
-            sums = t.loop(t.plus(k, 1), order, [t.number(0.0)] * len(factors), later)
+            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * len(factors), later)
             for factor, total in zip(factors, sums, strict=True):
                 found[factor] = t.add(found[factor], total) if factor in found else total
         for factor in [factor for factor in found if factor.slot in self._bars]:
