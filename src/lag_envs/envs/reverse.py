@@ -25,6 +25,9 @@ from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
+#: Rows that go through the parts of a step together: few enough that what is between them stays in a cache.
+ROWS = 4096
+
 
 class Reverse:
     """What a task computes before and after the motion, and its derivatives, for many rows.
@@ -88,19 +91,24 @@ class Reverse:
         """
         given = states, actions, targets, ends, after, by_states, by_observations, by_rewards[:, None]
         kicked = after is not ends
+        count = len(states)
         if self._form is None or self._parameters:
-            return self._in_parts(kicked, *given)
-        *found, ordinary = self._whole(kicked)(self._numbers, *given)
-        (others,) = np.nonzero(ordinary[:, 0] == 0.0)
-        if len(others):
-            parts = self._in_parts(kicked, *(x[others] for x in given), rows=others)
-            for x, some in zip(found, parts, strict=True):
-                x[others] = some
+            sizes = [x.shape[1] for x in given[:3]] + [len(self._parameters)]
+            found, others = [np.empty((size, count)).T for size in sizes], np.arange(count)
+        else:
+            *found, ordinary = self._whole(kicked)(self._numbers, *given)
+            (others,) = np.nonzero(ordinary[:, 0] == 0.0)
+        for first in range(0, len(others), ROWS):
+            rows = others[first : first + ROWS]
+            at: Any = slice(first, first + ROWS) if len(others) == count else rows
+            for x, some in zip(found, self._in_parts(kicked, rows, *(x[at] for x in given)), strict=True):
+                x[at] = some
         return found
 
     def _in_parts(
-        self, kicked: bool, y: Array, a: Array, g: Array, z: Array, *rest: Array, rows: Any = None
+        self, kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> list[Array]:
+        """Do what `pull` does, the motion by itself; `rows` are what errors call the rows."""
         (u,) = self._control(self._numbers, y, a, g)
         own_y, own_z, own_u, own_g, own_p = self._after(kicked)(self._numbers, y, u, g, z, *rest)
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)

@@ -279,6 +279,7 @@ class SeriesTangent:
             if name in self._columns:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
+        self._known_linear: dict[float, tuple[Any, Any]] = {}
         self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
@@ -350,7 +351,9 @@ class SeriesTangent:
         if self._stepper.mechanics.coupling or self._guide.any():
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
-        by_start, by_end = self._linear(dt)
+        if dt not in self._known_linear:
+            self._known_linear = {dt: self._linear(dt)}
+        by_start, by_end = self._known_linear[dt]
         moving, given, width = len(self._moving), len(self._given), states.shape[1] + controls.shape[1]
         # Entry by entry and not row by row: as `_pull` takes them, and quick to multiply.
         start = by_start[:, :width] @ np.concatenate([states.T, controls.T])
