@@ -394,7 +394,10 @@ class _EnvStep(torch.autograd.Function):
         #: Those that take a step, and those whose episode goes on in the state that it leads to; None: all.
         ctx.stepped = ctx.kept = envs._read("n") >= 0.0 if envs._over else None
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
-        if envs.autoreset_mode == AutoresetMode.SAME_STEP and (ended := (terminated | truncated).numpy()).any():
+        if (
+            envs.autoreset_mode == AutoresetMode.SAME_STEP
+            and (ended := (terminated | truncated).numpy()).any()
+        ):
             ctx.kept = ~ended
         after = torch.from_numpy(envs.state)
         ctx.save_for_backward(state, actions, after)

@@ -1,15 +1,15 @@
 """A task's step backwards: from gradients by its results to gradients by what it depends on.
 
 A step is control, motion, reward and observation. Each part's derivatives are recorded from its formulas
-(`lag_envs.stepping.adjoint`). Where the motion has a flow of its own, the whole is one record, so a lane goes
-through it at once. Otherwise, and where a step of the flow is no ordinary one, there are three: the formulas after
-the motion, `Scene.vjp`, and the formulas before it.
+(`lag_envs.stepping.adjoint`). Where the motion has a flow of its own, the whole is one record. Otherwise,
+and where a step of the flow is no ordinary one, there are three parts: the formulas after the motion,
+`Scene.vjp`, and the formulas before it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, cached_property, partial
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -62,10 +62,11 @@ class Reverse:
         sizes |= {"by_e": sizes["y"], "by_o": len(formulas.observation), "by_r": 1, "by_u": sizes["u"]}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
         self._form = task.scene._form
+        self._compiled: dict[str, Lanes] = {}
 
     def observations(self, states: Array, targets: Array) -> Array:
         """Return the observations of states (n, n_state) with targets (n, n_targets)."""
-        return self._observe(self._numbers, states, targets)[0]
+        return self._lanes("observe", self._observe_of, "y", "g")(self._numbers, states, targets)[0]
 
     def pull(
         self,
@@ -109,23 +110,38 @@ class Reverse:
         self, kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> list[Array]:
         """Do what `pull` does, the motion by itself; `rows` are what errors call the rows."""
-        (u,) = self._control(self._numbers, y, a, g)
+        (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
         own_y, own_z, own_u, own_g, own_p = self._after(kicked)(self._numbers, y, u, g, z, *rest)
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
         by_y, by_u, by_p = np.split(moved, [y.shape[1], y.shape[1] + u.shape[1]], axis=1)
-        last_y, last_a, last_g, last_p = self._before(self._numbers, y, a, g, own_u + by_u)
+        before = self._lanes("before", self._before_of, "y", "a", "g", "by_u")
+        last_y, last_a, last_g, last_p = before(self._numbers, y, a, g, own_u + by_u)
         return [own_y + by_y + last_y, last_a, own_g + last_g, own_p + by_p + last_p]
 
     # --- formulas ------------------------------------------------------------------------------------------
 
     def _lanes(self, name: str, formula: Callable, *arrays: str) -> Lanes:
+        """Return a formula, compiled when it is asked for first; `arrays` are what it takes."""
+
         def of_numbers(xp: Differentiable, numbers: dict[str, Any]) -> list[list]:
             given = {array: [numbers[name] for name in self._names[array]] for array in arrays}
             k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._constants})
             return formula(xp, k, **given)
 
-        names = [self._names[array] for array in arrays]
-        return Lanes(name, of_numbers, names, self._constants, self._absent)
+        if name not in self._compiled:
+            names = [self._names[array] for array in arrays]
+            self._compiled[name] = Lanes(name, of_numbers, names, self._constants, self._absent)
+        return self._compiled[name]
+
+    def _whole(self, kicked: bool) -> Lanes:
+        name = "whole_kicked" if kicked else "whole"
+        formula = partial(self._whole_of, kicked)
+        return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
+
+    def _after(self, kicked: bool) -> Lanes:
+        name = "after_kicked" if kicked else "after"
+        formula = partial(self._after_of, kicked)
+        return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
 
     def _parameters_of(self, k: Any) -> list:
         return [getattr(k, f"self_{name}") for name in self._parameters]
@@ -134,9 +150,9 @@ class Reverse:
         angle = None if self._form is None else self._form.angle
         return y if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
 
-    def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list:
+    def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list[list]:
         top = self._formulas.largest
-        return self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], self._lifted(xp, y), g, k)
+        return [self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], self._lifted(xp, y), g, k)]
 
     def _reward_of(self, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> Any:
         given = self._lifted(xp, y), self._lifted(xp, z), u, g, k
@@ -145,57 +161,37 @@ class Reverse:
         reward, ended = self._formulas.outcome(xp, *given)
         return xp.where(ended, self._formulas.last(xp, *given), reward)
 
-    def _observe_of(self, xp: Any, k: Any, y: list, g: list) -> list:
-        return self._formulas.observe(xp, self._lifted(xp, y), g, k)
+    def _observe_of(self, xp: Any, k: Any, y: list, g: list) -> list[list]:
+        return [self._formulas.observe(xp, self._lifted(xp, y), g, k)]
 
     def _after_of(
-        self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, by_e: list, by_o: list,
-        by_r: list,
-    ) -> list[list]:  # fmt: skip
+        self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, **seeds: list
+    ) -> list[list]:
         """Record the way back to the motion's end, and past it: cotangents of y, z, u, g and parameters."""
         e = e if kicked else z
-        outputs = [self._reward_of(xp, k, y, u, g, z), *self._observe_of(xp, k, e, g), *e]
+        outputs = [self._reward_of(xp, k, y, u, g, z), *self._observe_of(xp, k, e, g)[0], *e]
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
-        found = xp.adjoint(outputs, [*by_r, *by_o, *by_e], [x for numbers in by for x in numbers])
+        bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
+        found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
         own_y, own_z, *rest, own_e = split(found, *map(len, by[:-1]))
         return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, by_u: list) -> list[list]:
         """Record the way back from controls: cotangents of y, a, g and parameters."""
         by = [y, a, g, self._parameters_of(k)]
-        found = xp.adjoint(self._control_of(xp, k, y, a, g), by_u, [x for numbers in by for x in numbers])
+        found = xp.adjoint(self._control_of(xp, k, y, a, g)[0], by_u, [x for numbers in by for x in numbers])
         return split(found, *map(len, by[:-1]))
 
-    @cache  # noqa: B019 - kept as long as what it belongs to
-    def _whole(self, kicked: bool) -> Lanes:
+    def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
+        """Record the way back through all: cotangents of y, a, g, no parameters; 1 for ordinary steps."""
         stepper: Any = self._task.scene._code(self._task.dt)
-
-        def whole(xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
-            u = self._control_of(xp, k, y, a, g)
-            own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
-            moved, ordinary = stepper.pull(xp, y, u, k, k.dt, k.x, own_z, [*y, *u])
-            by_y, by_u = split(moved, len(y))
-            last_y, last_a, last_g, _ = self._before_of(xp, k, y, a, g, _sums(own_u, by_u))
-            return [_sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g), [], [xp.where(ordinary, 1.0, 0.0)]]
-
-        return self._lanes("whole", whole, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
-
-    @cache  # noqa: B019
-    def _after(self, kicked: bool) -> Lanes:
-        formula = partial(self._after_of, kicked)
-        return self._lanes("after", formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
-
-    @cached_property
-    def _before(self) -> Lanes:
-        return self._lanes("before", self._before_of, "y", "a", "g", "by_u")
-
-    @cached_property
-    def _control(self) -> Lanes:
-        return self._lanes("control", lambda *given, **k: [self._control_of(*given, **k)], "y", "a", "g")
-
-    @cached_property
-    def _observe(self) -> Lanes:
-        return self._lanes("observe", lambda *given, **k: [self._observe_of(*given, **k)], "y", "g")
+        (u,) = self._control_of(xp, k, y, a, g)
+        own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
+        moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
+        by_y, by_u = split(moved, len(y))
+        last_y, last_a, last_g, _ = self._before_of(xp, k, y, a, g, _sums(own_u, by_u))
+        by = _sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g), []
+        return [*by, [xp.where(ordinary, 1.0, 0.0)]]
 
 
 def _sums(*lists: list) -> list:

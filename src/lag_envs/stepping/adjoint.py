@@ -163,7 +163,9 @@ class Lanes:
         absent: Collection[str],
     ) -> None:
         trace = Differentiable()
-        columns = {n: f"given{i}[first + i, {j}]" for i, names in enumerate(inputs) for j, n in enumerate(names)}
+        columns = {
+            n: f"given{i}[first + i, {j}]" for i, names in enumerate(inputs) for j, n in enumerate(names)
+        }
         numbers = {n: trace.zero() if n in absent else trace.inputs(n)[0] for n in (*columns, *constants)}
         found = formula(trace, numbers)
         operations, results = trace.operations([x for numbers in found for x in numbers])
@@ -193,8 +195,9 @@ class Lanes:
             *(f"        {at} = {value}" for at, value in zip(out, values, strict=True)),
             *_loops(zip(places, out, strict=True)),
         ]
-        self._compiled = compile_function(name, "\n    ".join(body) + "\n")
-        self._sizes, self._kinds = [len(numbers) for numbers in found], {}
+        self._compiled: Any = compile_function(name, "\n    ".join(body) + "\n")
+        self._sizes = [len(numbers) for numbers in found]
+        self._kinds: dict[tuple[str, ...], Callable] = {}
 
     def __call__(self, numbers: Any, *given: Any) -> list[Any]:
         """Return the results, arrays of shape (lanes, columns).

@@ -2,9 +2,9 @@
 
 The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
 Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
-Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that cotangents of factors
-are sums of products too: Σ_{k>j} P_k B_{k-j} of A_j. An order thus costs two of them where the series has one.
-Lengths of substeps are held.
+Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents
+of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where
+the series has one. Lengths of substeps are held.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Backward(Series):
                     if w in self._active:
                         self._factor(a)
         self.slots = len(self._slots)
-        #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to which
-        #: several orders add, or which are known, and so wanted at the end.
+        #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to
+        #: which several orders add, or which are known, and so wanted at the end.
         self._sums = {key: self.slots + i for i, key in enumerate(self._pairs)}
         first, rates = self.slots + len(self._sums), {a.slot for a, _ in self._pairs.values() if a.back}
         kept = [
@@ -148,9 +148,9 @@ class Backward(Series):
     # --- one order -----------------------------------------------------------------------------------------
 
     def _gather(self, t: Target, k: Any, order: Any, first: bool = False) -> dict[Factor, Any]:
-        """Return what sums of products of higher orders add to the cotangents of factors' coefficients of order k.
+        """Return what sums of products of higher orders add to cotangents of factors of order k.
 
-        Those that are kept in slots are added to there instead.
+        To those that are kept in slots it is added there.
         """
         found: dict[Factor, Any] = {}
         pairs = list(self._pairs.items())
@@ -239,7 +239,7 @@ class Backward(Series):
                 t.store(self._sums[n], k, t.number(0.0))
 
     def _node_back(self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable) -> None:
-        """Take a node's cotangent of order k to what the coefficient was made of, and to its sum of products."""
+        """Take a node's cotangent of order k to what it was made of, and to its sum of products."""
         node, zero = self.record.nodes[n], start.zero
         op, args = node.op, node.args
         if op == "place":
@@ -287,9 +287,7 @@ class Backward(Series):
 
     # --- order 0 -------------------------------------------------------------------------------------------
 
-    def _first_order_back(
-        self, t: Target, start: Start, h: Any, order: Any
-    ) -> tuple[list, dict[str, Any]]:
+    def _first_order_back(self, t: Target, start: Start, h: Any, order: Any) -> tuple[list, dict[str, Any]]:
         """Return cotangents of places and velocities (None: zero), and of the active weights."""
         record, zero, first, n = self.record, start.zero, t.index(0), self.size
         gathered = self._gather(t, first, order, first=True)

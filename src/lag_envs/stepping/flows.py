@@ -31,12 +31,12 @@ class Flow(NamedTuple):
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step. ``pull(variables, coefficients, dt, bars, xp)`` records an ordinary step
-    backwards, from cotangents of the first two variables to those of variables and coefficients;
-    ``compile_tangent(present, by)`` makes the function that differentiates any step, by the variables and by the
-    coefficients that are named. ``order`` is that of the certified series,
-    0 where there is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
-    ``method`` says in words how a step is taken.
+    makes the scalar function for any step. ``pull(variables, coefficients, dt, bars, xp)`` records an
+    ordinary step backwards, from cotangents of the first two variables to those of variables and
+    coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step, by the
+    variables and by the coefficients that are named. ``order`` is that of the certified series, 0 where there
+    is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s]. ``method`` says in
+    words how a step is taken.
     """
 
     size: int
@@ -317,7 +317,13 @@ class Stepper:
         return compile_function("jacobian", "\n    ".join(body) + "\n", self._tangent(by))
 
     def pull(
-        self, xp: Differentiable, state: Sequence, u: Sequence, k: Any, dt: Any, x: Any, seeds: Sequence, by: Sequence
+        self,
+        xp: Differentiable,
+        state: Sequence,
+        u: Sequence,
+        k: Any,
+        seeds: Sequence,
+        by: Sequence,
     ) -> tuple[list, Any]:
         """Record the step backwards; return cotangents, and whether the step is an ordinary one.
 
@@ -325,8 +331,10 @@ class Stepper:
         ----------
         xp : Differentiable
             The recording.
-        state, u, k, dt, x
-            State and controls at the step's start, constants, and what the step takes besides.
+        state, u : sequence of number
+            State and controls at the step's start.
+        k : namespace
+            The constants, with dt and x.
         seeds : sequence of number
             Cotangents of the state after the step.
         by : sequence of number
@@ -337,11 +345,11 @@ class Stepper:
         variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
         # The end is linear in what was moved, so that needs no values.
         moved = xp.inputs("moved0", "moved1")
-        ends = form.pack([*moved, *variables[2:]], lifted, u, dt, k)[: self._n_state]
+        ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
         *bars, direct = split(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
-        pulled = flow.pull(variables, coefficients, dt, [bar for (bar,) in bars], xp)
+        pulled = flow.pull(variables, coefficients, k.dt, [bar for (bar,) in bars], xp)
         found = xp.adjoint([*variables, *coefficients], pulled, by)
-        within = flow.within(variables, coefficients, dt, x, xp)
+        within = flow.within(variables, coefficients, k.dt, k.x, xp)
         return [a + b for a, b in zip(direct, found, strict=True)], within
 
     @cache  # noqa: B019
@@ -349,15 +357,17 @@ class Stepper:
         """Return ordinary steps backwards, by lanes.
 
         Given are numbers dt, x and constants; states, controls, and cotangents of the states after the step.
-        Found are those of states and controls, of `constants`, and 1 where the step is an ordinary one, else 0.
+        Found are those of states and controls, of `constants`, and 1 where the step is an ordinary one.
         """
         y, seeds = self.start[: self._n_state], [f"seed{i}" for i in range(self._n_state)]
 
         def vjp(xp: Any, numbers: Mapping[str, Any]) -> list[list]:
             state, u, bars = ([numbers[name] for name in names] for names in (y, self.controls, seeds))
-            k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._names})
+            k = SimpleNamespace(
+                **{name.removeprefix("k_"): numbers[name] for name in ("dt", "x", *self._names)}
+            )
             by = [*state, *u, *(numbers[f"k_{name}"] for name in constants)]
-            found, within = self.pull(xp, state, u, k, numbers["dt"], numbers["x"], bars, by)
+            found, within = self.pull(xp, state, u, k, bars, by)
             return [*split(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
 
         absent = set(self._names) - set(self.constants)

@@ -279,7 +279,7 @@ class SeriesTangent:
             if name in self._columns:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
-        self._known_linear: dict[float, tuple[Any, Any]] = {}
+        self._known_linear: dict[float, tuple[Any, ...]] = {}
         self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
@@ -360,14 +360,17 @@ class SeriesTangent:
             refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
         return found.T, refused
 
-    def _linear(self, dt: float) -> tuple[Any, Any, Any, Any]:
+    def _linear(self, dt: float) -> tuple[Any, ...]:
         """Return what `_pull` takes of the constants, what series start from, and their end's effect.
 
         Where no rate is held, all are the same for all states.
         """
         xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
         ends, y, u, p = variables_of(
-            *(np.zeros((1, n)) for n in (moving, len(layout.state), len(self._stepper.arguments), len(self._by)))
+            *(
+                np.zeros((1, n))
+                for n in (moving, len(layout.state), len(self._stepper.arguments), len(self._by))
+            )
         )
         before = self._stepper.prepare(xp, y, u, self._numbers)
         before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
@@ -384,7 +387,7 @@ class SeriesTangent:
         constants = np.concatenate([self._constants, np.zeros(moving)])
         starts = by_start([*self._given, *self._moving])[:, : len(y) + len(u)]
         parts = constants, starts, by_start([*self._moving, *self._sources]), by_end
-        return tuple(map(np.ascontiguousarray, parts))  # type: ignore[return-value]
+        return tuple(map(np.ascontiguousarray, parts))
 
     @property
     def _width(self) -> int:

@@ -215,7 +215,6 @@ class NormalForm:
         The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
         """
         stepper, _ = self._stepper(dt, constants)
-        width = states.shape[1] + controls.shape[1]
         numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
         slopes, by_rates, ordinary = stepper.vjp(tuple(rates))(numbers, states, controls, cotangents)
         if parameters:

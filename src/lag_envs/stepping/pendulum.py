@@ -153,15 +153,16 @@ def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, o
     return theta + angle, omega + change * (1.0 / h), c, s
 
 
-def pull(
-    variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER
-) -> list:
-    """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step, from those of θ, θ' after it.
+def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
+    """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step, from those of θ, θ' after.
 
-    Those of cosθ and sinθ are counted with θ. What is small moves by the linearised equation, with θ = Σ θ_k:
-    (k+1) dW_{k+1} = -Σ_j Q_j dθ_{k-j} - Γ dW_k - S_k dA - C_k dB - W_k dΓ, plus dD for k = 0 and dR for k = 1,
-    where S, C are the series of sine and cosine. Backwards that takes one sum of products for each order,
-    where going back through `taylor_coefficients` would take three.
+    Those of cosθ and sinθ are counted with θ. Changes obey the linearised equation: with S, C the series of
+    sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on its right-hand side,
+
+        (k+1) dW_{k+1} = -Σ_j Q_j dθ_{k-j} - Γ dW_k - S_k dA - C_k dB - W_k dΓ.
+
+    Backwards that takes one sum of products for each order, where going back through `taylor_coefficients`
+    would take three.
 
     Parameters
     ----------
