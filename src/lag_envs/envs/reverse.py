@@ -190,8 +190,8 @@ class Reverse:
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
         by_y, by_u = split(moved, len(y))
         last_y, last_a, last_g, _ = self._before_of(xp, k, y, a, g, _sums(own_u, by_u))
-        by = _sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g), []
-        return [*by, [xp.where(ordinary, 1.0, 0.0)]]
+        by = _sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g)
+        return [*by, [], [xp.where(ordinary, 1.0, 0.0)]]
 
 
 def _sums(*lists: list) -> list:

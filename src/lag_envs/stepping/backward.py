@@ -3,8 +3,8 @@
 The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
 Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
 Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents
-of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where
-the series has one. Lengths of substeps are held.
+of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them
+where the series has one. Lengths of substeps are held.
 """
 
 from __future__ import annotations
