@@ -351,11 +351,11 @@ class SeriesTangent:
         if self._stepper.mechanics.coupling or self._guide.any():
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
-        if dt not in self._known_linear:
-            self._known_linear = {dt: self._linear(dt)}
+        linear = self._known_linear.get(dt) or self._linear(dt)
+        self._known_linear = {dt: linear}  # the last one's: a scene has one dt, mostly
         given, found = np.concatenate([states.T, controls.T]), np.empty((self._width, len(states)))
         seeds = np.ascontiguousarray(cotangents.T)
-        refused = self._pull(given, seeds, found, *self._known_linear[dt], dt, order)
+        refused = self._pull(given, seeds, found, *linear, dt, order)
         if not refused and not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
         return found.T, refused
