@@ -275,11 +275,16 @@ def test_cold_start_shows_where_the_time_goes(tmp_path, capsys):
 def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     some = partial(jacobians.jacobians, names=("Incline", "CartPole"))
     monkeypatch.setattr(measurement, "jacobians", some)
+    one = partial(jacobians.backwards, ids=(ID,), count=64)
+    monkeypatch.setattr(measurement, "backwards", one)
     report = bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, jacobians=True))
     rows = {row["name"]: row for row in report["jacobians"]}
     assert [rows[name]["columns"] for name in ("Incline", "CartPole")] == [3, 5]
     assert all(row["ratio"] > 0.0 and row["aim"] == 1 + 2 * row["columns"] for row in rows.values())
-    assert "Jacobian of a step" in capsys.readouterr().out
+    (row,) = report["backwards"]
+    assert row["id"] == ID and row["ratio"] == pytest.approx(row["back_ns"] / row["step_ns"], rel=0.02)
+    printed = capsys.readouterr().out
+    assert "Jacobian of a step" in printed and "Whole step backwards" in printed
     # The loop that it is compared with takes the very steps of the scene.
     scene, states = CartPole(), np.array([[0.1, 0.2, 0.3, 0.4], [0.5, -0.2, 3.0, 1.0]])
     ends = [scene.simulate(x, [u], 0.02)[1].sum() for x, u in zip(states, (1.0, -2.0), strict=True)]

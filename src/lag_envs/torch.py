@@ -390,11 +390,15 @@ class _EnvStep(torch.autograd.Function):
     def forward(ctx: Any, env: TorchVectorEnv, state: Tensor, actions: Tensor) -> tuple[Tensor, ...]:
         envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
-        ctx.stepped = envs._read("n") >= 0.0
+        ctx.set_materialize_grads(False)
+        #: Those that take a step, and those whose episode goes on in the state that it leads to; None: all.
+        ctx.stepped = ctx.kept = envs._read("n") >= 0.0 if envs._over else None
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
-        # Those whose episode went on in the state that the step led to.
-        again = envs.autoreset_mode == AutoresetMode.SAME_STEP
-        ctx.kept = ctx.stepped & ~(terminated | truncated).numpy() if again else ctx.stepped
+        if (
+            envs.autoreset_mode == AutoresetMode.SAME_STEP
+            and (ended := (terminated | truncated).numpy()).any()
+        ):
+            ctx.kept = ~ended
         after = torch.from_numpy(envs.state)
         ctx.save_for_backward(state, actions, after)
         ctx.mark_non_differentiable(terminated, truncated)
@@ -402,28 +406,33 @@ class _EnvStep(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *seeds: Tensor) -> tuple:
+    def backward(ctx: Any, *seeds: Tensor | None) -> tuple:
         model, stepped, kept = ctx.model, ctx.stepped, ctx.kept
-        y, a, ends = map(_numbers, ctx.saved_tensors)
-        by_observations, by_rewards, by_states = map(_numbers, seeds[:3])
-        if not stepped.all():  # what was restarted had no step
-            y, ends = (np.where(stepped[:, None], x, model.task.centre) for x in (y, ends))
-            a, by_rewards = np.where(stepped[:, None], a, 0.0), np.where(stepped, by_rewards, 0.0)
-        if not kept.all():
-            by_observations, by_states = (
-                np.where(kept[:, None], x, 0.0) for x in (by_observations, by_states)
-            )
+        y, a, ends = (x.detach().numpy() for x in ctx.saved_tensors)
+        task = model.task
+        shapes = (len(y), len(task.formulas.observation)), (len(y),), y.shape
+        by_observations, by_rewards, by_states = (
+            np.broadcast_to(0.0, shape) if seed is None else seed.detach().numpy()
+            for seed, shape in zip(seeds, shapes, strict=False)
+        )
+        if stepped is not None:  # what was restarted had no step
+            y, ends = (np.where(stepped[:, None], x, task.centre) for x in (y, ends))
+            a = np.where(stepped[:, None], a, np.float32(0.0))
         after = ends
-        if model.task.draws or not (kept | ~stepped).all():
-            random = ctx.targets is not None and model.task.fixed_target is None
+        if kept is not None:
+            by_observations, by_states = (
+                np.where(kept[:, None], x, np.float32(0.0)) for x in (by_observations, by_states)
+            )
+        if task.draws or kept is not stepped:
+            random = ctx.targets is not None and task.fixed_target is None
             ends, _, _ = model(y, a[:, 0] if a.shape[1] == 1 else a, ctx.targets if random else None)
-            after = np.where(kept[:, None], after, ends)
+            after = after if kept is None else np.where(kept[:, None], after, ends)
         g = np.zeros((len(y), 0)) if ctx.targets is None else ctx.targets.reshape(len(y), -1)
         by_state, by_action, _, _ = model.reverse().pull(
             y, a, g, ends, after, by_states, by_observations, by_rewards
         )
-        if not stepped.all():
-            by_state, by_action = (np.where(stepped[:, None], x, 0.0) for x in (by_state, by_action))
+        if stepped is not None:
+            by_state[~stepped] = by_action[~stepped] = 0.0
         return None, torch.from_numpy(by_state), torch.from_numpy(by_action).to(ctx.saved_tensors[1].dtype)
 
 

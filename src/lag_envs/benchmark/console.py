@@ -48,6 +48,8 @@ def table(report: dict[str, Any]) -> list[str]:
         lines += [f"chains by their bars, ns a step: {times}; grows like the power {found['exponent']:g}", ""]
     if costs := report.get("jacobians"):
         lines += [*columns(jacobians.table(costs)), ""]
+    if costs := report.get("backwards"):
+        lines += [*columns(jacobians.backwards_table(costs)), ""]
     if found := report.get("divisions"):
         rows = [divisions.cells(row, times_of(report).get(row["id"])) for row in found]
         lines += [*columns([divisions.HEAD, *rows]), ""]

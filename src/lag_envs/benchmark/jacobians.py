@@ -1,7 +1,8 @@
-"""What derivatives of a control step cost beside the step: a section of ``lag-envs bench``.
+"""What derivatives of a control step cost beside the step: two sections of ``lag-envs bench``.
 
-Both start from the same states. The step is the compiled one, state after state; `Scene.simulate` would have
-the states of one motion.
+In the first both start from the same states. The step is the compiled one, state after state;
+`Scene.simulate` would have the states of one motion. The second has whole steps: those of a vector
+environment, and the same steps backwards.
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ from typing import Any
 import numpy as np
 
 from lag_envs import scenes
+from lag_envs.envs.model import Model
+from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.scenes import Scene
 from lag_envs.stepping.compiling import compile_function
 from lag_envs.stepping.flows import lift_lines
+from lag_envs.tasks import TASKS
 
 #: Length of the step [s], states in a batch, and calls in a sample of single ones.
 DT, BATCH, CALLS = 0.02, 1024, 20
+#: Environments whose whole steps go backwards, and steps from which they start.
+ENVS, STEPS = 16384, 8
 #: Scenes of the package, each with the control that asks most of it.
 CASES: dict[str, Callable[[], Scene]] = {
     "PivotedBar": scenes.PivotedBar,
@@ -126,6 +132,72 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
             }
         )
     return found
+
+
+def backwards(
+    rounds: int, clock: Callable[[], float], ids: Sequence[str] = (), count: int = ENVS
+) -> list[dict[str, Any]]:
+    """Measure what a whole step of a vector environment costs backwards, on one core.
+
+    Parameters
+    ----------
+    rounds, clock
+        As for `jacobians`.
+    ids : sequence of str
+        Environments; by default one for each scene.
+    count : int
+        How many of them there are in a batch.
+
+    Returns
+    -------
+    list of dict
+        For each its ``id``; ``step_ns`` and ``back_ns`` for each environment; ``ratio``, which is to be 4 at
+        most.
+    """
+    smooth = [name for name, kind in TASKS.items() if not kind().formulas.choices and not kind.imperfections]
+    found = []
+    for name in ids or {TASKS[name].scene: name for name in reversed(smooth)}.values():
+        envs = LagrangianVectorEnv(TASKS[name], count, num_threads=1)
+        envs.reset(seed=0)
+        rng, reverse = np.random.default_rng(0), Model(envs.task).reverse()
+        actions = rng.uniform(-1.0, 1.0, (STEPS, count, envs.task.formulas.actions)).astype(np.float32)
+        targets = np.zeros((count, 0)) if envs.target is None else envs.target.reshape(count, -1)
+        states = [envs.state]
+        for action in actions:
+            envs.step(action)
+            states.append(envs.state)
+        seeds = np.ones_like(states[0]), np.ones((count, len(envs.task.formulas.observation))), np.ones(count)
+
+        def step(envs: Any = envs, actions: Any = actions) -> None:
+            for action in actions:
+                envs.step(action)
+
+        def back(
+            pull: Any = reverse.pull,
+            states: Any = states,
+            actions: Any = actions,
+            targets: Any = targets,
+            seeds: Any = seeds,
+        ) -> None:
+            for i, action in enumerate(actions):
+                pull(states[i], action, targets, states[i + 1], states[i + 1], *seeds)
+
+        step_ns, back_ns = (1e9 * x / STEPS / count for x in _least((step, back), rounds, clock))
+        found.append(
+            {
+                "id": name,
+                "step_ns": round(step_ns, 1),
+                "back_ns": round(back_ns, 1),
+                "ratio": round(back_ns / step_ns, 2),
+            }
+        )
+    return found
+
+
+def backwards_table(rows: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the rows of a table, the first with the columns' names."""
+    cells = [(r["id"], f"{r['step_ns']:,.1f}", f"{r['back_ns']:,.1f}", f"{r['ratio']:.1f}") for r in rows]
+    return [("Whole step backwards", "step, ns", "backwards, ns", "steps"), *cells]
 
 
 def _least(runs: Sequence[Callable[[], None]], rounds: int, clock: Callable[[], float]) -> list[float]:

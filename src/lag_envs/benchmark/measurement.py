@@ -14,7 +14,7 @@ from lag_envs.benchmark.contestants import contestants
 from lag_envs.benchmark.divisions import divisions
 from lag_envs.benchmark.docs import take_over, to_json
 from lag_envs.benchmark.energies import chains, of_energies
-from lag_envs.benchmark.jacobians import jacobians
+from lag_envs.benchmark.jacobians import backwards, jacobians
 from lag_envs.benchmark.peak import arithmetic
 from lag_envs.benchmark.results import speedups, summary
 from lag_envs.benchmark.rounds import CLOCKS, measure
@@ -78,6 +78,7 @@ def bench(settings: Settings) -> dict[str, Any]:
     }
     if settings.jacobians and complete:
         report["jacobians"] = jacobians(settings.rounds, CLOCKS[settings.clock])
+        report["backwards"] = backwards(settings.rounds, CLOCKS[settings.clock])
     if settings.divisions and complete:
         report["divisions"] = divisions(settings.ids)
     print("\n".join(table(report)))

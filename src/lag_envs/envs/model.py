@@ -214,7 +214,7 @@ class Model:
             actions,
             targets,
             ends,
-            ends + _rows("kicks", kicks, ends.shape),
+            ends if isinstance(kicks, float) and kicks == 0.0 else ends + _rows("kicks", kicks, ends.shape),
             _rows("by_states", by_states, (n, self._n_state)),
             _rows("by_observations", by_observations, (n, observations)),
             _rows("by_rewards", by_rewards, (n,)),

@@ -1,13 +1,15 @@
 """A task's step backwards: from gradients by its results to gradients by what it depends on.
 
-A step is control, motion, reward and observation. The motion's part is `Scene.vjp`; those of the formulas
-before and after it are recorded from the formulas themselves (`lag_envs.stepping.adjoint`).
+A step is control, motion, reward and observation. Each part's derivatives are recorded from its formulas
+(`lag_envs.stepping.adjoint`). Where the motion has a flow of its own, the whole is one record. Otherwise,
+and where a step of the flow is no ordinary one, there are three parts: the formulas after the motion,
+`Scene.vjp`, and the formulas before it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,11 +18,15 @@ from numpy.typing import NDArray
 
 from lag_envs.envs.program import constants_of
 from lag_envs.scenes.steps import pulled
-from lag_envs.stepping.adjoint import compile_lanes
+from lag_envs.stepping.adjoint import Differentiable, Lanes
+from lag_envs.stepping.flows import split
 from lag_envs.stepping.tracing import clip
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
+
+#: Rows that go through the parts of a step together: few enough that what is between them stays in a cache.
+ROWS = 4096
 
 
 class Reverse:
@@ -48,19 +54,19 @@ class Reverse:
                 "derivatives"
             )
         constants = constants_of(task)
-        self._names = [f"k_{name}" for name in constants]
+        self._constants = [f"k_{name}" for name in constants]
         self._numbers = np.array([*constants.values()])
         self._absent = {f"k_{name}" for name, value in constants.items() if value == 0.0}
-        self._by = [f"k_self_{name}" for name in parameters]
-        rows = {"y": len(formulas.state), "a": formulas.actions, "g": formulas.targets}
-        rows |= {"z": rows["y"], "u": formulas.controls, "e": rows["y"], "o": len(formulas.observation)}
-        self._rows = {letter: [f"{letter}{i}" for i in range(n)] for letter, n in rows.items()} | {"r": ["r"]}
-        form = task.scene._form
-        self._angle = None if form is None else form.angle
+        sizes = {"y": len(formulas.state), "a": formulas.actions, "g": formulas.targets}
+        sizes |= {"z": sizes["y"], "u": formulas.controls, "e": sizes["y"]}
+        sizes |= {"by_e": sizes["y"], "by_o": len(formulas.observation), "by_r": 1, "by_u": sizes["u"]}
+        self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
+        self._form = task.scene._form
+        self._compiled: dict[str, Lanes] = {}
 
     def observations(self, states: Array, targets: Array) -> Array:
         """Return the observations of states (n, n_state) with targets (n, n_targets)."""
-        return self._run(self._observe, states.T, targets.T).T
+        return self._lanes("observe", self._observe_of, "y", "g")(self._numbers, states, targets)[0]
 
     def pull(
         self,
@@ -80,114 +86,113 @@ class Reverse:
         states, actions, targets : ndarray, shape (n, ...)
             Where steps begin, all with two axes. What is given here is not checked.
         ends, after : ndarray, shape (n, n_state)
-            The states after the motion, and after the kick too.
+            The states after the motion, and after the kick too; the same array where there was none.
         by_states, by_observations, by_rewards : ndarray, shape (n, n_state), (n, n_observations), (n,)
             The gradient by `after`, by its observations, and by the rewards.
         """
-        y, a, g, z = states.T, actions.T, targets.T, ends.T
-        u = self._run(self._control, y, a, g)
-        seeds = by_states.T, by_observations.T, by_rewards[None]
-        own_y, own_z, own_u, own_g, own_p = self._split(
-            self._run(self._after, y, z, u, g, after.T, *seeds), "yzug"
-        )
-        dt, scene = self._task.dt, self._task.scene
-        moved = pulled(scene, np.ascontiguousarray(states), u.T.copy(), dt, own_z.T, self._parameters)
-        by_y, by_u, by_p = np.split(moved.T, [len(y), len(y) + len(u)])
-        last_y, last_a, last_g, last_p = self._split(self._run(self._before, y, a, g, own_u + by_u), "yag")
-        return [(own_y + by_y + last_y).T, last_a.T, (own_g + last_g).T, (own_p + by_p + last_p).T]
+        given = states, actions, targets, ends, after, by_states, by_observations, by_rewards[:, None]
+        kicked = after is not ends
+        count = len(states)
+        if self._form is None or self._parameters:
+            sizes = [x.shape[1] for x in given[:3]] + [len(self._parameters)]
+            found, others = [np.empty((size, count)).T for size in sizes], np.arange(count)
+        else:
+            *found, ordinary = self._whole(kicked)(self._numbers, *given)
+            (others,) = np.nonzero(ordinary[:, 0] == 0.0)
+        for first in range(0, len(others), ROWS):
+            rows = others[first : first + ROWS]
+            at: Any = slice(first, first + ROWS) if len(others) == count else rows
+            for x, some in zip(found, self._in_parts(kicked, rows, *(x[at] for x in given)), strict=True):
+                x[at] = some
+        return found
+
+    def _in_parts(
+        self, kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
+    ) -> list[Array]:
+        """Do what `pull` does, the motion by itself; `rows` are what errors call the rows."""
+        (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
+        own_y, own_z, own_u, own_g, own_p = self._after(kicked)(self._numbers, y, u, g, z, *rest)
+        moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
+        by_y, by_u, by_p = np.split(moved, [y.shape[1], y.shape[1] + u.shape[1]], axis=1)
+        before = self._lanes("before", self._before_of, "y", "a", "g", "by_u")
+        last_y, last_a, last_g, last_p = before(self._numbers, y, a, g, own_u + by_u)
+        return [own_y + by_y + last_y, last_a, own_g + last_g, own_p + by_p + last_p]
 
     # --- formulas ------------------------------------------------------------------------------------------
 
-    def _run(self, compiled: tuple[Callable, int], *given: Array) -> Array:
-        function, outputs = compiled
-        both = np.concatenate(given)
-        found = np.empty((outputs, both.shape[1]))
-        function(both, found, self._numbers)
-        return found
+    def _lanes(self, name: str, formula: Callable, *arrays: str) -> Lanes:
+        """Return a formula, compiled when it is asked for first; `arrays` are what it takes."""
 
-    def _split(self, found: Array, letters: str) -> list[Array]:
-        ends = np.cumsum([len(self._rows[letter]) for letter in letters])
-        return np.split(found, ends)
+        def of_numbers(xp: Differentiable, numbers: dict[str, Any]) -> list[list]:
+            given = {array: [numbers[name] for name in self._names[array]] for array in arrays}
+            k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._constants})
+            return formula(xp, k, **given)
 
-    def _compile(self, name: str, letters: str, formula: Callable, outputs: int) -> tuple[Callable, int]:
-        inputs = [row for letter in letters for row in self._rows[letter]]
-        return compile_lanes(name, formula, inputs, self._names, self._absent, outputs), outputs
+        if name not in self._compiled:
+            names = [self._names[array] for array in arrays]
+            self._compiled[name] = Lanes(name, of_numbers, names, self._constants, self._absent)
+        return self._compiled[name]
 
-    def _count(self, letters: str) -> int:
-        return sum(len(self._rows[letter]) for letter in letters)
+    def _whole(self, kicked: bool) -> Lanes:
+        name = "whole_kicked" if kicked else "whole"
+        formula = partial(self._whole_of, kicked)
+        return self._lanes(name, formula, "y", "a", "g", "z", "e", "by_e", "by_o", "by_r")
 
-    def _of(self, numbers: Mapping[str, Any], letter: str) -> list:
-        return [numbers[row] for row in self._rows[letter]]
+    def _after(self, kicked: bool) -> Lanes:
+        name = "after_kicked" if kicked else "after"
+        formula = partial(self._after_of, kicked)
+        return self._lanes(name, formula, "y", "u", "g", "z", "e", "by_e", "by_o", "by_r")
 
-    def _lifted(self, xp: Any, numbers: Mapping[str, Any], letter: str) -> list:
-        y = self._of(numbers, letter)
-        return y if self._angle is None else [*y, xp.cos(y[self._angle]), xp.sin(y[self._angle])]
+    def _parameters_of(self, k: Any) -> list:
+        return [getattr(k, f"self_{name}") for name in self._parameters]
 
-    def _constants(self, numbers: Mapping[str, Any]) -> SimpleNamespace:
-        return SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._names})
+    def _lifted(self, xp: Any, y: list) -> list:
+        angle = None if self._form is None else self._form.angle
+        return y if angle is None else [*y, xp.cos(y[angle]), xp.sin(y[angle])]
 
-    def _control_of(self, xp: Any, numbers: Mapping[str, Any]) -> list:
+    def _control_of(self, xp: Any, k: Any, y: list, a: list, g: list) -> list[list]:
         top = self._formulas.largest
-        a = [clip(x, -top, top, xp) for x in self._of(numbers, "a")]
-        y, k = self._lifted(xp, numbers, "y"), self._constants(numbers)
-        return self._formulas.control(xp, a, y, self._of(numbers, "g"), k)
+        return [self._formulas.control(xp, [clip(x, -top, top, xp) for x in a], self._lifted(xp, y), g, k)]
 
-    def _reward_of(self, xp: Any, numbers: Mapping[str, Any]) -> Any:
-        y, z = (self._lifted(xp, numbers, letter) for letter in "yz")
-        given: tuple[Any, ...] = (
-            y,
-            z,
-            self._of(numbers, "u"),
-            self._of(numbers, "g"),
-            self._constants(numbers),
-        )
+    def _reward_of(self, xp: Any, k: Any, y: list, u: list, g: list, z: list) -> Any:
+        given = self._lifted(xp, y), self._lifted(xp, z), u, g, k
         if not self._formulas.has_last:
             return self._formulas.reward(xp, *given)
         reward, ended = self._formulas.outcome(xp, *given)
         return xp.where(ended, self._formulas.last(xp, *given), reward)
 
-    def _observe_of(self, xp: Any, numbers: Mapping[str, Any], letter: str) -> list:
-        y, g = self._lifted(xp, numbers, letter), self._of(numbers, "g")
-        return self._formulas.observe(xp, y, g, self._constants(numbers))
+    def _observe_of(self, xp: Any, k: Any, y: list, g: list) -> list[list]:
+        return [self._formulas.observe(xp, self._lifted(xp, y), g, k)]
 
-    @cached_property
-    def _control(self) -> tuple[Callable, int]:
-        return self._compile("control", "yag", self._control_of, self._count("u"))
+    def _after_of(
+        self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, **seeds: list
+    ) -> list[list]:
+        """Record the way back to the motion's end, and past it: cotangents of y, z, u, g and parameters."""
+        e = e if kicked else z
+        outputs = [self._reward_of(xp, k, y, u, g, z), *self._observe_of(xp, k, e, g)[0], *e]
+        by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
+        bars = [x for name in ("by_r", "by_o", "by_e") for x in seeds[name]]
+        found = xp.adjoint(outputs, bars, [x for numbers in by for x in numbers])
+        own_y, own_z, *rest, own_e = split(found, *map(len, by[:-1]))
+        return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
-    @cached_property
-    def _observe(self) -> tuple[Callable, int]:
-        return self._compile(
-            "observe", "yg", lambda xp, numbers: self._observe_of(xp, numbers, "y"), self._count("o")
-        )
+    def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, by_u: list) -> list[list]:
+        """Record the way back from controls: cotangents of y, a, g and parameters."""
+        by = [y, a, g, self._parameters_of(k)]
+        found = xp.adjoint(self._control_of(xp, k, y, a, g)[0], by_u, [x for numbers in by for x in numbers])
+        return split(found, *map(len, by[:-1]))
 
-    @cached_property
-    def _after(self) -> tuple[Callable, int]:
-        seeds = {"o": [f"seed_{row}" for row in self._rows["o"]], "e": [f"seed_{r}" for r in self._rows["e"]]}
+    def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
+        """Record the way back through all: cotangents of y, a, g, no parameters; 1 for ordinary steps."""
+        stepper: Any = self._task.scene._code(self._task.dt)
+        (u,) = self._control_of(xp, k, y, a, g)
+        own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
+        moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
+        by_y, by_u = split(moved, len(y))
+        last_y, last_a, last_g, _ = self._before_of(xp, k, y, a, g, _sums(own_u, by_u))
+        by = _sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g)
+        return [*by, [], [xp.where(ordinary, 1.0, 0.0)]]
 
-        def after(xp: Any, numbers: Mapping[str, Any]) -> list:
-            reward = self._reward_of(xp, numbers)
-            seen = self._observe_of(xp, numbers, "e")
-            by = [numbers[row] for letter in "yzug" for row in self._rows[letter]]
-            kicked = self._of(numbers, "e")
-            outputs = [reward, *seen]
-            given = [numbers["seed_r"], *(numbers[name] for name in seeds["o"])]
-            found = xp.adjoint(outputs, given, [*by, *kicked, *(numbers[name] for name in self._by)])
-            first = self._count("y")
-            ends = found[len(by) : len(by) + len(kicked)]
-            for i, (own, seed) in enumerate(zip(ends, seeds["e"], strict=True)):
-                found[first + i] = found[first + i] + own + numbers[seed]
-            return found[: len(by)] + found[len(by) + len(kicked) :]
 
-        self._rows["s"] = [*seeds["e"], *seeds["o"], "seed_r"]
-        return self._compile("after", "yzuges", after, self._count("yzug") + len(self._by))
-
-    @cached_property
-    def _before(self) -> tuple[Callable, int]:
-        self._rows["c"] = [f"seed_{row}" for row in self._rows["u"]]
-
-        def before(xp: Any, numbers: Mapping[str, Any]) -> list:
-            by = [numbers[row] for letter in "yag" for row in self._rows[letter]]
-            by += [numbers[name] for name in self._by]
-            return xp.adjoint(self._control_of(xp, numbers), self._of(numbers, "c"), by)
-
-        return self._compile("before", "yagc", before, self._count("yag") + len(self._by))
+def _sums(*lists: list) -> list:
+    return [sum(numbers) for numbers in zip(*lists, strict=True)]

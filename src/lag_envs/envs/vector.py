@@ -386,7 +386,11 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     @property
     def state(self) -> NDArray[np.float64]:
         """Copy of the states, shape (num_envs, n_state), ordered as ``scene.state_names``, in SI units."""
-        return np.stack([self._read(f"y{j}") for j in range(len(self.scene.state_names))], axis=1)
+        blocks = self._blocks
+        found = np.empty((len(blocks), BLOCK, len(self.scene.state_names)))
+        for j in range(found.shape[2]):
+            found[..., j] = blocks[:, self._row[f"y{j}"]]
+        return found.reshape(-1, found.shape[2])[: self.num_envs]
 
     @property
     def target(self) -> NDArray[np.float64] | None:

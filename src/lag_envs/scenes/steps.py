@@ -147,11 +147,17 @@ def vjp(
 
 
 def pulled(
-    scene: Scene, states: Array, controls: Array, dt: float, cotangents: Array, by: tuple[str, ...]
+    scene: Scene,
+    states: Array,
+    controls: Array,
+    dt: float,
+    cotangents: Array,
+    by: tuple[str, ...],
+    rows: Sequence[int] | None = None,
 ) -> Array:
-    """Return what `vjp` does for rows of checked arrays, side by side."""
+    """Return what `vjp` does for rows of checked arrays, side by side; `rows` are what errors call them."""
     found, refused = _derivatives(scene, by).vjp(states, controls, dt, cotangents)
-    _check_refused(scene, states, controls, dt, refused)
+    _check_refused(scene, states, controls, dt, refused, rows)
     return found
 
 
@@ -165,10 +171,13 @@ def _rows(scene: Scene, state: ArrayLike, control: ArrayLike) -> tuple[Array, Ar
     return states, controls, shape
 
 
-def _check_refused(scene: Scene, states: Array, controls: Array, dt: float, refused: int) -> None:
+def _check_refused(
+    scene: Scene, states: Array, controls: Array, dt: float, refused: int, rows: Sequence[int] | None = None
+) -> None:
     if refused:
         i = refused - 1
-        raise refusal(scene, states[i], controls[i], dt, None, f"the step of row {i}")
+        where = f"the step of row {i if rows is None else rows[i]}"
+        raise refusal(scene, states[i], controls[i], dt, None, where)
 
 
 class _Derivatives(NamedTuple):

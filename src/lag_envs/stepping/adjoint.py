@@ -12,12 +12,18 @@ Where a formula has kinks the derivative is that of the branch that its value ca
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from lag_envs.stepping.compiling import BLOCK, compile_function, record_block
+import numpy as np
+
+from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import BOOLEAN, Number, Operation, Trace
+
+#: Lanes whose numbers lie together: few enough for the nearest cache, with all that goes in and out.
+LANES = 64
 
 
 def _whole(name: str) -> Callable:
@@ -50,7 +56,8 @@ class Differentiable(Trace):
         seeds : sequence of number
             One for each output, its cotangent.
         inputs : sequence of Number
-            By what.
+            By what. Results of earlier operations are independent inputs here: what they were computed from
+            gets nothing through them.
         """
         total: dict[str, Any] = {}
 
@@ -60,7 +67,7 @@ class Differentiable(Trace):
 
         for output, seed in zip(outputs, seeds, strict=True):
             pass_on(output, seed)
-        nodes = list(self._nodes)
+        nodes = self._between(outputs, {x.name for x in inputs if isinstance(x, Number)})
         branches = self._branches(nodes)
         for node in reversed(nodes):
             seed = total.pop(node.name, None)
@@ -70,7 +77,17 @@ class Differentiable(Trace):
                 if node.name in branches and node.op not in ("+", "-", "neg", "where"):
                     amount = self.where(0.0 < self.abs(seed), amount, 0.0)
                 pass_on(operand, amount)
-        return [total.get(number.name, 0.0) for number in inputs]
+        return [total.get(x.name, 0.0) if isinstance(x, Number) else 0.0 for x in inputs]
+
+    def _between(self, outputs: Sequence[Any], inputs: set[str]) -> list[Number]:
+        """Return the operations from these inputs to these outputs, in order."""
+        needed, stack = set(inputs), list(outputs)
+        while stack:
+            value = stack.pop()
+            if isinstance(value, Number) and value.name not in needed:
+                needed.add(value.name)
+                stack.extend(value.args)
+        return [node for node in self._nodes if node.name in needed - inputs]
 
     def _shares(self, node: Number, seed: Any) -> list[tuple[Any, Any]]:
         """Return the operands of an operation, and what each gets of its cotangent."""
@@ -119,70 +136,94 @@ def replay(operations: Sequence[Operation], values: Mapping[str, Any], trace: Tr
     return known
 
 
-def compile_lanes(
-    name: str,
-    formula: Callable,
-    inputs: Sequence[str],
-    constants: Sequence[str],
-    absent: Collection[str],
-    outputs: int,
-) -> Callable:
-    """Compile ``name(given, found, numbers)``, which carries out a formula for each lane of a batch.
+class Lanes:
+    """A formula, compiled to be carried out for each lane of a batch.
 
     Parameters
     ----------
     name : str
         Name of the compiled function.
     formula : callable
-        ``formula(trace, numbers)`` takes a `Differentiable` and a dict of numbers by name, and returns
-        `outputs` numbers.
-    inputs : sequence of str
-        Rows of `given`, of shape (inputs, lanes).
+        ``formula(trace, numbers)`` takes a `Differentiable` and a dict of numbers by name, and returns for
+        each array of results a list of numbers.
+    inputs : sequence of sequence of str
+        For each array that is given, the names of its columns.
     constants : sequence of str
-        What the lanes have in common: the entries of `numbers`.
+        What the lanes have in common.
     absent : collection of str
         Constants that are known to be zero.
-    outputs : int
-        Rows of `found`, of shape (outputs, lanes).
     """
-    trace = Differentiable()
-    numbers = {n: trace.zero() if n in absent else trace.inputs(n)[0] for n in (*inputs, *constants)}
-    operations, results = trace.operations(formula(trace, numbers), fused=False)
-    target = ElementaryTrace()
-    known = replay(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
-    ends = [known[result] if isinstance(result, str) else float(result) for result in results]
-    lines, values = record_block(target, {f"out{i}": end for i, end in enumerate(ends)})
-    # As in `envs/program.py`: rows at distances known when compiling, so that lanes become vectors.
-    body = [
-        f"def {name}(given, found, numbers):",
-        "wide_vectors()",
-        f"rows, count = np.empty({(len(inputs) + outputs) * BLOCK}), np.uint64(given.shape[1])",
-        *(f"{constant} = numbers[{j}]" for j, constant in enumerate(constants)),
-        f"for block in range(np.uint64((given.shape[1] + {BLOCK - 1}) // {BLOCK})):",
-        f"    first = block * np.uint64({BLOCK})",
-        f"    size = min(np.uint64({BLOCK}), count - first)",
-        *(
-            line
-            for j in range(len(inputs))
-            for line in (
-                "    for i in range(size):",
-                f"        rows[np.uint64({j * BLOCK}) + i] = given[{j}, first + i]",
-            )
-        ),
-        "    for i in range(size):",
-        *(f"        {n} = rows[np.uint64({j * BLOCK}) + i]" for j, n in enumerate(inputs)),
-        *(f"        {line}" for line in lines),
-        *(
-            f"        rows[np.uint64({(len(inputs) + j) * BLOCK}) + i] = {value}"
-            for j, value in enumerate(values)
-        ),
-        *(
-            line
-            for j in range(outputs)
-            for line in (
-                "    for i in range(size):",
-                f"        found[{j}, first + i] = rows[np.uint64({(len(inputs) + j) * BLOCK}) + i]",
-            )
-        ),
-    ]
-    return compile_function(name, "\n    ".join(body) + "\n")
+
+    def __init__(
+        self,
+        name: str,
+        formula: Callable,
+        inputs: Sequence[Sequence[str]],
+        constants: Sequence[str],
+        absent: Collection[str],
+    ) -> None:
+        trace = Differentiable()
+        columns = {
+            n: f"given{i}[first + i, {j}]" for i, names in enumerate(inputs) for j, n in enumerate(names)
+        }
+        numbers = {n: trace.zero() if n in absent else trace.inputs(n)[0] for n in (*columns, *constants)}
+        found = formula(trace, numbers)
+        operations, results = trace.operations([x for numbers in found for x in numbers])
+        target = ElementaryTrace()
+        known = replay(operations, {n: target.inputs(n)[0] for n in numbers if n not in absent}, target)
+        ends = [known[result] if isinstance(result, str) else float(result) for result in results]
+        lines, values = record_block(target, {f"out{i}": end for i, end in enumerate(ends)})
+        used = set(re.findall(r"\w+", " ".join([*lines, *map(str, values)])))
+        columns = {n: place for n, place in columns.items() if n in used}
+        places = [f"found{i}[first + i, {j}]" for i, x in enumerate(found) for j in range(len(x))]
+        # As in `envs/program.py`: rows at distances known when compiling, so that lanes become vectors.
+        row = [f"rows[np.uint64({k * LANES}) + i]" for k in range(len(columns) + len(places))]
+        into, out = row[: len(columns)], row[len(columns) :]
+        arrays = [f"given{i}" for i in range(len(inputs))], [f"found{i}" for i in range(len(found))]
+        body = [
+            f"def {name}({', '.join([*arrays[0], *arrays[1], 'numbers'])}):",
+            "wide_vectors()",
+            f"rows, count = np.empty({len(row) * LANES}), np.uint64(found0.shape[0])",
+            *(f"{constant} = numbers[{j}]" for j, constant in enumerate(constants)),
+            f"for block in range(np.uint64((found0.shape[0] + {LANES - 1}) // {LANES})):",
+            f"    first = block * np.uint64({LANES})",
+            f"    size = min(np.uint64({LANES}), count - first)",
+            *_loops(zip(into, columns.values(), strict=True)),
+            "    for i in range(size):",
+            *(f"        {n} = {at}" for n, at in zip(columns, into, strict=True)),
+            *(f"        {line}" for line in lines),
+            *(f"        {at} = {value}" for at, value in zip(out, values, strict=True)),
+            *_loops(zip(places, out, strict=True)),
+        ]
+        self._compiled: Any = compile_function(name, "\n    ".join(body) + "\n")
+        self._sizes = [len(numbers) for numbers in found]
+        self._kinds: dict[tuple[str, ...], Callable] = {}
+
+    def __call__(self, numbers: Any, *given: Any) -> list[Any]:
+        """Return the results, arrays of shape (lanes, columns).
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (constants,)
+            The constants.
+        *given : ndarray, shape (lanes, columns)
+            Numbers of float64 or float32, with any strides.
+        """
+        found = [np.empty((size, len(given[0]))).T for size in self._sizes]
+        kinds = tuple(x.dtype.char for x in given)
+        if kinds not in self._kinds:
+            self._kinds[kinds] = self._compile(kinds)
+        self._kinds[kinds](*given, *found, numbers)
+        return found
+
+    def _compile(self, kinds: Sequence[str]) -> Callable:
+        """Compile for arrays of these types, once for all strides."""
+        from numba import from_dtype, types
+
+        given = [types.Array(from_dtype(np.dtype(kind)), 2, "A", readonly=True) for kind in kinds]
+        found = [types.Array(types.float64, 2, "A")] * len(self._sizes)
+        return self._compiled.compile((*given, *found, types.float64[::1]))
+
+
+def _loops(pairs: Iterable[tuple[str, str]]) -> list[str]:
+    return [line for a, b in pairs for line in ("    for i in range(size):", f"        {a} = {b}")]

@@ -2,9 +2,9 @@
 
 The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
 Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
-Σ_j x_j z_{k-j} = 0 of a reciprocal; a coefficient's cotangent, divided by what it is multiplied with, goes to
-all the others. So an order costs two sums of products where the series has one, and no totals are kept.
-Lengths of substeps are held.
+Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents
+of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them
+where the series has one. Lengths of substeps are held.
 """
 
 from __future__ import annotations
@@ -44,12 +44,29 @@ class Backward(Series):
                     if w in self._active:
                         self._factor(a)
         self.slots = len(self._slots)
+        #: Slots of cotangents: of each node's or matrix entry's sum of products; and, by slot, of series to
+        #: which several orders add, or which are known, and so wanted at the end.
+        self._sums = {key: self.slots + i for i, key in enumerate(self._pairs)}
+        first, rates = self.slots + len(self._sums), {a.slot for a, _ in self._pairs.values() if a.back}
+        kept = [
+            slot
+            for (kind, i), slot in self._slots.items()
+            if kind == "v" or slot in rates or self._is_known(kind, i)
+        ]
+        self._bars = {slot: first + i for i, slot in enumerate(kept)}
         self._cells = {key: i for i, key in enumerate([*record.mass, *self._active])}
 
     @property
     def entries(self) -> int:
-        """How many numbers a lane needs: coefficients, their cotangents, those of masses and weights."""
-        return (2 * self.slots) * STRIDE + STRIDE * -(-max(len(self._cells), 1) // STRIDE)
+        """How many numbers a lane needs: coefficients, cotangents, those of masses and weights."""
+        return STRIDE * (self._first_cell + -(-max(len(self._cells), 1) // STRIDE))
+
+    @property
+    def _first_cell(self) -> int:
+        return self.slots + len(self._sums) + len(self._bars)
+
+    def _is_known(self, kind: str, i: int) -> bool:
+        return kind == "x" and self.record.nodes[i].op in KNOWN
 
     def pull(
         self, t: Target, inputs: dict, q: Sequence, v: Sequence, h: Any, order: Any, ends: Sequence
@@ -70,18 +87,18 @@ class Backward(Series):
         def seed(k: Any, carried: Sequence) -> list:
             per = t.mul(h, t.reciprocal(t.plus(k, 1)))
             for i in range(n):
-                t.store(self._bar(self._slots["v", i]), k, t.fma(per, ends[i], ends[n + i]))
+                t.store(self._bar("v", i), k, t.fma(per, ends[i], ends[n + i]))
             return []
 
         t.loop(t.index(0), t.plus(order, 1), [], seed)
 
         def back(m: Any, carried: Sequence) -> list:
-            self._one_order_back(t, start, h, t.minus(order, m))
+            self._one_order_back(t, start, h, t.minus(order, m), order)
             return []
 
         t.loop(t.index(1), order, [], back)
-        places, weights = self._first_order_back(t, start, h)
-        velocities = [t.load(self._bar(self._slots["v", i]), t.index(0)) for i in range(n)]
+        places, weights = self._first_order_back(t, start, h, order)
+        velocities = [t.load(self._bar("v", i), t.index(0)) for i in range(n)]
         found = [
             total if x is None else t.add(x, total) for x, total in zip(places[:n], ends[:n], strict=True)
         ]
@@ -100,32 +117,29 @@ class Backward(Series):
 
     # --- cotangents in memory ------------------------------------------------------------------------------
 
-    def _bar(self, slot: int) -> int:
-        return self.slots + slot
+    def _bar(self, kind: str, i: int) -> int:
+        return self._bars[self._slots[kind, i]]
 
     def _clear(self, t: Target, order: Any) -> None:
         zero = t.number(0.0)
 
         def clear(k: Any, carried: Sequence) -> list:
-            for slot in range(self.slots):
-                t.store(self._bar(slot), k, zero)
+            for (kind, _), slot in self._slots.items():
+                if kind == "x" and slot in self._bars:
+                    t.store(self._bars[slot], k, zero)
             return []
 
-        t.loop(t.index(0), t.plus(order, 2), [], clear)
+        t.loop(t.index(0), order, [], clear)
         for key in self._cells:
             t.store(*self._cell(t, key), zero)
 
     def _cell(self, t: Target, key: Any) -> tuple[int, Any]:
         cell = self._cells[key]
-        return 2 * self.slots + cell // STRIDE, t.index(cell % STRIDE)
+        return self._first_cell + cell // STRIDE, t.index(cell % STRIDE)
 
     def _add(self, t: Target, slot: int, k: Any, a: Any, b: Any) -> None:
         """Add a product to a number in memory."""
         t.store(slot, k, t.fma(a, b, t.load(slot, k)))
-
-    def _add_to(self, t: Target, factor: Factor, k: Any, a: Any, b: Any) -> None:
-        """Add a product to the cotangent of a factor's coefficient of order k."""
-        self._add(t, self._bar(factor.slot), t.plus(k, -factor.back), a, b)
 
     def _weight_bar(self, t: Target, weight: Any, a: Any, b: Any) -> None:
         if weight in self._active:
@@ -133,7 +147,38 @@ class Backward(Series):
 
     # --- one order -----------------------------------------------------------------------------------------
 
-    def _solve_back(self, t: Target, start: Start, h: Any, k: Any) -> list:
+    def _gather(self, t: Target, k: Any, order: Any, first: bool = False) -> dict[Factor, Any]:
+        """Return what sums of products of higher orders add to cotangents of factors of order k.
+
+        To those that are kept in slots it is added there.
+        """
+        found: dict[Factor, Any] = {}
+        pairs = list(self._pairs.items())
+        for begin in range(0, len(pairs), GROUP):
+            some = pairs[begin : begin + GROUP]
+            factors = list(dict.fromkeys(factor for _, pair in some for factor in pair))
+
+            def later(i: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
+                m = t.minus(order, i)  # what was found last is added last
+                value = {factor: factor.load(t, t.minus(m, k)) for factor in factors}
+                total = dict(zip(factors, carried, strict=True))
+                for key, (a, b) in some:
+                    bar = t.load(self._sums[key], m)
+                    if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
+                        total[a] = t.fma(bar, value[b], total[a])
+                    total[b] = t.fma(bar, value[a], total[b])
+                return list(total.values())
+
+            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * len(factors), later)
+            for factor, total in zip(factors, sums, strict=True):
+                found[factor] = t.add(found[factor], total) if factor in found else total
+        for factor in [factor for factor in found if factor.slot in self._bars]:
+            total = found.pop(factor)
+            if not (first and factor.back):
+                self._add(t, self._bars[factor.slot], t.plus(k, -factor.back), t.number(1.0), total)
+        return found
+
+    def _solve_back(self, t: Target, start: Start, h: Any, k: Any, found: dict[Factor, Any]) -> list:
         """Go back through M_0 a_k = r and v_{k+1} = h a_k/(k+1); return the cotangents of r."""
         after = t.plus(k, 1)
         step = t.mul(h, t.reciprocal(after))
@@ -141,8 +186,9 @@ class Backward(Series):
         for i in range(self.size):
             slot = self._slots["a", i]
             a.append(t.load(slot, k))
-            v_bar = t.load(self._bar(self._slots["v", i]), after)
-            bars.append(t.fma(step, v_bar, t.load(self._bar(slot), k)))
+            v_bar = t.load(self._bar("v", i), after)
+            own = found.get(Factor(slot))
+            bars.append(t.mul(step, v_bar) if own is None else t.fma(step, v_bar, own))
         right = [t.number(0.0) if x is None else x for x in times(t, start.inverse.rows, bars)]
         for i, j in self.record.mass:
             less = t.mul(right[i], a[j])
@@ -151,23 +197,25 @@ class Backward(Series):
             t.store(*cell, t.sub(t.load(*cell), less))
         return right
 
-    def _one_order_back(self, t: Target, start: Start, h: Any, k: Any) -> None:
+    def _one_order_back(self, t: Target, start: Start, h: Any, k: Any, order: Any) -> None:
         """Take the cotangents of all coefficients of order k > 0 to those of lower ones."""
         record, first = self.record, t.index(0)
+        found = self._gather(t, k, order)
         bars: dict[int, Any] = {}
         for n in self._live:
-            if ("x", n) in self._slots and record.nodes[n].op not in KNOWN:
-                bars[n] = t.load(self._bar(self._slots["x", n]), k)
-            if ("d", n) in self._slots:
-                more = t.mul(t.real(k), t.load(self._bar(self._slots["d", n]), k))
+            slot = self._slots.get(("x", n), -1)
+            if slot in self._bars and record.nodes[n].op not in KNOWN:
+                bars[n] = t.load(self._bars[slot], k)
+            elif Factor(slot) in found:
+                bars[n] = found[Factor(slot)]
+            if ("d", n) in self._slots and (bar := found.get(Factor(self._slots["d", n]))) is not None:
+                more = t.mul(t.real(k), bar)
                 bars[n] = t.add(bars[n], more) if n in bars else more
-        inner: list[tuple[Factor, Factor, Any]] = []
-        weighted: list[tuple[Any, Factor, Factor, Any]] = []
 
         def add(n: int, a: Any, b: Any) -> None:
             bars[n] = t.fma(a, b, bars[n]) if n in bars else t.mul(a, b)
 
-        right = self._solve_back(t, start, h, k)
+        right = self._solve_back(t, start, h, k, found)
         one = t.number(1.0)
         for i, f in enumerate(record.force):
             if f >= 0:
@@ -179,109 +227,76 @@ class Backward(Series):
                 rate, factor = Factor(self._slots["a", j]), self._factor(node)
                 less = t.neg(right[i])
                 if weight in self._active:
-                    weighted.append((weight, factor, rate, less))
+                    self._weight_bar(t, weight, less, self._product(t, k, factor, rate))
                 if weight != 1.0:
                     less = t.mul(less, self._weight(t, start.scalars, weight))
                 add(node, less, rate.load(t, first))
-                self._add_to(t, rate, first, less, factor.load(t, k))
-                inner.append((factor, rate, less))
+                t.store(self._sums[i, j], k, less)
         for n in reversed(self._live):
             if n in bars:
-                inner += self._node_back(t, start, n, bars[n], h, k, add)
-        self._convolve_back(t, k, inner, weighted)
+                self._node_back(t, start, n, bars[n], h, k, add)
+            elif n in self._pairs:
+                t.store(self._sums[n], k, t.number(0.0))
 
-    def _node_back(
-        self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable
-    ) -> list[tuple[Factor, Factor, Any]]:
-        """Take a node's cotangent of order k to order 0 and k; return what goes to those between."""
-        node, zero, first = self.record.nodes[n], start.zero, t.index(0)
+    def _node_back(self, t: Target, start: Start, n: int, bar: Any, h: Any, k: Any, add: Callable) -> None:
+        """Take a node's cotangent of order k to what it was made of, and to its sum of products."""
+        node, zero = self.record.nodes[n], start.zero
         op, args = node.op, node.args
         if op == "place":
             step = t.mul(h, t.reciprocal(k))
-            self._add(t, self._bar(self._slots["v", node.index]), t.plus(k, -1), step, bar)
-            return []
-        if op == "velocity" or op in KNOWN:
-            self._add_to(t, self._factor(n), k, bar, t.number(1.0))
-            return []
-        if op == "sum":
+            self._add(t, self._bar("v", node.index), t.plus(k, -1), step, bar)
+        elif op == "velocity" or op in KNOWN:
+            self._add(t, self._bars[self._factor(n).slot], k, bar, t.number(1.0))
+        elif op == "sum":
             for a, weight in zip(args, node.weights, strict=False):
                 add(a, bar, self._weight(t, start.scalars, weight))
                 if weight in self._active:
                     self._weight_bar(t, weight, bar, self._factor(a).load(t, k))
-            return []
-        if op == "product":
-            x, y = self._factor(args[0]), self._factor(args[1])
+        elif op == "product":
             add(args[0], bar, zero[args[1]])
             add(args[1], bar, zero[args[0]])
-            self._add_to(t, x, first, bar, y.load(t, k))
-            self._add_to(t, y, first, bar, x.load(t, k))
-            return [(x, y, bar)]
-        if op == "reciprocal":  # Σ x_j z_{k-j} = 0
-            x, z = self._factor(args[0]), self._factor(n)
+            t.store(self._sums[n], k, bar)
+        elif op == "reciprocal":  # Σ x_j z_{k-j} = 0
             less = t.neg(t.mul(bar, zero[n]))
             add(args[0], less, zero[n])
-            self._add_to(t, x, first, less, z.load(t, k))
-            self._add_to(t, z, first, less, x.load(t, k))
-            return [(x, z, less)]
-        if op == "sqrt":  # Σ z_j z_{k-j} = x_k
-            z = self._factor(n)
+            t.store(self._sums[n], k, less)
+        elif op == "sqrt":  # Σ z_j z_{k-j} = x_k
             half = t.mul(bar, t.div(t.number(0.5), zero[n]))
-            less = t.neg(half)
             add(args[0], half, t.number(1.0))
-            self._add_to(t, z, first, t.add(less, less), z.load(t, k))
-            return [(z, z, less)]
-        assert op in FUNCTIONS  # k z_k = Σ_{j>0} D_j w_{k-j}
-        slope, w = self._slope(n), self._factor(args[1])
-        bar = t.neg(bar) if op == "cos" else bar
-        scaled = t.mul(t.reciprocal(k), bar)
-        if slope.back:  # D is h times the argument's rate
-            scaled = t.mul(h, scaled)
-            self._add_to(t, slope, k, scaled, zero[args[1]])
-        else:
-            add(args[0], bar, zero[args[1]])
-        self._add_to(t, w, first, scaled, slope.load(t, k))
-        return [(slope, w, scaled)]
+            t.store(self._sums[n], k, t.neg(half))
+        else:  # k z_k = Σ_{j>0} D_j w_{k-j}
+            assert op in FUNCTIONS
+            slope = self._slope(n)
+            bar = t.neg(bar) if op == "cos" else bar
+            scaled = t.mul(t.reciprocal(k), bar)
+            if slope.back:  # D is h times the argument's rate
+                scaled = t.mul(h, scaled)
+                self._add(t, self._bars[slope.slot], t.plus(k, -1), scaled, zero[args[1]])
+            else:
+                add(args[0], bar, zero[args[1]])
+            t.store(self._sums[n], k, scaled)
 
-    def _convolve_back(
-        self,
-        t: Target,
-        k: Any,
-        inner: Sequence[tuple[Factor, Factor, Any]],
-        weighted: Sequence[tuple[Any, Factor, Factor, Any]],
-    ) -> None:
-        """Go back through Σ_{0<j<k} A_j B_{k-j} for all pairs with their cotangents."""
-        for begin in range(0, len(inner), GROUP):
-            some = inner[begin : begin + GROUP]
+    def _product(self, t: Target, k: Any, a: Factor, b: Factor) -> Any:
+        """Return Σ_{0<j<=k} A_j B_{k-j}."""
 
-            def spread(j: Any, carried: Sequence, some: Sequence = some) -> list:
-                other = t.minus(k, j)
-                x = {a: a.load(t, j) for a, _, _ in some}
-                y = {b: b.load(t, other) for _, b, _ in some}
-                for a, b, bar in some:
-                    self._add_to(t, a, j, bar, y[b])
-                for a, b, bar in some:
-                    self._add_to(t, b, other, bar, x[a])
-                return []
+        def total(j: Any, carried: Sequence) -> list:
+            return [t.fma(a.load(t, j), b.load(t, t.minus(k, j)), carried[0])]
 
-            t.loop(t.index(1), k, [], spread)
-        for weight, a, b, bar in weighted:
-
-            def total(j: Any, carried: Sequence, a: Factor = a, b: Factor = b) -> list:
-                return [t.fma(a.load(t, j), b.load(t, t.minus(k, j)), carried[0])]
-
-            (found,) = t.loop(t.index(1), t.plus(k, 1), [t.number(0.0)], total)
-            self._weight_bar(t, weight, bar, found)
+        (found,) = t.loop(t.index(1), t.plus(k, 1), [t.number(0.0)], total)
+        return found
 
     # --- order 0 -------------------------------------------------------------------------------------------
 
-    def _first_order_back(self, t: Target, start: Start, h: Any) -> tuple[list, dict[str, Any]]:
+    def _first_order_back(self, t: Target, start: Start, h: Any, order: Any) -> tuple[list, dict[str, Any]]:
         """Return cotangents of places and velocities (None: zero), and of the active weights."""
         record, zero, first, n = self.record, start.zero, t.index(0), self.size
-        bars: dict[int, Any] = {
-            i: t.load(self._bar(self._slots["x", i]), first)
-            for i in range(len(record.nodes))
-            if ("x", i) in self._slots
-        }
+        gathered = self._gather(t, first, order, first=True)
+        bars: dict[int, Any] = {}
+        for (kind, i), slot in self._slots.items():
+            if kind == "x" and slot in self._bars:
+                bars[i] = t.load(self._bars[slot], first)
+            elif kind == "x" and Factor(slot) in gathered:
+                bars[i] = gathered[Factor(slot)]
         found: list[Any] = [None] * (2 * n)
 
         def add(to: Any, key: int, a: Any, b: Any) -> None:
@@ -289,7 +304,7 @@ class Backward(Series):
             to[key] = t.mul(a, b) if old is None else t.fma(a, b, old)
 
         one = t.number(1.0)
-        for f, bar in zip(record.force, self._solve_back(t, start, h, first), strict=True):
+        for f, bar in zip(record.force, self._solve_back(t, start, h, first, gathered), strict=True):
             if f >= 0:
                 add(bars, f, bar, one)
         for place, (entry, weight, constant) in record.mass.items():
@@ -304,7 +319,7 @@ class Backward(Series):
             if op in KNOWN and ("x", i) in self._slots:
                 power = h
                 for k, w in enumerate(node.weights[1:], 1):
-                    self._weight_bar(t, w, power, t.load(self._bar(self._slots["x", i]), t.index(k)))
+                    self._weight_bar(t, w, power, t.load(self._bar("x", i), t.index(k)))
                     power = t.mul(power, h)
             if i not in bars:
                 continue

@@ -208,25 +208,46 @@ def compile_advance_tangents(
     return compile_python("advance_tangents", _advance_tangents, advance, **numbers)
 
 
-def _pull_all(values, seeds, found, dt, order):  # type: ignore[no-untyped-def]
+def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, order):  # type: ignore[no-untyped-def]
     """Take control steps, then the same substeps backwards; return the lane that was refused, or 0.
 
-    A row of `values` is an input, a place or a velocity, of `seeds` the cotangent of a place or a velocity at
-    the end. Rows of `found` are filled in: cotangents of places and velocities at the start, and of sources.
+    A row of `given` is an entry of state or controls, of `cotangents` one of the state after the step, and of
+    `found`, which is filled in, one of state, controls and parameters before it. How they go together with
+    what the series has is linear: inputs, places and velocities are ``constants + starts @ given``, and
+    `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the cotangents of places, velocities and
+    sources, where `by_end` is that of places and velocities by the state, then `direct`.
     """
-    rows, back = np.zeros(size * BLOCK), np.zeros((status + 2 + len(found)) * BLOCK)
-    ends, kept = status + 2, np.empty((8, 2 * n + 2, LANES))
-    count = values.shape[1]
+    ends, wanted = status + 2, len(pulled)
+    rows, back = np.zeros(size * BLOCK), np.zeros((ends + wanted) * BLOCK)
+    kept = np.empty((8, 2 * n + 2, LANES))
+    count = given.shape[1]
     for first in range(0, count, LANES):
+        filled = min(LANES, count - first)
+        for r in range(status):
+            row = r * BLOCK
+            for i in range(filled):
+                rows[row + i] = constants[r]
+            for c in range(len(given)):
+                weight = starts[r, c]
+                if weight != 0.0:
+                    for i in range(filled):
+                        rows[row + i] += weight * given[c, first + i]
+            for i in range(filled, LANES):
+                rows[row + i] = rows[row]
+            for i in range(LANES):
+                back[row + i] = rows[row + i]
+        for r in range(wanted):
+            for i in range(LANES):
+                back[(ends + r) * BLOCK + i] = 0.0
+            for c in range(len(cotangents) if r < 2 * n else 0):
+                weight = by_end[c, r]
+                if weight != 0.0:
+                    for i in range(filled):
+                        back[(ends + r) * BLOCK + i] += weight * cotangents[c, first + i]
         for i in range(LANES):
-            lane = min(first + i, count - 1)
-            for r in range(status):
-                rows[r * BLOCK + i] = back[r * BLOCK + i] = values[r, lane]
             rows[status * BLOCK + i] = 0.0
-            rows[left * BLOCK + i] = dt if first + i < count else 0.0
+            rows[left * BLOCK + i] = dt if i < filled else 0.0
             rows[wish * BLOCK + i] = dt
-            for r in range(len(found)):
-                back[(ends + r) * BLOCK + i] = seeds[r, lane] if r < 2 * n else 0.0
         substeps, going = 0, True
         while going:
             if substeps == kept.shape[0]:
@@ -256,9 +277,19 @@ def _pull_all(values, seeds, found, dt, order):  # type: ignore[no-untyped-def]
                 back[status * BLOCK + i] = dt - kept[j, 2 * n, i]
                 back[(status + 1) * BLOCK + i] = kept[j, 2 * n + 1, i]
             pull(back, 0, order)
-        for i in range(min(LANES, count - first)):
-            for r in range(len(found)):
-                found[r, first + i] = back[(ends + r) * BLOCK + i]
+        for r in range(len(found)):
+            for i in range(filled):
+                found[r, first + i] = 0.0
+            for c in range(len(cotangents)):
+                weight = by_end[c, 2 * n + r]
+                if weight != 0.0:
+                    for i in range(filled):
+                        found[r, first + i] += weight * cotangents[c, first + i]
+            for c in range(wanted):
+                weight = pulled[c, r]
+                if weight != 0.0:
+                    for i in range(filled):
+                        found[r, first + i] += weight * back[(ends + c) * BLOCK + i]
     return 0
 
 
@@ -266,7 +297,7 @@ def _pull_all(values, seeds, found, dt, order):  # type: ignore[no-untyped-def]
 def compile_pull_all(
     record: SeriesRecord, sources: tuple[str, ...], tolerance: float = TOLERANCE, width: int | None = None
 ) -> Callable:
-    """Compile ``pull_all(values, seeds, found, dt, order)``, see `_pull_all` and `compile_pull`."""
+    """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
     helpers = (

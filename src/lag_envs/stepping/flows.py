@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lag_envs.stepping import pendulum, slope
-from lag_envs.stepping.adjoint import compile_lanes
+from lag_envs.stepping.adjoint import Differentiable, Lanes
 from lag_envs.stepping.compiling import compile_function, count_operations, record_block
 from lag_envs.stepping.dual import Variable, VariableFunctions
 from lag_envs.stepping.tracing import Trace
@@ -31,10 +31,12 @@ class Flow(NamedTuple):
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
     ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
-    makes the scalar function for any step. ``compile_tangent(present, by)`` makes the one that differentiates
-    steps, by the variables and by the coefficients that are named. ``order`` is that of the certified series,
-    0 where there is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s].
-    ``method`` says in words how a step is taken.
+    makes the scalar function for any step. ``pull(variables, coefficients, dt, bars, xp)`` records an
+    ordinary step backwards, from cotangents of the first two variables to those of variables and
+    coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step, by the
+    variables and by the coefficients that are named. ``order`` is that of the certified series, 0 where there
+    is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s]. ``method`` says in
+    words how a step is taken.
     """
 
     size: int
@@ -42,6 +44,7 @@ class Flow(NamedTuple):
     order: int
     fast: Callable
     within: Callable
+    pull: Callable
     compile: Callable
     compile_tangent: Callable
     method: str
@@ -62,11 +65,26 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
         order,
         fast,
         lambda variables, drive, dt, x, xp: pendulum.certified(variables[1], drive, dt, x, xp),
+        lambda variables, drive, dt, bars, xp: pendulum.pull(variables, drive, dt, bars, order),
         lambda present: pendulum.compile_flow(present, order, tolerance),
         lambda present, by: pendulum.compile_tangent(present, by, order, tolerance),
         f"one Taylor series of order {order}, no trigonometry",
         tolerance,
     )
+
+
+def _backwards(fast: Callable) -> Callable:
+    """Return a flow's `pull`, found by going back through what its fast formula records."""
+
+    def pull(variables: Sequence, coefficients: Any, dt: Any, bars: Sequence, xp: Differentiable) -> list:
+        ends = fast(variables, coefficients, dt, xp)[:2]
+        return xp.adjoint(ends, bars, [*variables, *coefficients])
+
+    return pull
+
+
+def _slide(variables: Sequence, force: slope.FixedSlope, dt: Any, xp: Any) -> tuple:
+    return slope.slide(variables[0], variables[1], force, dt)
 
 
 def _turn(variables: Sequence, turn: slope.TurningSlope, dt: Any, xp: Any) -> tuple:
@@ -78,8 +96,9 @@ SLIDE = Flow(
     2,
     slope.FixedSlope,
     0,
-    lambda variables, pull, dt, xp: slope.slide(variables[0], variables[1], pull, dt),
+    _slide,
     lambda variables, pull, dt, x, xp: slope.slides(pull, dt),
+    _backwards(_slide),
     slope.compile_slide,
     slope.compile_slide_tangent,
     "closed form",
@@ -90,6 +109,7 @@ TURN = Flow(
     0,
     _turn,
     lambda variables, turn, dt, x, xp: slope.turns(turn, dt, xp),
+    _backwards(_turn),
     slope.compile_turn,
     slope.compile_turn_tangent,
     f"series of order {slope.TURN_ORDER}, summed to rounding",
@@ -296,40 +316,62 @@ class Stepper:
         ]
         return compile_function("jacobian", "\n    ".join(body) + "\n", self._tangent(by))
 
-    @cache  # noqa: B019
-    def compile_vjp(self, constants: tuple[str, ...] = ()) -> Callable:
-        """Compile ``vjp(given, found, numbers)`` of ordinary steps, by lanes; see `compile_lanes`.
+    def pull(
+        self,
+        xp: Differentiable,
+        state: Sequence,
+        u: Sequence,
+        k: Any,
+        seeds: Sequence,
+        by: Sequence,
+    ) -> tuple[list, Any]:
+        """Record the step backwards; return cotangents, and whether the step is an ordinary one.
 
-        Given are the state's entries, the controls, and cotangents of the state after the step; found are
-        those of state, controls and constants, and whether the step is an ordinary one. The numbers are dt, x
-        and `constants`, as for `advance`.
+        Parameters
+        ----------
+        xp : Differentiable
+            The recording.
+        state, u : sequence of number
+            State and controls at the step's start.
+        k : namespace
+            The constants, with dt and x.
+        seeds : sequence of number
+            Cotangents of the state after the step.
+        by : sequence of number
+            What cotangents are wanted of.
         """
-        form, flow, n = self._form, self.flow, self._n_state
-        y, seeds = self.start[:n], [f"seed{i}" for i in range(n)]
+        form, flow, angle = self._form, self.flow, self._angle
+        lifted = state if angle is None else [*state, xp.cos(state[angle]), xp.sin(state[angle])]
+        variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
+        # The end is linear in what was moved, so that needs no values.
+        moved = xp.inputs("moved0", "moved1")
+        ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
+        *bars, direct = split(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
+        pulled = flow.pull(variables, coefficients, k.dt, [bar for (bar,) in bars], xp)
+        found = xp.adjoint([*variables, *coefficients], pulled, by)
+        within = flow.within(variables, coefficients, k.dt, k.x, xp)
+        return [a + b for a, b in zip(direct, found, strict=True)], within
 
-        def vjp(xp: Any, numbers: Mapping[str, Any]) -> list:
-            state, u = [numbers[name] for name in y], [numbers[name] for name in self.controls]
-            lifted = (
-                state
-                if self._angle is None
-                else [*state, xp.cos(state[self._angle]), xp.sin(state[self._angle])]
+    @cache  # noqa: B019
+    def vjp(self, constants: tuple[str, ...] = ()) -> Lanes:
+        """Return ordinary steps backwards, by lanes.
+
+        Given are numbers dt, x and constants; states, controls, and cotangents of the states after the step.
+        Found are those of states and controls, of `constants`, and 1 where the step is an ordinary one.
+        """
+        y, seeds = self.start[: self._n_state], [f"seed{i}" for i in range(self._n_state)]
+
+        def vjp(xp: Any, numbers: Mapping[str, Any]) -> list[list]:
+            state, u, bars = ([numbers[name] for name in names] for names in (y, self.controls, seeds))
+            k = SimpleNamespace(
+                **{name.removeprefix("k_"): numbers[name] for name in ("dt", "x", *self._names)}
             )
-            k = SimpleNamespace(**{name.removeprefix("k_"): numbers[name] for name in self._names})
-            variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
-            moved = flow.fast(variables, coefficients, numbers["dt"], xp)
-            within = flow.within(variables, coefficients, numbers["dt"], numbers["x"], xp)
-            ends = form.pack(moved, lifted, u, numbers["dt"], k)[:n]
             by = [*state, *u, *(numbers[f"k_{name}"] for name in constants)]
-            return [*xp.adjoint(ends, [numbers[name] for name in seeds], by), xp.where(within, 1.0, 0.0)]
+            found, within = self.pull(xp, state, u, k, bars, by)
+            return [*split(found, len(state) + len(u)), [xp.where(within, 1.0, 0.0)]]
 
-        return compile_lanes(
-            "vjp",
-            vjp,
-            [*y, *self.controls, *seeds],
-            ["dt", "x", *self._names],
-            set(self._names) - set(self.constants),
-            n + len(self.controls) + len(constants) + 1,
-        )
+        absent = set(self._names) - set(self.constants)
+        return Lanes("vjp", vjp, [y, self.controls, seeds], ["dt", "x", *self._names], absent)
 
     @cached_property
     def simulation(self) -> Callable:

@@ -279,6 +279,7 @@ class SeriesTangent:
             if name in self._columns:
                 self._first[i, self._columns.index(name)] = 1.0
         self._constants = np.array([constants.get(name, 0.0) for name in record.given])
+        self._known_linear: dict[float, tuple[Any, ...]] = {}
         self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
@@ -350,40 +351,48 @@ class SeriesTangent:
         if self._stepper.mechanics.coupling or self._guide.any():
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
-        by_start, by_end = self._linear(dt)
-        moving, count = len(self._moving), len(states)
-        seeds = cotangents @ by_end
-        given = (
-            np.concatenate([states, controls], axis=1) @ by_start[:, : states.shape[1] + controls.shape[1]].T
-        )
-        values = np.empty((len(self._given) + moving, count))
-        values[: len(self._given)] = self._constants[:, None]
-        for i, name in enumerate([*self._given, *self._moving]):
-            if name in self._rows:
-                values[i] = given[:, self._rows.index(name)]
-        found = np.empty((moving + len(self._sources), count))
-        refused = self._pull(values, np.ascontiguousarray(seeds[:, :moving].T), found, dt, order)
+        linear = self._known_linear.get(dt) or self._linear(dt)
+        self._known_linear = {dt: linear}  # the last one's: a scene has one dt, mostly
+        given, found = np.concatenate([states.T, controls.T]), np.empty((self._width, len(states)))
+        seeds = np.ascontiguousarray(cotangents.T)
+        refused = self._pull(given, seeds, found, *linear, dt, order)
         if not refused and not np.isfinite(found).all():
             refused = int(np.argmin(np.isfinite(found).all(axis=0))) + 1
-        return seeds[:, moving:] + found.T @ by_start[self._pulled], refused
+        return found.T, refused
 
-    def _linear(self, dt: float) -> tuple[Any, Any]:
-        """Return what the series starts from by states, controls and parameters; and its end's effect.
+    def _linear(self, dt: float) -> tuple[Any, ...]:
+        """Return what `_pull` takes of the constants, what series start from, and their end's effect.
 
-        Where no rate is held, both are the same for all states: matrices of shape (rows, n_state + n_controls
-        + n_parameters), and (n_state, places and velocities, then the same columns).
+        Where no rate is held, all are the same for all states.
         """
         xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
-        sizes = moving, len(layout.state), len(self._stepper.arguments), len(self._by)
-        ends, y, u, p = variables_of(*(np.zeros((1, n)) for n in sizes))
+        ends, y, u, p = variables_of(
+            *(
+                np.zeros((1, n))
+                for n in (moving, len(layout.state), len(self._stepper.arguments), len(self._by))
+            )
+        )
         before = self._stepper.prepare(xp, y, u, self._numbers)
         before |= {f"parameter_{name}": x for name, x in zip(self._by, p, strict=True)}
-        by_start = np.zeros((len(self._rows), sum(sizes)))
-        for i, name in enumerate(self._rows):
-            by_start[i] = np.reshape(getattr(before[name], "slopes", 0.0), -1)
+
+        def by_start(names: Sequence[str]) -> Any:
+            found = np.zeros((len(names), moving + self._width))
+            for row, name in zip(found, names, strict=True):
+                if name not in self._record.constants:
+                    row[:] = np.reshape(getattr(before.get(name, 0.0), "slopes", 0.0), -1)
+            return found[:, moving:]
+
         q, v = ends[: moving // 2], ends[moving // 2 :]
-        finished = self._stepper.finish(xp, q, v, y, u, dt, self._numbers)
-        return by_start[:, moving:], stacked(finished, 1)[0]
+        by_end = stacked(self._stepper.finish(xp, q, v, y, u, dt, self._numbers), 1)[0]
+        constants = np.concatenate([self._constants, np.zeros(moving)])
+        starts = by_start([*self._given, *self._moving])[:, : len(y) + len(u)]
+        parts = constants, starts, by_start([*self._moving, *self._sources]), by_end
+        return tuple(map(np.ascontiguousarray, parts))
+
+    @property
+    def _width(self) -> int:
+        """Number of entries of state, controls and parameters together."""
+        return len(self._stepper._layout.state) + len(self._stepper.arguments) + len(self._by)
 
     @cached_property
     def _advance(self) -> Callable:
@@ -394,17 +403,6 @@ class SeriesTangent:
     @cached_property
     def _sources(self) -> tuple[str, ...]:
         return tuple(name for name in self._columns if name not in self._moving)
-
-    @cached_property
-    def _rows(self) -> list[str]:
-        """What follows from states, controls and parameters when the series begins."""
-        inputs = [name for name in self._given if name not in self._record.constants]
-        return list(dict.fromkeys([*self._moving, *inputs, *self._sources]))
-
-    @cached_property
-    def _pulled(self) -> list[int]:
-        """Rows whose cotangents are found."""
-        return [self._rows.index(name) for name in (*self._moving, *self._sources)]
 
     @cached_property
     def _pull(self) -> Callable:

@@ -215,17 +215,12 @@ class NormalForm:
         The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
         """
         stepper, _ = self._stepper(dt, constants)
-        width = states.shape[1] + controls.shape[1]
-        given = np.concatenate([states.T, controls.T, cotangents.T])
-        found = np.empty((width + len(rates) + 1, len(states)))
         numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
-        stepper.compile_vjp(tuple(rates))(given, found, numbers)
-        slopes = np.empty((len(states), width + parameters))
-        slopes[:, :width] = found[:width].T
+        slopes, by_rates, ordinary = stepper.vjp(tuple(rates))(numbers, states, controls, cotangents)
         if parameters:
             by_constants = np.array([*rates.values()]).reshape(len(rates), parameters)
-            slopes[:, width:] = found[width:-1].T @ by_constants
-        (others,) = np.nonzero(found[-1] == 0.0)
+            slopes = np.concatenate([slopes, by_rates @ by_constants], axis=1)
+        (others,) = np.nonzero(ordinary[:, 0] == 0.0)
         if len(others):
             some = np.ascontiguousarray(states[others]), np.ascontiguousarray(controls[others])
             jacobian, refused = self.jacobian(*some, constants, dt, rates, parameters)

@@ -153,6 +153,65 @@ def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, o
     return theta + angle, omega + change * (1.0 / h), c, s
 
 
+def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
+    """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step, from those of θ, θ' after.
+
+    Those of cosθ and sinθ are counted with θ. Changes obey the linearised equation: with S, C the series of
+    sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on its right-hand side,
+
+        (k+1) dW_{k+1} = -Σ_j Q_j dθ_{k-j} - Γ dW_k - S_k dA - C_k dB - W_k dΓ.
+
+    Backwards that takes one sum of products for each order, where going back through `taylor_coefficients`
+    would take three.
+
+    Parameters
+    ----------
+    variables : sequence of number
+        θ, θ', cosθ and sinθ at the start.
+    coeffs : Coefficients
+        Coefficients.
+    h : number
+        The step.
+    bars : sequence of number
+        Cotangents of θ and θ' after the step.
+    order : int
+        The highest coefficient of W.
+    """
+    _, omega, c, s = variables
+    a, b, gamma, d, r = scaled(coeffs, h)
+    W, C, S = [omega * h], [c], [s]
+    for k in range(order):
+        push = d if k == 0 else r if k == 1 else 0.0
+        W.append((push - (a * S[k] + b * C[k]) - gamma * W[k]) * (1.0 / (k + 1)))
+        C.append(sum_of_products((S[j], W[k - j]) for j in range(k + 1)) * (-1.0 / (k + 1)))
+        S.append(sum_of_products((C[j], W[k - j]) for j in range(k + 1)) * (1.0 / (k + 1)))
+    Q = [a * x - b * y for x, y in zip(C, S, strict=True)]
+    angle, change = bars[0], bars[1] * (1.0 / h)
+    # Cotangents of dW_{k+1}, divided by k + 1, and of -dθ_{k+1}.
+    right: list[Any] = [0.0] * (order + 1)
+    turned: list[Any] = [0.0] * (order + 2)
+    for k in reversed(range(order)):
+        bar = angle * (1.0 / (k + 2)) + change - gamma * right[k + 1] - turned[k + 2] * (1.0 / (k + 2))
+        right[k] = bar * (1.0 / (k + 1))
+        turned[k] = sum_of_products((Q[j - k], right[j]) for j in reversed(range(k, order)))
+    hh = h * h
+
+    def total(series: Sequence) -> Any:
+        return -sum_of_products(zip(series, right[:order], strict=False))
+
+    return [
+        bars[0] - turned[0],
+        bars[1] + h * (angle - gamma * right[0] - turned[1]),
+        0.0,
+        0.0,
+        hh * total(S),
+        hh * total(C),
+        h * total(W),
+        hh * right[0],
+        hh * h * right[1],
+    ]
+
+
 def step_slopes(
     omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, elapsed: Any, columns: Sequence[str], order: int
 ) -> list:
