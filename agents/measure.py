@@ -284,11 +284,19 @@ class Evaluation:
             agent: Data = {"name": name, "kind": entrants[0].kind}
             groups = {c: [found[c] for found in policies if c in found] for c in order}
             agent["conditions"] = {c: returns for c, returns in groups.items() if returns}
-            if runs := [entrant.run for entrant in entrants if entrant.run is not None]:
-                told = {"seeds": "seed", "steps": "trained", "seconds": "wall_seconds", "curves": "curve"}
+            if runs := [_timed(entrant.run) for entrant in entrants if entrant.run is not None]:
+                told = {"seeds": "seed", "steps": "trained", "seconds": "seconds", "curves": "curve"}
                 agent |= {many: [run[one] for run in runs] for many, one in told.items()}
                 agent["trained_on"] = sorted(set(map(_where, runs)))
             yield agent
+
+
+def _timed(run: Data) -> Data:
+    """Return a run with its seconds on the processor, which what else the machine does hardly lengthens."""
+    wall = run["wall_seconds"]
+    seconds = run.get("processor_seconds", wall)  # earlier versions did not count them
+    share = seconds / wall if wall else 1.0
+    return run | {"seconds": seconds, "curve": [(steps, share * s, mean) for steps, s, mean in run["curve"]]}
 
 
 def _where(run: Data) -> str:

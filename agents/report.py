@@ -106,7 +106,7 @@ def _reading(data: Data) -> str:
         " The others have no training seed, so what varies is the episode: mean, 1.96 standard errors"
         " to either side, and standard error over episodes. *Ten times as often*: the same policy in steps of"
         " a tenth; it shows what exploits the discretisation. *Worst*: the lowest result under changed"
-        " parameters, noise and delay. *Training*: time of one run."
+        " parameters, noise and delay. *Training*: processor time of one run."
     )
 
 
@@ -303,9 +303,9 @@ def _method(data: Data) -> str:
             " not trained is one run. Learning curves are of 20 test episodes with other seeds, and straight"
             " between tests.",
             "- *First tests*: a run has 16, so a score may have been reached up to a sixteenth of the run"
-            " earlier, and 20 episodes may be lucky ones. Seconds are those of training alone, while as many"
-            " runs as there are cores went on side by side. `python -m agents.race` tests more often, one run"
-            " at a time.",
+            " earlier, and 20 episodes may be lucky ones. Seconds are processor time of training"
+            " alone, on one core (of policies from before November 2026 wall time)."
+            " `python -m agents.race` tests more often, one run at a time.",
         ]
     )
 
