@@ -317,7 +317,7 @@ def test_a_changed_machine_is_not_scored(drive):
     page = drive("PivotedBar-v0")
     page.click(".sliders summary")
     names = page.evaluate("[...document.querySelectorAll('.sliders label span')].map((e) => e.textContent)")
-    assert names == ["mass", "com distance", "damping", "gravity", "control limit"]
+    assert names == ["mass", "com distance", "damping", "gravity", "track", "control limit"]
     before = page.evaluate("document.querySelector('.driver .scene').toDataURL()")
     page.evaluate(
         "(() => { const i = document.querySelectorAll('.sliders input')[1]; i.value = '1';"

@@ -123,6 +123,14 @@ def test_constants_are_those_of_the_scene():
                 assert found[name] == pytest.approx(value, rel=1e-14), name
 
 
+def test_the_start_follows_parameters():
+    longer = pivoted_bar.SwingUp(track=0.7)
+    changed, own = Unfused(pivoted_bar.SwingUp()), Unfused(longer)
+    changed.set_parameter("track", 0.7)
+    assert changed.reset(3) == own.reset(3)
+    assert changed.state == own.state != Unfused(pivoted_bar.SwingUp()).state
+
+
 def test_a_step_that_is_refused_changes_nothing():
     env = Unfused(TASKS[pivoted_bar.SwingUpFree.id](damping=0.0))
     env.reset(1)

@@ -43,6 +43,7 @@ from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
 from lag_envs.stepping.series import TOLERANCE
+from lag_envs.stepping.tracing import Number
 from lag_envs.tasks.base import Task
 
 #: What a substep's truncation may be in single precision, relative to the velocities: half a unit in the last
@@ -246,6 +247,24 @@ class UnfusedProgram:
 
         results = t.formula(constants, {n: known[n] for n in names})
         self._write(t, len(self.given), results, "k")
+        moved = self._moved_starts()
+
+        def starts(xp: Any, *numbers: Any) -> list:
+            found = self._formulas.starts_of(dict(zip(names, numbers, strict=True)))
+            return [found[name] for name in moved]
+
+        results = t.formula(starts, {n: known[n] for n in names})
+        for name, result in zip(moved, results, strict=True):
+            self._write(t, list(self._place).index(name), [result], "k")
+
+    def _moved_starts(self) -> list[str]:
+        """Return the constants of the start that follow from parameters, as far as arithmetic tells."""
+        names = list(self.task.scene._numbers())
+        try:
+            found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
+        except FormulaError:
+            return []
+        return [name for name, value in found.items() if isinstance(value, Number)]
 
     def _start(self, t: Script) -> None:
         formulas, n = self._formulas, self.states

@@ -226,7 +226,7 @@
     return choices.map((count) => indexOfLargest(numbers.slice(end, (end += count))));
   }
 
-  const indexOfLargest = (x) => x.indexOf(Math.max(...x));
+  const indexOfLargest = (x) => x.reduce((best, v, i) => (v > x[best] ? i : best), 0);
 
   /** What an agent sees, in float32. */
   const seen = (episode) => Float64Array.from(episode.part("o"), Math.fround);
