@@ -41,7 +41,7 @@ from lag_envs.stepping.flows import split
 from lag_envs.stepping.tracing import Number
 from lag_envs.stepping.twofold import two_product, two_sum
 from lag_envs.tasks.base import Task
-from lag_envs.tasks.imperfections import Imperfections, seen_box
+from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 
 #: What has draws of its own, by the number that its key is made with.
 PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
@@ -252,9 +252,8 @@ class ImperfectProgram(DrawnProgram):
         if not sigma:
             return []
 
-        def normals(xp: Any, first: Any, second: Any) -> list:
-            radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
-            return [radius * xp.cos(angle), radius * xp.sin(angle)]
+        def recorded(xp: Any, first: Any, second: Any) -> list:
+            return normals(first, second, xp)
 
         lines = [f"key_{purpose} = {self._key(purpose)}"]
         per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step has that many times `DRAWS`
@@ -265,7 +264,7 @@ class ImperfectProgram(DrawnProgram):
                     f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
                     for x, j in zip(("first", "second"), (i, i + 1), strict=True)
                 ]
-                lines += _lines(normals, ["first", "second"], ["normal0", "normal1"], formulas.trace)
+                lines += _lines(recorded, ["first", "second"], ["normal0", "normal1"], formulas.trace)
                 lines += [f"{values[j]} += {self._constant(f'{name}{j}')} * normal{j - i}" for j in pair]
         return lines
 
@@ -657,11 +656,7 @@ class _Constants:
             given = (constants[f"draw_{name}{j}"] for name in ("base", "low", "high"))
             base, low, high = (trace.inputs(x)[0] if isinstance(x, str) else x for x in given)
             (share,) = trace.inputs(f"share{j}")
-            if d.log:
-                factor = trace.exp(trace.log(low) + share * (trace.log(high) - trace.log(low)))
-            else:
-                factor = low + share * (high - low)
-            outputs[f"p_{d.name}"] = base * trace.minimum(trace.maximum(factor, low), high)
+            outputs[f"p_{d.name}"] = d.printed(share, base, low, high, trace)
         code, values = record_block(trace, outputs, fused=False)
         code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
         # Those that follow are made as Python makes them: one rounding for each operation.

@@ -28,7 +28,6 @@ from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
-FUNCTIONS = ("derive", "start", "lift", "move", "kick", "observe", "poses")
 #: Where sliders have their marks, as multiples of a parameter's value.
 MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 
@@ -36,10 +35,13 @@ MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 def script(env_id: str) -> str | None:
     """Return the file with which a page drives an environment of the package.
 
-    None for an unknown id, and for one with hidden parameters or imperfect sensors or actuators.
+    None for an unknown id, and for one with imperfections that no script has.
     """
     kind: Any = TASKS.get(env_id)
-    return script_of(kind) if kind and not kind.imperfections else None
+    try:
+        return script_of(kind) if kind else None
+    except FormulaError:
+        return None
 
 
 @cache
@@ -58,7 +60,7 @@ def script_of(kind: type[Task]) -> str:
     """
     task = kind()
     env = Unfused(task)
-    program, names = env.program, ", ".join(FUNCTIONS)
+    program, names = env.program, ", ".join(env.program.names)
     constants = ", ".join(map(_number, program.constants))
     about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
     about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -94,6 +96,9 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
         "states": program.states,
         "starts": program.states + formulas.targets,
         "draws": task.draws,
+        "drawn": program.drawn,
+        "noise": program.noise,
+        "delay": program.delay,
         "controls": [
             {"name": a.control, "unit": units[a.control], "low": a.low, "high": a.high, "values": a.values}
             for a in formulas.acting
@@ -119,7 +124,8 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     """
     task, program = env.task, env.program
     names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
-    values = {name: getattr(task.scene, name) for name in units if name not in program.made}
+    fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
+    values = {name: getattr(task.scene, name) for name in units if name not in fixed}
     marked = {
         name: others
         for name, value in values.items()
@@ -201,6 +207,8 @@ def agent(policy: Policy) -> dict[str, Any] | None:
         The policy.
     """
     made = policy.architecture
+    if isinstance(made, Table) and made.task.imperfections:
+        return None  # it looks ahead on the environment without them, which the page does not have
     if isinstance(made, Network | Linear | Table):
         about, arrays, head = _learned(policy), policy.arrays, made.head
     elif isinstance(made, Plan | Controller) and not made.plans:

@@ -3,6 +3,7 @@
  *
  * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
  * Arrays as there: k constants, f the rows of one environment, a an action, d draws in [0, 1), p poses.
+ * Of imperfect sensors and actuators it has what scripts have: drawn parameters, noise, late actions.
  *
  * In this order: random numbers, episodes, links, agents, the person's hands, the stage.
  */
@@ -16,7 +17,10 @@
   const BITS = 64;
   const word = (x) => BigInt.asUintN(BITS, x);
   const [GOLDEN, FIRST, SECOND] = ["0x9E3779B97F4A7C15", "0xBF58476D1CE4E5B9", "0x94D049BB133111EB"].map(big);
-  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, 16, 1].map(big);
+  const PER_STEP = 16;
+  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, PER_STEP, 1].map(big);
+  /** Keys of draws that are not the episode's own, as lag_envs/envs/imperfect.py has them. */
+  const PURPOSES = { parameters: big(1), observation: big(2) };
 
   function mixed(z) {
     z = word((z ^ (z >> S30)) * FIRST);
@@ -48,12 +52,26 @@
       const { functions, about } = this.code;
       this.key = episodeKey(big(seed), ONE);
       [this.steps, this.total, this.over] = [0, 0, ""];
+      this.waiting = Array(about.delay).fill(about.rest);
+      if (about.drawn) {
+        functions.draw(this.k, this.draws(about.drawn, "parameters"));
+        functions.derive(this.k);
+      }
       functions.start(this.f, this.draws(about.starts), this.k);
-      functions.observe(this.f, this.k);
+      this.observe();
     }
 
-    draws(count) {
-      return Float64Array.from({ length: count }, (_, i) => uniform(this.key, this.steps, i));
+    /** Draws of this step, of the episode's own or of a purpose's. */
+    draws(count, purpose) {
+      const key = purpose ? episodeKey(this.key, PURPOSES[purpose]) : this.key;
+      const step = purpose ? this.steps * Math.ceil(count / PER_STEP) : this.steps;
+      return Float64Array.from({ length: count }, (_, i) => uniform(key, step, i));
+    }
+
+    observe() {
+      const { functions, about } = this.code;
+      functions.observe(this.f, this.k);
+      functions.sense?.(this.f, this.draws(about.noise, "observation"), this.k);
     }
 
     /** Hold an action for one interval; returns the reward. Afterwards `over` says how it ended, if it did. */
@@ -61,7 +79,8 @@
       const { functions, about } = this.code;
       const { rows } = about;
       this.kept.set(this.f);
-      functions.move(this.f, action, this.k);
+      this.waiting.push(action);
+      functions.move(this.f, this.waiting.shift(), this.k);
       if (this.f[rows.refused] > 0) {
         this.f.set(this.kept);
         this.over = "refused";
@@ -72,7 +91,7 @@
       this.total += reward;
       const ended = this.f[rows.ended] > 0;
       if (about.draws) functions.kick(this.f, this.draws(about.draws), this.k);
-      functions.observe(this.f, this.k);
+      this.observe();
       this.over = ended ? "terminated" : about.limit !== null && this.steps >= about.limit ? "truncated" : "";
       return reward;
     }
