@@ -104,8 +104,8 @@ def open_page(browsing, folder):
 
 def see_episodes(page):
     """Go to where episodes are watched, which loads them, and back."""
-    page.evaluate("document.querySelector('#watch').scrollIntoView({ behavior: 'instant' })")
-    until(page, "document.querySelectorAll('.episode option').length >= 2")
+    there = "document.querySelector('#watch').scrollIntoView({ behavior: 'instant' })"
+    until(page, f"({there}, document.querySelectorAll('.episode option').length >= 2)")
     page.evaluate("scrollTo({ top: 0, behavior: 'instant' })")
 
 
@@ -357,7 +357,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     build({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
     assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
-    assert sum(name.startswith("assets/") for name in left) == 4 + len(board_pages.AGENTS)
+    assert sum(name.startswith("assets/") for name in left) == 5 + len(board_pages.AGENTS)
 
 
 def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
@@ -403,7 +403,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
                 assert (out / name).exists(), (moment, page.name, name)
         build(other, out)
         assert not list(out.rglob("*.part"))
-        assert len(list(out.rglob("*.js"))) == 2 + 2 * 2, "what a killed build left is removed by the next"
+        assert len(list(out.rglob("*.js"))) == 2 + 2 * 3, "what a killed build left is removed by the next"
         if finished:
             break
     assert moment > 5
