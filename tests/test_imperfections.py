@@ -495,11 +495,15 @@ def test_a_parameter_that_an_attribute_follows_from_is_refused():
         LagrangianVectorEnv(Stale, 1, randomize={"mass": (0.5, 2.0)})
 
 
-def test_pages_and_drives_leave_them_out():
-    env_id = pivoted_bar.SwingUpUnknown.id
-    assert driving.script(env_id) is None
-    drive = replay.Drive(env_id, 1, "", 0.0, "")
-    with pytest.raises(replay.LinkError, match=f"{env_id} has hidden parameters"):
+def test_pages_and_drives_leave_out_what_scripts_lack(monkeypatch):
+    class Late(pivoted_bar.SwingUp):
+        id = "OwnLate-v0"
+        imperfections = {"action_delay": 0.5 * pivoted_bar.SwingUp.interval}
+
+    monkeypatch.setitem(TASKS.data, Late.id, Late)
+    assert driving.script(Late.id) is None
+    drive = replay.Drive(Late.id, 1, "", 0.0, "")
+    with pytest.raises(replay.LinkError, match=f"{Late.id}: .* action_delay in whole steps only"):
         replay.replay(drive)
 
 

@@ -96,10 +96,17 @@ def open_page(browsing, folder):
         root = root or folder.as_uri()
         page = browsing.open(f"{root}/{name}.html", root, **options)
         if options.get("java_script_enabled", True) and name != "index":
-            until(page, "document.querySelectorAll('.episode option').length >= 2")
+            see_episodes(page)
         return page
 
     return open_it
+
+
+def see_episodes(page):
+    """Go to where episodes are watched, which loads them, and back."""
+    there = "document.querySelector('#watch').scrollIntoView({ behavior: 'instant' })"
+    until(page, f"({there}, document.querySelectorAll('.episode option').length >= 2)")
+    page.evaluate("scrollTo({ top: 0, behavior: 'instant' })")
 
 
 def clean(text):
@@ -350,7 +357,7 @@ def test_build_again_leaves_nothing_behind_and_nothing_else_away(data, tmp_path)
     build({**data, "environments": data["environments"][:1]}, tmp_path)
     left = files_of(tmp_path)
     assert f"{incline.Brake.id}.html" not in left and "CNAME" in left
-    assert sum(name.startswith("assets/") for name in left) == 4 + len(board_pages.AGENTS)
+    assert sum(name.startswith("assets/") for name in left) == 5 + len(board_pages.AGENTS)
 
 
 def test_a_folder_that_is_not_ours_is_refused(data, tmp_path):
@@ -396,7 +403,7 @@ def test_a_kill_at_any_moment_leaves_whole_pages(tmp_path, monkeypatch):
                 assert (out / name).exists(), (moment, page.name, name)
         build(other, out)
         assert not list(out.rglob("*.part"))
-        assert len(list(out.rglob("*.js"))) == 2 + 2 * 2, "what a killed build left is removed by the next"
+        assert len(list(out.rglob("*.js"))) == 2 + 2 * 3, "what a killed build left is removed by the next"
         if finished:
             break
     assert moment > 5
@@ -715,7 +722,7 @@ def test_agents_page(open_page):
     page = open_page()
     page.click(".ranking a:has-text('TD3')")
     until(page, "document.querySelector('h1')?.innerText === 'TD3'")
-    until(page, "document.querySelectorAll('.episode option').length >= 2")
+    see_episodes(page)
     page.click(".play")
     until(page, "parseFloat(document.querySelector('.clock').textContent) > 0.1")
     assert page.evaluate("document.querySelectorAll('#curves path').length") >= 3
@@ -787,6 +794,14 @@ SIZED = ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id)
 @pytest.mark.parametrize("name", SIZED)
 def test_page_is_light_before_anything_is_played(served, browser, name):
     assert loaded(browser, f"{served}/{name}.html")[0] < 300_000
+
+
+@pytest.mark.slow
+def test_so_is_every_page_of_the_board(browser, tmp_path):
+    """The episodes there are longer, up to thousands of steps."""
+    build(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
+    for env_id in TASKS:
+        assert loaded(browser, (tmp_path / f"{env_id}.html").as_uri())[0] < 300_000, env_id
 
 
 @pytest.mark.slow

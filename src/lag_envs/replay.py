@@ -154,6 +154,7 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
         Where the link is damaged, or holds what nobody can have driven.
     """
     from lag_envs.envs.unfused import Unfused
+    from lag_envs.mechanics.algebra import FormulaError
     from lag_envs.scenes import StepRefused
     from lag_envs.scores import score
     from lag_envs.tasks import TASKS
@@ -163,11 +164,10 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
         if drive.id not in TASKS:
             raise LinkError(f"there is no environment {_short(drive.id)}; {hint(drive.id, TASKS)}")
         task = TASKS[drive.id]()
-    if task.imperfections:
-        raise LinkError(
-            f"{drive.id} has hidden parameters or imperfect sensors or actuators; nobody can have driven it"
-        )
-    env = Unfused(task)
+    try:
+        env = Unfused(task)
+    except FormulaError as error:
+        raise LinkError(f"nobody can have driven {drive.id}: {error}") from error
     if env.program.digest != drive.step:
         raise LinkError(
             f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "

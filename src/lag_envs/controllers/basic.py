@@ -283,6 +283,16 @@ class ObservationDecoder:
         targets = lifted[..., self._width :]
         return state, targets[..., 0] if targets.shape[-1] == 1 else targets
 
+    def numbers(self) -> dict[str, Any]:
+        """Return what it computes with, in JSON types."""
+        return {
+            "zero": self._zero.tolist(),
+            "inverse": self._inverse.tolist(),
+            "states": self._n,
+            "width": self._width,
+            "pairs": self._pairs,
+        }
+
     def expected(self, states: Array) -> tuple[Array, Array]:
         """Return what states (n, n_state) look like without targets, and its derivatives by them."""
         turned = states[:, self._angles]

@@ -5,7 +5,7 @@ script (`lag_envs.stepping.script`). All scenes are stepped by the general serie
 flow of their own too: its code has one form, loops included, whereas the flows call fused operations and the
 C library.
 
-A script has seven functions. All work on arrays of numbers: ``k``, the constants; ``f``, the rows of one
+A script has these functions. All work on arrays of numbers: ``k``, the constants; ``f``, the rows of one
 environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 
 =================  ==========================================================================================
@@ -17,6 +17,15 @@ environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 ``observe(f, k)``  fills in the observation
 ``poses(f, p, k)`` fills in where the picture's frames are, x, y, angle and part of each
 =================  ==========================================================================================
+
+Where parameters are hidden or sensors noisy there are two more (`UnfusedImperfectProgram`):
+
+=================  ==========================================================================================
+``draw(k, d)``     fills in the drawn parameters of an episode, to be followed by ``derive``
+``sense(f, d, k)`` makes the observation what is shown
+=================  ==========================================================================================
+
+Actions that come into force later wait with the caller.
 """
 
 from __future__ import annotations
@@ -32,6 +41,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lag_envs.envs.actions import Actions
+from lag_envs.envs.imperfect.draws import PURPOSES
+from lag_envs.envs.program import DRAWS
 from lag_envs.envs.single import key_of
 from lag_envs.mechanics.algebra import FormulaError, evaluate
 from lag_envs.mechanics.recording import parameter
@@ -43,7 +54,9 @@ from lag_envs.stepping.flows import split
 from lag_envs.stepping.general import usual_order
 from lag_envs.stepping.script import JAVASCRIPT, PYTHON, Script, motion, run_python
 from lag_envs.stepping.series import TOLERANCE
+from lag_envs.stepping.tracing import Number
 from lag_envs.tasks.base import Task
+from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 
 #: What a substep's truncation may be in single precision, relative to the velocities: half a unit in the last
 #: place.
@@ -81,7 +94,7 @@ class UnfusedProgram:
     Parameters
     ----------
     task : Task
-        The task; not with imperfections, which scripts do not have.
+        The task; not with imperfections, for which there is `UnfusedImperfectProgram`.
     single : bool
         Whether the numbers are of single precision, to which shorter series are certified.
 
@@ -97,6 +110,12 @@ class UnfusedProgram:
     frames : list of str
         The picture's frames; empty where there is no picture.
     """
+
+    #: The script's functions.
+    names: tuple[str, ...] = ("derive", "start", "lift", "move", "kick", "observe", "poses")
+    #: How many parameters are drawn, how many draws noise takes in a step, and by how many steps an action
+    #: comes into force later.
+    drawn, noise, delay = 0, 0, 0
 
     def __init__(self, task: Task, single: bool = False) -> None:
         if task.imperfections:
@@ -168,16 +187,27 @@ class UnfusedProgram:
     def digest(self) -> str:
         """All that decides the bits of an episode, in short."""
         numbers = repr(self.constants)
-        return hashlib.sha256(f"{self.python.partition('def poses(')[0]}{numbers}".encode()).hexdigest()[:8]
+        late = self.delay or ""
+        text = f"{self.python.partition('def poses(')[0]}{numbers}{late}"
+        return hashlib.sha256(text.encode()).hexdigest()[:8]
 
     @cached_property
     def script(self) -> Script:
         """The functions of the module's docstring."""
-        return self.written("derive", "start", "lift", "move", "kick", "observe", "poses")
+        return self.written(*self.names)
 
     def written(self, *names: str) -> Script:
         """Return a script of these functions."""
-        known: dict[str, tuple[str, Callable]] = {
+        known = self._writers
+        t = Script()
+        for name in names:
+            arguments, write = known[name]
+            t.function(name, arguments, partial(write, t))
+        return t
+
+    @property
+    def _writers(self) -> dict[str, tuple[str, Callable]]:
+        return {
             "derive": ("k", self._derive),
             "start": ("f, d, k", self._start),
             "lift": ("f, k", self._lift),
@@ -186,11 +216,6 @@ class UnfusedProgram:
             "observe": ("f, k", self._observe),
             "poses": ("f, p, k", self._poses),
         }
-        t = Script()
-        for name in names:
-            arguments, write = known[name]
-            t.function(name, arguments, partial(write, t))
-        return t
 
     def _read(self, t: Script, rows: slice, array: str = "f") -> list[str]:
         return [t.put("read", array, i) for i in range(rows.start, rows.stop)]
@@ -246,6 +271,24 @@ class UnfusedProgram:
 
         results = t.formula(constants, {n: known[n] for n in names})
         self._write(t, len(self.given), results, "k")
+        moved = self._moved_starts()
+
+        def starts(xp: Any, *numbers: Any) -> list:
+            found = self._formulas.starts_of(dict(zip(names, numbers, strict=True)))
+            return [found[name] for name in moved]
+
+        results = t.formula(starts, {n: known[n] for n in names})
+        for name, result in zip(moved, results, strict=True):
+            self._write(t, list(self._place).index(name), [result], "k")
+
+    def _moved_starts(self) -> list[str]:
+        """Return the constants of the start that follow from parameters, as far as arithmetic tells."""
+        names = list(self.task.scene._numbers())
+        try:
+            found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
+        except FormulaError:
+            return []
+        return [name for name, value in found.items() if isinstance(value, Number)]
 
     def _start(self, t: Script) -> None:
         formulas, n = self._formulas, self.states
@@ -361,6 +404,71 @@ class UnfusedProgram:
         self.frames = []
 
 
+class UnfusedImperfectProgram(UnfusedProgram):
+    """The step of a task with hidden parameters, noisy sensors or late actions, as a script.
+
+    Parameters
+    ----------
+    task : Task
+        The task. What else is imperfect no script has.
+
+    Raises
+    ------
+    FormulaError
+        For other imperfections, or a delay that is not the same number of whole steps each time.
+    """
+
+    names = ("derive", "draw", "start", "lift", "move", "kick", "observe", "sense", "poses")
+
+    def __init__(self, task: Task) -> None:
+        found: Any = task.imperfections
+        least = found.action_delay[0]
+        known = Imperfections(
+            drawn=found.drawn, observation_noise=found.observation_noise, action_delay=(least, least)
+        )
+        if found != known or least % 1.0:
+            raise FormulaError(
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, of which "
+                "scripts have randomize, observation_noise, and action_delay in whole steps only; switch the "
+                "others off with None, as in lag=None"
+            )
+        super().__init__(task.drawn.inner if task.drawn else task.varied())
+        self._options, self._box = found, seen_box(task)
+        self.drawn, self.delay = len(found.drawn), int(least)
+        wide = len(self._formulas.observation)
+        self.noise = wide + wide % 2 if found.observation_noise else 0
+
+    @property
+    def _writers(self) -> dict[str, tuple[str, Callable]]:
+        return super()._writers | {"draw": ("k, d", self._draw), "sense": ("f, d, k", self._sense)}
+
+    def _draw(self, t: Script) -> None:
+        def drawn(xp: Any, shares: Sequence, k: Any) -> list:
+            return [
+                d.printed(share, d.base, d.low, d.high, xp)
+                for d, share in zip(self._options.drawn, shares, strict=True)
+            ]
+
+        values = self._run(t, drawn, self._read(t, slice(0, self.drawn), "d"))
+        for d, value in zip(self._options.drawn, values, strict=True):
+            self._write(t, list(self._place).index(f"self_{d.name}"), [value], "k")
+
+    def _sense(self, t: Script) -> None:
+        def shown(xp: Any, draws: Sequence, seen: Sequence, k: Any) -> list:
+            pairs = zip(draws[::2], draws[1::2], strict=True)
+            noise = [x for pair in pairs for x in normals(*pair, xp)]
+            sigma = self._options.observation_noise
+            if noise:
+                seen = [o + s * x if s else o for o, s, x in zip(seen, sigma, noise, strict=False)]
+            return [
+                xp.where(o < low, low, xp.where(o > high, high, o))
+                for o, low, high in zip(seen, *self._box, strict=True)
+            ]
+
+        draws, seen = self._read(t, slice(0, self.noise), "d"), self._read(t, self.rows.o)
+        self._write(t, self.rows.o, self._run(t, shown, draws, seen))
+
+
 class _Numbers:
     """A scene some of whose parameters are recorded numbers, for what follows from them."""
 
@@ -399,12 +507,14 @@ class Unfused:
 
     def __init__(self, task: Task, program: UnfusedProgram | None = None) -> None:
         self.task = task
-        self.program = program = program or UnfusedProgram(task)
+        kind = UnfusedImperfectProgram if task.imperfections else UnfusedProgram
+        self.program = program = program or kind(task)
         self._functions = program.functions
         self.numbers = [0.0] * program.size
         self.constants = program.constants
         self._actions = Actions(task.formulas)
         self._key: Any = None
+        self._waiting: list[list[float]] = []
         self.steps = 0
 
     def reset(self, seed: int) -> list[float]:
@@ -413,6 +523,11 @@ class Unfused:
 
         self._key = episode_key(np.uint64(key_of(seed)), np.uint64(1))
         self.steps = 0
+        program, rest = self.program, np.atleast_1d(self.task.formulas.rest_action).tolist()
+        self._waiting = [rest] * program.delay
+        if program.drawn:
+            self._functions["draw"](self.constants, self._draws(program.drawn, "parameters"))
+            self._functions["derive"](self.constants)
         self._functions["start"](
             self.numbers, self._draws(self.program.states + self.task.formulas.targets), self.constants
         )
@@ -423,11 +538,14 @@ class Unfused:
         self.constants[list(self.program.given).index(f"self_{name}")] = float(value)
         self._functions["derive"](self.constants)
 
-    def _draws(self, count: int) -> list[float]:
-        from lag_envs.stepping.primitives import uniform
+    def _draws(self, count: int, purpose: str = "") -> list[float]:
+        """Return draws of this step, of the episode's own or of a purpose's."""
+        from lag_envs.stepping.primitives import episode_key, uniform
 
-        step = np.uint64(self.steps)
-        return [float(uniform(np.uint64(self._key), step, np.uint64(i))) for i in range(count)]
+        key, step = np.uint64(self._key), np.uint64(self.steps)
+        if purpose:
+            key, step = episode_key(key, np.uint64(PURPOSES[purpose])), step * np.uint64(-(-count // DRAWS))
+        return [float(uniform(np.uint64(key), step, np.uint64(i))) for i in range(count)]
 
     def step(self, action: Any) -> tuple[list[float], float, bool, bool]:
         """Hold one control for one control interval.
@@ -454,7 +572,8 @@ class Unfused:
         found = self._actions.one(action)
         before = list(self.numbers)
         f, k, rows = self.numbers, self.constants, self.program.rows
-        self._functions["move"](f, np.atleast_1d(found).tolist(), k)
+        self._waiting.append(np.atleast_1d(found).tolist())
+        self._functions["move"](f, self._waiting.pop(0), k)
         if f[rows.refused]:
             held = f[rows.u]
             self.numbers[:] = before
@@ -468,6 +587,9 @@ class Unfused:
     def observe(self) -> list[float]:
         """Return the observation."""
         self._functions["observe"](self.numbers, self.constants)
+        if "sense" in self._functions:
+            draws = self._draws(self.program.noise, "observation")
+            self._functions["sense"](self.numbers, draws, self.constants)
         return self.numbers[self.program.rows.o]
 
     @property

@@ -635,6 +635,19 @@ class TaskFormulas:
         found |= {"scale": task.dt / task.interval, "limit": task.limit, "dt": task.dt}
         return found | {"x": scene._limit(task.dt)}
 
+    def starts_of(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the constants of the start that differ from 0, where the parameters are other numbers."""
+        k = SimpleNamespace(**self.constants())
+        vars(k).update({f"self_{name}": x for name, x in numbers.items()})
+        with formula(self._task, "start"):
+            given = dict(self._self(k).start)
+        found = {}
+        for i, name in enumerate(self.state):
+            if name in given:
+                pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
+                found[f"centre{i}"], found[f"half{i}"] = pair
+        return found
+
     @property
     def key(self) -> tuple:
         """What decides the code: tasks of a class that agree in it differ in their numbers only."""

@@ -46,6 +46,12 @@ MARGIN = 0.1
 _UNBOUNDED = float(np.finfo(np.float32).max)
 
 
+def normals(first: Any, second: Any, xp: Any) -> list[Any]:
+    """Return two normal numbers, made of two uniform ones in [0, 1)."""
+    radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
+    return [radius * xp.cos(angle), radius * xp.sin(angle)]
+
+
 class Draw(NamedTuple):
     """A parameter that is drawn anew for each episode: `base` times a factor between `low` and `high`."""
 
@@ -54,6 +60,14 @@ class Draw(NamedTuple):
     low: float
     high: float
     log: bool
+
+    def printed(self, share: Any, base: Any, low: Any, high: Any, xp: Any) -> Any:
+        """Return the value at a share of the range, for recorded numbers."""
+        if self.log:
+            factor = xp.exp(xp.log(low) + share * (xp.log(high) - xp.log(low)))
+        else:
+            factor = low + share * (high - low)
+        return base * xp.minimum(xp.maximum(factor, low), high)
 
     def at(self, share: float) -> float:
         """Return the value at a share of the range."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from types import SimpleNamespace
 from typing import Any
 
 from lag_envs.envs.imperfect.twice import Functions, Twice, rounded
@@ -36,7 +35,7 @@ class DerivedConstants:
             inner[d.name] = trace.inputs(d.name)[0]
         self._follow(inner)
         parameters = {n for n, x in inner.items() if isinstance(x, Number)}
-        found = self._starts(inner) | {f"self_{n}": x for n, x in inner.items()}
+        found = self._task.formulas.starts_of(inner) | {f"self_{n}": x for n, x in inner.items()}
         found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
         #: Constants that differ from episode to episode.
         self.changed = [name for name, x in found.items() if isinstance(x, Number)]
@@ -47,19 +46,6 @@ class DerivedConstants:
         for name, made in self._made.items():
             with naming(self._scene, name):
                 numbers[name] = made(twin(self._scene, numbers))
-
-    def _starts(self, numbers: dict[str, Any]) -> dict[str, Any]:
-        """Return centres and half widths of the start."""
-        k = SimpleNamespace(**self._task.formulas.constants())
-        vars(k).update({f"self_{name}": x for name, x in numbers.items()})
-        found = {}
-        with naming(self._task, "start"):
-            given = dict(self._task.formulas._self(k).start)
-        for i, name in enumerate(self._scene.state_names):
-            if name in given:
-                pair = given[name] if isinstance(given[name], tuple) else (0.0, given[name])
-                found[f"centre{i}"], found[f"half{i}"] = pair
-        return found
 
     def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
         """Return the constants of the motion that depend on parameters that change."""
@@ -90,11 +76,7 @@ class DerivedConstants:
             given = (constants[f"draw_{name}{j}"] for name in ("base", "low", "high"))
             base, low, high = (trace.inputs(x)[0] if isinstance(x, str) else x for x in given)
             (share,) = trace.inputs(f"share{j}")
-            if d.log:
-                factor = trace.exp(trace.log(low) + share * (trace.log(high) - trace.log(low)))
-            else:
-                factor = low + share * (high - low)
-            outputs[f"p_{d.name}"] = base * trace.minimum(trace.maximum(factor, low), high)
+            outputs[f"p_{d.name}"] = d.printed(share, base, low, high, trace)
         code, values = record_block(trace, outputs, fused=False)
         code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
         # Those that follow are made as Python makes them: one rounding for each operation.
@@ -107,7 +89,7 @@ class DerivedConstants:
             code += more
         trace = ElementaryTrace()
         numbers = self._given(trace, constants) | {n: trace.inputs(f"p_{n}")[0] for n in self._parameters}
-        found = self._starts(numbers) | {f"self_{n}": x for n, x in numbers.items()}
+        found = self._task.formulas.starts_of(numbers) | {f"self_{n}": x for n, x in numbers.items()}
         found |= self._motion(trace, numbers, self._parameters)
         results = {f"k_{name}": found[name] for name in self.changed}
         last, values = record_block(trace, results)

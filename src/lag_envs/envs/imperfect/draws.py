@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lag_envs.envs.lines import recorded
 from lag_envs.envs.program import DRAWS
 from lag_envs.stepping.tracing import Trace
+from lag_envs.tasks.imperfections import normals
 
 #: What has draws of its own, by the number that its key is made with.
 PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
@@ -45,9 +45,8 @@ def noise(
     if not sigmas:
         return []
 
-    def normals(xp: Any, first: Any, second: Any) -> list:
-        radius, angle = xp.sqrt(-2.0 * xp.log(1.0 - first)), 2.0 * math.pi * second
-        return [radius * xp.cos(angle), radius * xp.sin(angle)]
+    def two(xp: Any, first: Any, second: Any) -> list:
+        return normals(first, second, xp)
 
     lines = [f"key_{purpose} = {key_of(purpose)}"]
     per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step has that many times `DRAWS`
@@ -59,6 +58,6 @@ def noise(
                 f"{x} = uniform(key_{purpose}, np.uint64(n) * np.uint64({per_step}), np.uint64({j}))"
                 for x, j in zip(("first", "second"), (i, i + 1), strict=True)
             ]
-            lines += recorded(normals, ["first", "second"], ["normal0", "normal1"], trace)
+            lines += recorded(two, ["first", "second"], ["normal0", "normal1"], trace)
             lines += [f"{values[j]} += {constants[names[j]]} * normal{j - i}" for j in pair]
     return lines

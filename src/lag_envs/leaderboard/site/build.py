@@ -142,6 +142,7 @@ def render(
         board["page"] = _unused(board["page"], taken)
         code = None if board["frozen"] else driving.script(str(given["id"]))
         board["code"] = code and keep(f"{board['page']}-drive", "js", code)
+        board["film"] = None
         for i, row in enumerate(board["rows"]):
             own = str(row["id"] or row["name"]).removeprefix(f"{board['id']}-")
             row["page"] = _unused(f"{board['page']}-{_slug(own)}", taken)
@@ -154,9 +155,11 @@ def render(
             )
             if replays:
                 # The script that fetches the file knows it by this key.
-                episodes = _json([scenery.episode(replay) for replay in replays])
-                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({episodes});\n")
-        board["film"] = next((row["file"] for row in board["rows"] if row["name"] == board["shown"]), None)
+                episodes = [scenery.episode(replay) for replay in replays]
+                row["file"] = keep(f"{board['page']}-{i}", "js", f"lagEnvs.put({_json(episodes)});\n")
+                if row["name"] == board["shown"] and not board["film"]:
+                    first = _json(episodes[:1])
+                    board["film"] = keep(f"{board['page']}-film", "js", f"lagEnvs.put({first});\n")
         preview = scenery.preview(board.pop("states"), board.pop("goal_of_states")) if url else None
         board["preview"] = preview and keep(board["page"], "png", preview)
         boards.append(board)

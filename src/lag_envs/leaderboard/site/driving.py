@@ -11,11 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from lag_envs.controllers.basic import Constant, Feedback
+from lag_envs.controllers.linear import BalanceLQR, Regulator
+from lag_envs.controllers.tracking import Tracking
 from lag_envs.envs.unfused import Unfused
+from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import Table
-from lag_envs.leaderboard.networks import MLP, Linear
-from lag_envs.leaderboard.policies import Policy
+from lag_envs.leaderboard.networks import GRU, Linear, Network
+from lag_envs.leaderboard.policies import Controller, Policy
 from lag_envs.leaderboard.site.scenery import picture
+from lag_envs.leaderboard.tracking import Plan
 from lag_envs.mechanics.algebra import FormulaError
 from lag_envs.replay import LEVELS, VERSION
 from lag_envs.scenes import StepRefused
@@ -23,7 +28,6 @@ from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
-FUNCTIONS = ("derive", "start", "lift", "move", "kick", "observe", "poses")
 #: Where sliders have their marks, as multiples of a parameter's value.
 MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 
@@ -31,10 +35,13 @@ MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 def script(env_id: str) -> str | None:
     """Return the file with which a page drives an environment of the package.
 
-    None for an unknown id, and for one with hidden parameters or imperfect sensors or actuators.
+    None for an unknown id, and for one with imperfections that no script has.
     """
     kind: Any = TASKS.get(env_id)
-    return script_of(kind) if kind and not kind.imperfections else None
+    try:
+        return script_of(kind) if kind else None
+    except FormulaError:
+        return None
 
 
 @cache
@@ -53,7 +60,7 @@ def script_of(kind: type[Task]) -> str:
     """
     task = kind()
     env = Unfused(task)
-    program, names = env.program, ", ".join(FUNCTIONS)
+    program, names = env.program, ", ".join(env.program.names)
     constants = ", ".join(map(_number, program.constants))
     about = json.dumps(_about(kind, env), separators=(",", ":"), allow_nan=False)
     about = about.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
@@ -89,6 +96,9 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
         "states": program.states,
         "starts": program.states + formulas.targets,
         "draws": task.draws,
+        "drawn": program.drawn,
+        "noise": program.noise,
+        "delay": program.delay,
         "controls": [
             {"name": a.control, "unit": units[a.control], "low": a.low, "high": a.high, "values": a.values}
             for a in formulas.acting
@@ -114,7 +124,8 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     """
     task, program = env.task, env.program
     names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
-    values = {name: getattr(task.scene, name) for name in units if name not in program.made}
+    fixed = {*program.made, *(d.name for d in (task.imperfections.drawn if task.imperfections else ()))}
+    values = {name: getattr(task.scene, name) for name in units if name not in fixed}
     marked = {
         name: others
         for name, value in values.items()
@@ -187,44 +198,98 @@ def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
 def agent(policy: Policy) -> dict[str, Any] | None:
     """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
 
+    The page runs networks, linear and time-varying feedback, and tables; of the controllers those that are
+    nothing but feedback.
+
     Parameters
     ----------
     policy : Policy
         The policy.
     """
     made = policy.architecture
-    about: dict[str, Any]
-    if not isinstance(made, MLP | Linear | Table) or made.schema > 1:
-        return None
-    if isinstance(made, MLP):
-        about = {
-            "kind": "mlp",
-            "layers": made.layers,
-            "activation": made.activation,
-            "bins": made.bins,
-            "controls": made.controls,
-            "squash": made.squash,
-            "mean_limit": made.mean_limit,
-            "normalise": made.normalise and made.normalise.model_dump(),
-        }
-    elif isinstance(made, Linear):
-        about = {"kind": "linear"}
+    if isinstance(made, Table) and made.task.imperfections:
+        return None  # it looks ahead on the environment without them, which the page does not have
+    if isinstance(made, Network | Linear | Table):
+        about, arrays, head = _learned(policy), policy.arrays, made.head
+    elif isinstance(made, Plan | Controller) and not made.plans:
+        found = _feedback(made.task, policy.agent())
+        if found is None:
+            return None
+        (about, arrays), head = found, Head(made.task)
     else:
-        agent: Any = policy.agent()
-        about = {
+        return None
+    return about | {
+        "largest": head.largest,
+        "choices": head.choices,
+        "arrays": {name: _array(x) for name, x in arrays.items()},
+    }
+
+
+def _learned(policy: Policy) -> dict[str, Any]:
+    """Return what the page knows of a policy whose arrays it takes as they are."""
+    made: Any = policy.architecture
+    if isinstance(made, Linear):
+        return {"kind": "linear"}
+    if isinstance(made, Table):
+        return {
             "kind": f"{made.kind} table",
             "sums": made.sums.tolist(),
-            "axes": list(made.axes),
+            "axes": made.axes,
             "mirror": made.mirror,
             "sign": made.sign,
             "actions": made.actions,
-            "wrapped": agent.read.wrapped,
+            "read": policy.agent().read.numbers(),
             "interval": made.task.interval,
         }
-    return about | {
-        "largest": made.head.largest,
-        "arrays": {name: _array(x) for name, x in policy.arrays.items()},
+    about = {
+        "layers": made.layers,
+        "activation": made.activation,
+        "bins": made.bins,
+        "controls": made.controls,
+        "squash": made.squash,
+        "mean_limit": made.mean_limit,
+        "normalise": made.normalise and made.normalise.model_dump(),
     }
+    if isinstance(made, GRU):
+        return about | {"kind": "gru", "memory": made.memory}
+    return about | {"kind": "mlp", "frames": made.frames, "padding": made.padding}
+
+
+def _feedback(task: Task, acting: Any) -> tuple[dict[str, Any], dict[str, Array]] | None:
+    """Return what acts by feedback, its last state, action and gain those that hold; None for all else."""
+    formulas, n = task.formulas, len(task.scene.state_names)
+    if type(acting) is Feedback:
+        return {"kind": "linear"}, {"gain": acting.gain.T, "offset": np.zeros(len(acting.gain))}
+    if type(acting) is Constant:
+        offset = np.full(formulas.actions, acting.action, np.float64)
+        return {"kind": "linear"}, {"gain": np.zeros((len(task.observation), len(offset))), "offset": offset}
+    if type(acting) is Tracking:
+        m = formulas.actions
+        states = np.append(acting.states[:-1], acting.rest[None], axis=0)
+        actions = np.append(acting.actions.reshape(-1, m), np.zeros((1, m)), axis=0)
+        gains = np.append(acting.gains.reshape(-1, m, n), acting.hold.reshape(1, m, n), axis=0)
+    elif type(acting) in (Regulator, BalanceLQR):
+        scale, offset = _per_control(formulas)
+        gain = np.atleast_2d(acting.gain)
+        states, actions, gains = acting.rest[None], offset[None], (scale[:, None] * gain)[None]
+    else:
+        return None
+    about = {"kind": "plan", "read": acting.read.numbers()}
+    return about, {"states": states, "actions": actions, "gains": gains}
+
+
+def _per_control(formulas: Any) -> tuple[Array, Array]:
+    """Return (scale, offset) with which controls become numbers of actions, as `actions_for` makes them.
+
+    Of listed controls c the nearest to u is that with the largest 2 c u - c².
+    """
+    if formulas.choices:
+        (acting,) = formulas.acting
+        values = np.array(acting.values)
+        return 2.0 * values, -(values**2)
+    low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
+    scale = 2.0 * formulas.largest / (high - low)
+    return scale, -0.5 * scale * (high + low)
 
 
 def _array(array: Any) -> dict[str, Any]:

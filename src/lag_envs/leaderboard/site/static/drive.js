@@ -3,6 +3,7 @@
  *
  * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
  * Arrays as there: k constants, f the rows of one environment, a an action, d draws in [0, 1), p poses.
+ * Of imperfect sensors and actuators it has what scripts have: drawn parameters, noise, late actions.
  *
  * In this order: random numbers, episodes, links, agents, the person's hands, the stage.
  */
@@ -16,7 +17,10 @@
   const BITS = 64;
   const word = (x) => BigInt.asUintN(BITS, x);
   const [GOLDEN, FIRST, SECOND] = ["0x9E3779B97F4A7C15", "0xBF58476D1CE4E5B9", "0x94D049BB133111EB"].map(big);
-  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, 16, 1].map(big);
+  const PER_STEP = 16;
+  const [S30, S27, S31, S11, DRAWS, ONE] = [30, 27, 31, 11, PER_STEP, 1].map(big);
+  /** Keys of draws that are not the episode's own, as lag_envs/envs/imperfect/draws.py has them. */
+  const PURPOSES = { parameters: big(1), observation: big(2) };
 
   function mixed(z) {
     z = word((z ^ (z >> S30)) * FIRST);
@@ -48,12 +52,26 @@
       const { functions, about } = this.code;
       this.key = episodeKey(big(seed), ONE);
       [this.steps, this.total, this.over] = [0, 0, ""];
+      this.waiting = Array(about.delay).fill(about.rest);
+      if (about.drawn) {
+        functions.draw(this.k, this.draws(about.drawn, "parameters"));
+        functions.derive(this.k);
+      }
       functions.start(this.f, this.draws(about.starts), this.k);
-      functions.observe(this.f, this.k);
+      this.observe();
     }
 
-    draws(count) {
-      return Float64Array.from({ length: count }, (_, i) => uniform(this.key, this.steps, i));
+    /** Draws of this step, of the episode's own or of a purpose's. */
+    draws(count, purpose) {
+      const key = purpose ? episodeKey(this.key, PURPOSES[purpose]) : this.key;
+      const step = purpose ? this.steps * Math.ceil(count / PER_STEP) : this.steps;
+      return Float64Array.from({ length: count }, (_, i) => uniform(key, step, i));
+    }
+
+    observe() {
+      const { functions, about } = this.code;
+      functions.observe(this.f, this.k);
+      functions.sense?.(this.f, this.draws(about.noise, "observation"), this.k);
     }
 
     /** Hold an action for one interval; returns the reward. Afterwards `over` says how it ended, if it did. */
@@ -61,7 +79,8 @@
       const { functions, about } = this.code;
       const { rows } = about;
       this.kept.set(this.f);
-      functions.move(this.f, action, this.k);
+      this.waiting.push(action);
+      functions.move(this.f, this.waiting.shift(), this.k);
       if (this.f[rows.refused] > 0) {
         this.f.set(this.kept);
         this.over = "refused";
@@ -72,7 +91,7 @@
       this.total += reward;
       const ended = this.f[rows.ended] > 0;
       if (about.draws) functions.kick(this.f, this.draws(about.draws), this.k);
-      functions.observe(this.f, this.k);
+      this.observe();
       this.over = ended ? "terminated" : about.limit !== null && this.steps >= about.limit ? "truncated" : "";
       return reward;
     }
@@ -214,56 +233,126 @@
     const arrays = Object.fromEntries(
       Object.entries(about.arrays).map(([name, array]) => [name, { n: numbersOf(array), shape: array.shape }]),
     );
-    const found = { mlp: network, linear: feedback, "action table": table, "value table": table }[about.kind](about, arrays);
-    return (episode) => found(episode).map((x) => Math.fround(clamp(x, -about.largest, about.largest)));
+    const kinds = { mlp, gru, linear: feedback, plan, "action table": table, "value table": table };
+    const numbers = kinds[about.kind](about, arrays);
+    return (episode) => actionsFrom(numbers(episode), about);
   }
+
+  /** Numbers as an action: clipped where it lies in a range, else the largest of each list's chooses. */
+  function actionsFrom(numbers, { choices, largest }) {
+    if (!choices.length) return Array.from(numbers, (x) => Math.fround(clamp(x, -largest, largest)));
+    let end = 0;
+    return choices.map((count) => indexOfLargest(numbers.slice(end, (end += count))));
+  }
+
+  const indexOfLargest = (x) => x.reduce((best, v, i) => (v > x[best] ? i : best), 0);
 
   /** What an agent sees, in float32. */
   const seen = (episode) => Float64Array.from(episode.part("o"), Math.fround);
 
-  function network(about, arrays) {
-    const f = ACTIVATIONS[about.activation];
+  /** State and target that an agent reads from what it sees, as ObservationDecoder does. */
+  function reader({ zero, inverse, states, width, pairs }) {
     return (episode) => {
-      let x = seen(episode);
-      if (about.normalise) {
-        const { epsilon, clip } = about.normalise;
-        x = x.map((v, i) => clamp((v - arrays.obs_mean.n[i]) / Math.sqrt(arrays.obs_var.n[i] + epsilon), -clip, clip));
+      const lifted = inverse[0].map(() => 0);
+      seen(episode).forEach((o, i) => inverse[i].forEach((x, j) => (lifted[j] += (o - zero[i]) * x)));
+      const state = lifted.slice(0, states);
+      for (const [i, j] of pairs) state[i] = Math.atan2(lifted[j + 1], lifted[j]);
+      return [state, lifted[width]];
+    };
+  }
+
+  const affine = (x, weight, bias) =>
+    Float64Array.from(bias.n, (start, row) => x.reduce((sum, v, i) => sum + v * weight.n[row * x.length + i], start));
+
+  /** What a network's observations are to it. */
+  function normaliser({ normalise }, { obs_mean: mean, obs_var: variance }) {
+    if (!normalise) return (x) => x;
+    const { epsilon, clip } = normalise;
+    return (x) => x.map((v, i) => clamp((v - mean.n[i]) / Math.sqrt(variance.n[i] + epsilon), -clip, clip));
+  }
+
+  /** The numbers that a network's layers make of what enters them. */
+  function layers(about, arrays) {
+    const { activation, bins, choices, controls, largest, mean_limit: limit } = about;
+    return (x) => {
+      for (let k = 0; k < about.layers; k++) {
+        x = affine(x, arrays[`weight_${k}`], arrays[`bias_${k}`]);
+        if (k + 1 < about.layers) x = x.map(ACTIVATIONS[activation]);
       }
-      for (let layer = 0; layer < about.layers; layer++) {
-        const [weight, bias] = [arrays[`weight_${layer}`].n, arrays[`bias_${layer}`].n];
-        const out = Float64Array.from(bias);
-        for (let row = 0; row < out.length; row++) {
-          for (let i = 0; i < x.length; i++) out[row] += x[i] * weight[row * x.length + i];
-        }
-        x = layer + 1 < about.layers ? out.map(f) : out;
+      if (choices.length) return x;
+      if (bins) {
+        return Array.from({ length: controls }, (_, i) =>
+          largest * ((2 * indexOfLargest(x.subarray(i * bins, (i + 1) * bins)) + 1) / bins - 1));
       }
-      if (about.bins) {
-        return Array.from({ length: about.controls }, (_, i) => {
-          const worth = x.subarray(i * about.bins, (i + 1) * about.bins);
-          return about.largest * ((2 * worth.indexOf(Math.max(...worth)) + 1) / about.bins - 1);
-        });
-      }
-      if (about.mean_limit) x = x.map((v) => clamp(v, -about.mean_limit, about.mean_limit));
-      return [...(about.squash === "tanh" ? x.map((v) => about.largest * Math.tanh(v)) : x)];
+      if (limit) x = x.map((v) => clamp(v, -limit, limit));
+      return about.squash === "tanh" ? x.map((v) => largest * Math.tanh(v)) : x;
+    };
+  }
+
+  function mlp(about, arrays) {
+    const [normalised, outputs] = [normaliser(about, arrays), layers(about, arrays)];
+    let frames;
+    return (episode) => {
+      const now = seen(episode);
+      if (!episode.steps) frames = Array(about.frames).fill(about.padding === "first" ? now : now.map(() => 0));
+      frames = [...frames.slice(1), now];
+      return outputs(normalised(Float64Array.from(frames.flatMap((x) => [...x]))));
+    };
+  }
+
+  function gru(about, arrays) {
+    const [normalised, outputs] = [normaliser(about, arrays), layers(about, arrays)];
+    const size = about.memory;
+    let memory;
+    return (episode) => {
+      if (!episode.steps) memory = new Float64Array(size);
+      const o = affine(normalised(seen(episode)), arrays.weight_ih, arrays.bias_ih);
+      const h = affine(memory, arrays.weight_hh, arrays.bias_hh);
+      memory = memory.map((old, i) => {
+        const [r, z] = [0, size].map((at) => sigmoid(o[at + i] + h[at + i]));
+        return (1 - z) * Math.tanh(o[2 * size + i] + r * h[2 * size + i]) + z * old;
+      });
+      return outputs(memory);
     };
   }
 
   function feedback(about, { gain, offset }) {
     return (episode) => {
       const x = seen(episode);
-      return Array.from(offset.n, (start, j) => x.reduce((sum, v, i) => sum + v * gain.n[i * offset.n.length + j], start));
+      return Float64Array.from(offset.n, (start, j) => x.reduce((sum, v, i) => sum + v * gain.n[i * offset.n.length + j], start));
+    };
+  }
+
+  /** x rounded to a whole number, halves to the even one. */
+  function rounded(x) {
+    const found = Math.round(x);
+    return found - x === 0.5 && found % 2 ? found - 1 : found;
+  }
+
+  /** Actions minus gains times how far the state is from the planned one; the last of them go on. */
+  function plan(about, { states, actions, gains }) {
+    const read = reader(about.read);
+    const wrapped = about.read.pairs.map(([i]) => i);
+    const [[length, wide], many] = [states.shape, actions.shape[1]];
+    return (episode) => {
+      const now = Math.min(episode.steps, length - 1);
+      const off = read(episode)[0].map((x, i) => x - states.n[now * wide + i]);
+      for (const i of wrapped) off[i] -= 2 * Math.PI * rounded(off[i] / (2 * Math.PI));
+      return Array.from({ length: many }, (_, j) =>
+        actions.n[now * many + j] - off.reduce((sum, x, i) => sum + gains.n[(now * many + j) * wide + i] * x, 0));
     };
   }
 
   function table(about, arrays) {
     const axes = about.axes.map((_, j) => arrays[`axis_${j}`].n);
     const values = arrays.table.n;
+    const read = reader(about.read);
     const strides = axes.map((_, j) => axes.slice(j + 1).reduce((product, axis) => product * axis.length, 1));
 
     /** The table's number at a moment, and whether it is that of the mirror image. */
     function lookUp(state, target, steps) {
       const given = [...state, target, steps * about.interval];
-      for (const i of about.wrapped) given[i] -= 2 * Math.PI * Math.round(given[i] / (2 * Math.PI));
+      for (const [i] of about.read.pairs) given[i] -= 2 * Math.PI * Math.round(given[i] / (2 * Math.PI));
       const points = about.sums.map((row) => row.reduce((sum, s, i) => sum + (s ? s * given[i] : 0), 0));
       const mirrored = about.mirror !== null && points[about.mirror] < 0;
       const cells = points.map((x, j) => {
@@ -291,29 +380,32 @@
 
     if (about.kind === "action table") {
       return (episode) => {
-        const [found, mirrored] = lookUp(episode.state, episode.part("g")[0] ?? 0, episode.steps);
+        const [found, mirrored] = lookUp(...read(episode), episode.steps);
         return [mirrored ? about.sign * found : found];
       };
     }
 
-    /** The best of some actions, one step ahead. */
-    function best(episode, actions) {
+    /** What actions are worth: the reward of a step from what is seen, and the value where it ends. */
+    function worth(episode, actions) {
       const { functions, about: code } = episode.code;
-      const after = new Float64Array(episode.f.length);
-      let [chosen, most] = [actions[0], -Infinity];
-      for (const action of actions) {
-        after.set(episode.f);
+      const [state, target] = read(episode);
+      const before = Float64Array.from(episode.f);
+      before.set(state);
+      before.fill(target, ...code.rows.g);
+      functions.lift(before, episode.k);
+      const after = new Float64Array(before.length);
+      return actions.map((action) => {
+        after.set(before);
         functions.move(after, [action], episode.k);
-        const later = after[code.rows.ended] > 0 ? 0 :
-          lookUp(after.subarray(0, code.states), episode.part("g")[0] ?? 0, episode.steps + 1)[0];
-        const gain = after[code.rows.reward] + later;
-        if (gain > most) [chosen, most] = [action, gain];
-      }
-      return chosen;
+        const later = after[code.rows.ended] > 0 ? 0 : lookUp(after.subarray(0, code.states), target, episode.steps + 1)[0];
+        return after[code.rows.reward] + later;
+      });
     }
 
-    const { largest } = about;
+    const { choices, largest } = about;
+    if (choices.length) return (episode) => worth(episode, [...Array(choices[0]).keys()]);
     const spaced = (n) => Array.from({ length: n }, (_, i) => -1 + (2 * i) / (n - 1));
+    const best = (episode, actions) => actions[indexOfLargest(worth(episode, actions))];
     return (episode) => {
       const coarse = best(episode, spaced(about.actions).map((x) => largest * x));
       const width = (2 * largest) / (about.actions - 1);

@@ -640,8 +640,12 @@
 
     const ready = board.rows.map((row, i) => (row.file ? i : -1)).filter((i) => i >= 0);
     const other = ready.find((i) => board.rows[i].kind !== board.rows[ready[0]].kind) ?? ready[1];
-    choose(sides[0], ready[0]);
-    if (sides[1]) choose(sides[1], other ?? null);
+    // Episodes are long: they come when this comes into view, unless some were chosen by then.
+    new IntersectionObserver((entries, observer) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      observer.disconnect();
+      sides.forEach((side, i) => side.asked || choose(side, [ready[0], other ?? null][i]));
+    }).observe(root);
     return () => {
       for (const side of sides) side.background = null;
       show();
