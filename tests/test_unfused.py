@@ -80,7 +80,7 @@ def check_against_fused(env, seeds):
         rewards, own_rewards, seen, own_seen, starts, ends, own, controls, own_controls = columns
         np.testing.assert_allclose(own_rewards, rewards, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(own_seen, seen, rtol=1e-6, atol=1e-6)
-        by_states, by_controls = env.scene.jacobian(starts, controls, env.task.dt)
+        by_states, by_controls = env.drawn_task.scene.jacobian(starts, controls, env.task.dt)
         # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
         moved = np.einsum("nij,nj->ni", by_controls, own_controls - controls)
         assert np.abs(moved).max(initial=0.0) <= 1e-10
