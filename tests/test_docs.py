@@ -284,7 +284,7 @@ def test_measured_error(env_id):
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
-    assert f"With an exact flow no step errs by more than {limit} of" in plain(readme())
+    assert f"is below {limit} of the state's size in nine environments of ten" in plain(readme())
     assert f"errs by less than {limit} of the largest that each entry" in plain(numerics())
     scene = env.scene
     env.reset(seed=3)
