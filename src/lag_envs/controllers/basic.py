@@ -6,16 +6,28 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lag_envs.envs.actions import Actions
-from lag_envs.tasks.base import Lifted, Task
+from lag_envs.tasks.base import Lifted, Task, TaskFormulas
 
 Array = NDArray[np.float64]
+
+
+class Law(NamedTuple):
+    """What a controller is that is nothing but feedback: actions a - K (x - x₀), step by step.
+
+    The last entries hold from then on. Clipped numbers, or the largest of them for choices, are the action.
+    """
+
+    states: Array  #: x₀, shape (steps, n)
+    actions: Array  #: a, shape (steps, numbers)
+    gains: Array  #: K, shape (steps, numbers, n)
+    read: ObservationDecoder | None  #: what finds x in the observation; None where it is the observation
 
 
 class Constant:
@@ -36,6 +48,11 @@ class Constant:
         """Return the action, for each observation."""
         own: NDArray = np.atleast_1d(np.asarray(self.action, np.float32))
         return np.tile(own, (*np.shape(observation)[:-1], 1)), state
+
+    def law(self, task: Task) -> Law:
+        """Return the controller as feedback."""
+        actions, n = np.full((1, task.formulas.actions), self.action, np.float64), len(task.observation)
+        return Law(np.zeros((1, n)), actions, np.zeros((1, actions.size, n)), None)
 
 
 def constant(task: Task, *, action: float) -> Constant:
@@ -64,6 +81,11 @@ class Feedback:
     ) -> tuple[NDArray[np.float32], Any]:
         """Return the action, for each observation."""
         return np.clip(observation @ self.gain.T, -self.largest, self.largest).astype(np.float32), state
+
+    def law(self, task: Task) -> Law:
+        """Return the controller as feedback."""
+        m, n = self.gain.shape
+        return Law(np.zeros((1, n)), np.zeros((1, m)), -self.gain[None], None)
 
 
 def feedback(task: Task, **gains: float) -> Feedback:
@@ -212,6 +234,26 @@ def actions_for(task: Task, controls: Array) -> NDArray:
     low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
     shares = 2.0 * (controls - low) / (high - low) - 1.0
     return (formulas.largest * np.clip(shares, -1.0, 1.0)).astype(np.float32)
+
+
+def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
+    """Return (scale, offset) with which controls become numbers of actions, as `actions_for` makes them.
+
+    Of listed controls c the nearest to u is that with the largest 2 c u - c².
+    """
+    if formulas.choices:
+        (acting,) = formulas.acting
+        values = np.array(acting.values)
+        return 2.0 * values, -(values**2)
+    low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
+    scale = 2.0 * formulas.largest / (high - low)
+    return scale, -0.5 * scale * (high + low)
+
+
+def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> Law:
+    """Return what asks for controls -K (x - rest), K of shape (n_state,) or (n_actions, n_state)."""
+    scale, offset = per_control(task.formulas)
+    return Law(rest[None], offset[None], (scale[:, None] * np.atleast_2d(gain))[None], read)
 
 
 def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:

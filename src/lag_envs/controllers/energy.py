@@ -47,6 +47,10 @@ class Pumped(Regulator):
         holds = self.cost_to_go(x) < np.where(holds, self.lose, self.catch)
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
+    def law(self, task: Task) -> None:
+        """Tell that this is more than feedback."""
+        return
+
 
 class PivotEnergyLQR(Pumped):
     """Swing a pendulum up by accelerating its pivot, then hold it.

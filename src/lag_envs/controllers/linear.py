@@ -14,7 +14,7 @@ import sympy
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from lag_envs.controllers.basic import FeedbackController
+from lag_envs.controllers.basic import FeedbackController, Law, hold_law
 from lag_envs.scenes.symbolic import Symbolic
 from lag_envs.tasks.base import Task
 
@@ -181,6 +181,10 @@ class Regulator(FeedbackController):
         u = -self.off(state) @ self.gain.T
         return u[..., 0] if self.gain.shape[0] == 1 else u
 
+    def law(self, task: Task) -> Law | None:
+        """Return the controller as feedback; None for one that makes more of it."""
+        return hold_law(task, self.rest, self.gain, self.read)
+
 
 class BalanceLQR(FeedbackController):
     """Keep what moves on a support upright by a linear-quadratic regulator, in spite of kicks.
@@ -208,3 +212,7 @@ class BalanceLQR(FeedbackController):
     def control(self, state: Array, target: Array) -> Array:
         """Return the support's acceleration."""
         return -(state - self.rest) @ self.gain
+
+    def law(self, task: Task) -> Law:
+        """Return the controller as feedback."""
+        return hold_law(task, self.rest, self.gain, self.read)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lag_envs.controllers.basic import remade
+from lag_envs.controllers.basic import Law, remade
 from lag_envs.controllers.ilqr import ILQR
 from lag_envs.controllers.linear import time_varying
 from lag_envs.controllers.lookahead import Clocked
@@ -121,6 +121,16 @@ class Tracking(Clocked):
         off = self.read.difference(states, planned)
         actions = np.concatenate([self.actions, np.zeros((1, *self.actions.shape[1:]))])[step]
         return actions - np.einsum("i...j,ij->i...", gains, off)
+
+    def law(self, task: Task) -> Law:
+        """Return the controller as feedback, for steps of the task's own length."""
+        m, n = task.formulas.actions, len(self.rest)
+        return Law(
+            np.append(self.states[:-1], self.rest[None], axis=0),
+            np.append(self.actions.reshape(-1, m), np.zeros((1, m)), axis=0),
+            np.append(self.gains.reshape(-1, m, n), self.hold.reshape(1, m, n), axis=0),
+            self.read,
+        )
 
 
 def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lag_envs.controllers.basic import Constant, Feedback
-from lag_envs.controllers.linear import BalanceLQR, Regulator
-from lag_envs.controllers.tracking import Tracking
+from lag_envs.controllers.basic import Law
 from lag_envs.envs.unfused import Unfused
 from lag_envs.leaderboard.architecture import Array, Head
 from lag_envs.leaderboard.grids import Table
@@ -212,10 +210,11 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     if isinstance(made, Network | Linear | Table):
         about, arrays, head = _learned(policy), policy.arrays, made.head
     elif isinstance(made, Plan | Controller) and not made.plans:
-        found = _feedback(made.task, policy.agent())
-        if found is None:
+        acting = policy.agent()
+        law = acting.law(made.task) if hasattr(acting, "law") else None
+        if law is None:
             return None
-        (about, arrays), head = found, Head(made.task)
+        (about, arrays), head = _feedback(law), Head(made.task)
     else:
         return None
     return about | {
@@ -255,41 +254,12 @@ def _learned(policy: Policy) -> dict[str, Any]:
     return about | {"kind": "mlp", "frames": made.frames, "padding": made.padding}
 
 
-def _feedback(task: Task, acting: Any) -> tuple[dict[str, Any], dict[str, Array]] | None:
-    """Return what acts by feedback, its last state, action and gain those that hold; None for all else."""
-    formulas, n = task.formulas, len(task.scene.state_names)
-    if type(acting) is Feedback:
-        return {"kind": "linear"}, {"gain": acting.gain.T, "offset": np.zeros(len(acting.gain))}
-    if type(acting) is Constant:
-        offset = np.full(formulas.actions, acting.action, np.float64)
-        return {"kind": "linear"}, {"gain": np.zeros((len(task.observation), len(offset))), "offset": offset}
-    if type(acting) is Tracking:
-        m = formulas.actions
-        states = np.append(acting.states[:-1], acting.rest[None], axis=0)
-        actions = np.append(acting.actions.reshape(-1, m), np.zeros((1, m)), axis=0)
-        gains = np.append(acting.gains.reshape(-1, m, n), acting.hold.reshape(1, m, n), axis=0)
-    elif type(acting) in (Regulator, BalanceLQR):
-        scale, offset = _per_control(formulas)
-        gain = np.atleast_2d(acting.gain)
-        states, actions, gains = acting.rest[None], offset[None], (scale[:, None] * gain)[None]
-    else:
-        return None
-    about = {"kind": "plan", "read": acting.read.numbers()}
-    return about, {"states": states, "actions": actions, "gains": gains}
-
-
-def _per_control(formulas: Any) -> tuple[Array, Array]:
-    """Return (scale, offset) with which controls become numbers of actions, as `actions_for` makes them.
-
-    Of listed controls c the nearest to u is that with the largest 2 c u - c².
-    """
-    if formulas.choices:
-        (acting,) = formulas.acting
-        values = np.array(acting.values)
-        return 2.0 * values, -(values**2)
-    low, high = (np.array([getattr(a, end) for a in formulas.acting]) for end in ("low", "high"))
-    scale = 2.0 * formulas.largest / (high - low)
-    return scale, -0.5 * scale * (high + low)
+def _feedback(law: Law) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return what the page knows of a controller that is nothing but feedback, and its arrays."""
+    if law.read is None:
+        return {"kind": "linear"}, {"gain": -law.gains[0].T, "offset": law.actions[0]}
+    arrays = {name: getattr(law, name) for name in ("states", "actions", "gains")}
+    return {"kind": "plan", "read": law.read.numbers()}, arrays
 
 
 def _array(array: Any) -> dict[str, Any]:
