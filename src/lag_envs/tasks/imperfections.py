@@ -61,21 +61,17 @@ class Draw(NamedTuple):
     high: float
     log: bool
 
+    def at(self, share: float) -> float:
+        """Return the value at a share of the range."""
+        return float(self.printed(share, self.base, self.low, self.high, np))
+
     def printed(self, share: Any, base: Any, low: Any, high: Any, xp: Any) -> Any:
-        """Return the value at a share of the range, for recorded numbers."""
+        """Return the value at a share of the range, for recorded numbers too."""
         if self.log:
             factor = xp.exp(xp.log(low) + share * (xp.log(high) - xp.log(low)))
         else:
             factor = low + share * (high - low)
         return base * xp.minimum(xp.maximum(factor, low), high)
-
-    def at(self, share: float) -> float:
-        """Return the value at a share of the range."""
-        if self.log:
-            factor = self.low * (self.high / self.low) ** share
-        else:
-            factor = self.low + share * (self.high - self.low)
-        return self.base * min(max(factor, self.low), self.high)
 
 
 @dataclasses.dataclass(frozen=True)
