@@ -635,7 +635,7 @@ def test_a_log_that_is_replaced_while_one_waits(board):
 @pytest.mark.parametrize(
     "task",
     [
-        ("every_step",),
+        slow(("every_step",)),
         ("random_moments", "6"),
         slow(("random_moments", "200")),
         ("at_once", "3", "5"),

@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from browsers import serious, until
-from covering import covering, engine, quick, size
+from covering import covering, engine, quick, size, slow
 from driven import Six, at_random, by_agent
 from own_tasks import TASKS as OWN
 from own_tasks import Switched
 from test_policies import EVERY as LATER
+from test_policies import LISTED, LISTS, numbers
 from test_policies import OWN as LATER_TASKS
-from test_policies import numbers
 
 from lag_envs import cli, replay
 from lag_envs.controllers import controllers
@@ -225,17 +225,22 @@ def test_by_keys_alone(drive, capsys):
     until(page, "location.hash !== '#seed=12'")
 
 
-def test_a_link_is_recomputed_in_the_page(drive, bare):
+@pytest.fixture(scope="module")
+def link():
+    """Return what a link of a drive holds that ends before its ten seconds."""
     task = TASKS[incline.Tilt.id]()
     env = Unfused(task)
     env.reset(77)
     keys, total, over = [], 0.0, False
     while not over:
-        keys.append(((-64, 33, 64)[min(len(keys) // 9, 2)],))  # so that it ends before its ten seconds
+        keys.append(((-64, 33, 64)[min(len(keys) // 9, 2)],))
         _, reward, *ended = env.step(replay.action_of(keys[-1], task))
         total, over = total + reward, any(ended)
-    made = replay.Drive(task.id, 77, replay.pack(keys), total, env.program.digest)
-    page = drive(task.id, replay.write_link(made))
+    return replay.Drive(task.id, 77, replay.pack(keys), total, env.program.digest)
+
+
+def test_a_link_is_recomputed_in_the_page(drive, link):
+    page = drive(link.id, replay.write_link(link))
     until(page, "document.querySelector('.verdict').textContent.startsWith('The link is true')")
     assert page.evaluate("document.querySelector('.drive-controls select option:checked') !== null")
     # Watching it leads to the same return; it is the ghost of whoever drives.
@@ -243,27 +248,39 @@ def test_a_link_is_recomputed_in_the_page(drive, bare):
     page.select_option(".drive-controls select >> nth=0", "1")
     page.click(".rerun")
     until(page, "document.querySelector('.message').textContent.includes('R: again')")
-    assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(total, abs=6e-3)
+    assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(link.claimed, abs=6e-3)
     # Its last bit changed, it is false; so it is with one key more.
-    forged = np.nextafter(total, np.inf)
-    for false in (made._replace(claimed=forged), made._replace(keys=replay.pack([*keys, (0,)]))):
-        page = drive(task.id, replay.write_link(false))
+    longer = replay.pack([*replay.unpack(link.keys, 1), (0,)])
+    for changed in ({"claimed": np.nextafter(link.claimed, np.inf)}, {"keys": longer}):
+        page = drive(link.id, replay.write_link(link._replace(**changed)))
         until(page, "document.querySelector('.verdict').dataset.true === 'false'")
         assert verdict(page).startswith("The link is false")
-    for hash, told in (
-        (replay.write_link(made)[:-1], "damaged"),
-        ("#drive=1~x", "damaged"),
-        ("#drive=%E0%A4%A", "no link"),
-        ("#drive=2~a~b~c~d~e~f", "version"),
-        (replay.write_link(made._replace(id="PivotedBar-v0")), "another environment"),
-        (replay.write_link(made._replace(step="00000000")), "another version"),
-        (replay.write_link(made._replace(seed=2**64)), "forged"),
-        (replay.write_link(made._replace(keys=replay.pack([(65,)]))), "between -64 and 64"),
-        (replay.write_link(made._replace(keys="gA")), "damaged"),
-        ("#seed=99999999999999999999", "below 2"),
-    ):  # fmt: skip
-        page = drive(task.id, hash)
-        until(page, f"document.querySelector('.verdict').textContent.includes({told!r})")
+
+
+#: Links that no drive makes: the whole of one, or what is changed in one; and what the page says.
+IMPOSSIBLE = [
+    ({"step": "00000000"}, "another version"),
+    ("#drive=1~x", "damaged"),
+    slow("#drive=%E0%A4%A", "no link"),
+    slow("#drive=2~a~b~c~d~e~f", "version"),
+    slow({"id": "PivotedBar-v0"}, "another environment"),
+    slow({"seed": 2**64}, "forged"),
+    slow({"keys": replay.pack([(65,)])}, "between -64 and 64"),
+    slow({"keys": "gA"}, "damaged"),
+    slow("#seed=99999999999999999999", "below 2"),
+]
+
+
+@pytest.mark.parametrize(("made", "told"), IMPOSSIBLE)
+def test_an_impossible_link_is_explained(drive, link, made, told):
+    hash = made if isinstance(made, str) else replay.write_link(link._replace(**made))
+    page = drive(link.id, hash)
+    until(page, f"document.querySelector('.verdict').textContent.includes({told!r})")
+
+
+def test_a_link_cut_short_is_explained(drive, link):
+    page = drive(link.id, replay.write_link(link)[:-1])
+    until(page, "document.querySelector('.verdict').textContent.includes('damaged')")
 
 
 def test_by_pointer_and_by_touch(drive, browsing):
@@ -400,7 +417,7 @@ def test_names_for_those_who_do_not_see(drive):
     assert f"Drive {pivoted_bar.Balance.id}" in str(nodes)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", slow("dark")])
 def test_axe_finds_nothing_serious(drive, haunted, scheme):
     page = drive(cylinder_in_cylinder.Tilt.id, folder=haunted, color_scheme=scheme, bypass_csp=True)
     page.select_option(".drive-controls select >> nth=1", "stored:1")
@@ -504,7 +521,16 @@ def made(id, table, arrays):
     return Policy(architecture(id, table), {name: np.asarray(x, np.float64) for name, x in arrays.items()})
 
 
-@pytest.mark.parametrize("name, id, table, arrays", POLICIES, ids=[name for name, *_ in POLICIES])
+def covering_architectures():
+    """Yield all policies; but the first of each architecture, those of listed actions apart, are slow."""
+    seen = set()
+    for name, id, table, arrays in POLICIES:
+        kind = table["architecture"], id in (LISTED, LISTS)
+        yield pytest.param(name, id, table, arrays, id=name, marks=[pytest.mark.slow] * (kind in seen))
+        seen.add(kind)
+
+
+@pytest.mark.parametrize("name, id, table, arrays", list(covering_architectures()))
 def test_agents_act_in_the_page_as_in_python(browsing, bare, monkeypatch, name, id, table, arrays):
     for kind in (*OWN, *LATER_TASKS):
         monkeypatch.setitem(TASKS.data, kind.id, kind)

@@ -127,6 +127,7 @@ def test_few_samples_on_a_finer_grid():
     assert agrees(found, ROD) and found.warnings == ()
 
 
+@pytest.mark.slow
 def test_chaos():
     """A change of the start grows a million times within the recording."""
     truth = Chain(bars=2, damping=0.002)

@@ -296,6 +296,7 @@ def test_a_largest_action_must_be_a_size(top):
         kind()
 
 
+@pytest.mark.slow
 def test_plans_use_actions_beyond_1():
     task = make_task(PendulumExact.id, duration=1.0)
     guess = build(task, "energy shaping + LQR")

@@ -291,12 +291,12 @@ def test_agent_is_there_for_what_is_solved():
 @pytest.mark.parametrize("env_id", played())
 def test_observations_are_read_back(env_id):
     read = ObservationDecoder(TASKS[env_id]())
-    envs = gym.make_vec(env_id, 50)
-    observations, _ = envs.reset(seed=3)
-    for _ in range(5):
-        observations, *_ = envs.step(envs.action_space.sample())
-    found = read(observations)[0]
-    np.testing.assert_allclose(found, envs.unwrapped.state, rtol=1e-6, atol=1e-6)
+    env = gym.make(env_id)
+    env.reset(seed=3)
+    for _ in range(50):
+        observation, *_ = env.step(env.action_space.sample())
+        found = read(observation[None])[0]
+        np.testing.assert_allclose(found[0], env.unwrapped.state, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("env_id", [id for id, p in solvable().items() if p.targets])

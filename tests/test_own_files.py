@@ -230,9 +230,9 @@ def test_bench_takes_tasks_of_a_file(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(contestants, "PEERS", [])
     ids = tuple(own_files.registered(SEVERAL))
     assert ids == ("OwnCrane-v0", "OwnSwitched-v0", "OwnDrift-v0")
-    settings = Settings(ids, (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
+    settings = Settings(ids[-1:], (SEVERAL,), sizes=(3,), rounds=1, seconds=1e-4, cold_starts=0)
     rows = [row for row in bench(settings)["rows"] if row["library"] == "lag_envs"]
-    assert len(rows) == 9 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
+    assert len(rows) == 3 and all(row["rates"] for row in rows), [row["problem"] for row in rows]
 
 
 def test_random_actions_fit_their_space():

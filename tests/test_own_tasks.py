@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import own_tasks
 import pytest
+from covering import slow
 from gymnasium.utils.env_checker import check_env
 from rollouts import RENDERS
 
@@ -37,7 +38,7 @@ def test_gymnasium_checker(id):
     check_env(gym.make(id).unwrapped, skip_render_check=not RENDERS)
 
 
-@pytest.mark.parametrize("id", IDS)
+@pytest.mark.parametrize("id", [slow(IDS[0]), *IDS[1:]])
 @pytest.mark.parametrize("n", [3, 70])
 def test_vector_is_single(id, n):
     single = gym.make_vec(id, num_envs=n, vectorization_mode="sync")

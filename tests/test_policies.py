@@ -216,6 +216,7 @@ def test_a_plan_does_what_the_controller_of_such_numbers_does(tmp_path):
         assert np.array_equal(play(env, theirs, range(3), **options), play(env, ours, range(3), **options))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [LISTED, LISTS])
 def test_listed_actions_go_through_the_board(env, tmp_path):
     """They are verified, replayed, and compared: one choice differs from another, however near."""

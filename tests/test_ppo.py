@@ -158,9 +158,9 @@ def test_the_policy_that_was_written_is_the_one_that_was_evaluated(tmp_path):
 @pytest.mark.parametrize(
     ("env_id", "space"),
     [
-        (Centre.id, gym.spaces.Box(-1.0, 1.0, (2,), np.float32)),
+        slow(Centre.id, gym.spaces.Box(-1.0, 1.0, (2,), np.float32)),
         (Jerky.id, gym.spaces.MultiDiscrete([3, 2])),
-        (Row.id, gym.spaces.Discrete(3)),
+        slow(Row.id, gym.spaces.Discrete(3)),
     ],
 )
 def test_it_learns_with_any_actions(env_id, space, own, tmp_path):

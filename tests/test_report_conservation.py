@@ -90,6 +90,7 @@ def test_unused_things_are_found():
     assert "k_one" in needed and "k_two" not in needed and "b" not in needed
 
 
+@pytest.mark.slow
 def test_what_is_left_out_saves_operations():
     rows = list(leave_out.savings(len(leave_out.PAIRS), 1))
     assert all(row["operations"][0] < row["operations"][1] for row in rows)

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from covering import slow
 
 from lag_envs.report import general, general_results
 from lag_envs.report.linkages import ENGINES, SYSTEMS, differences
@@ -60,7 +61,7 @@ def worst(rival, name, together=False):
 # --- the reference ---
 
 
-@pytest.mark.parametrize("control", ["rate", "place", "acceleration"])
+@pytest.mark.parametrize("control", ["rate", slow("place"), slow("acceleration")])
 def test_what_moves_a_support(control):
     """The exact end, and the steppers' equation, whether acceleration, rate or place is held."""
     scene = Trolley(control=control)
@@ -126,7 +127,7 @@ def test_ours_is_what_simulate_does(name, together):
     assert np.array_equal(found, paths)
 
 
-@pytest.mark.parametrize("name", ["cart-pole", "rotary pendulum"])
+@pytest.mark.parametrize("name", ["cart-pole", slow("rotary pendulum")])
 def test_every_rival_converges(name):
     """No form is fast because it is broken."""
     assert worst(Certified(Certified.method_of(12), 1e-6), name) < 1e-5

@@ -17,6 +17,7 @@ import flint
 import numpy as np
 import pytest
 from contract_scenes import Trolley
+from covering import slow
 from llvmlite import binding, ir
 from series_systems import SYSTEMS, System
 
@@ -447,7 +448,7 @@ def test_unfused_bits_are_those_of_plain_numbers(scene, state, control, monkeypa
 
 @pytest.mark.parametrize(
     ("system", "width", "fused"),
-    [(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), (SYSTEMS[3], 8, False)],
+    [slow(SYSTEMS[1], 4, True), (SYSTEMS[1], 16, True), (SYSTEMS[3], 8, False)],
     ids=["4", "16", "8 unfused"],
 )
 def test_bits_depend_neither_on_the_width_nor_on_the_neighbours(system, width, fused):

@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from browsers import serious, until
+from covering import slow
 from toy_pendulum import Swing
 
 from lag_envs.leaderboard.board import Board
@@ -684,7 +685,7 @@ def test_hostile_names_stay_names(open_page, hostile, tmp_path):
     assert page.evaluate("window.hacked") is None
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", slow("dark")])
 def test_narrow_screen(open_page, scheme):
     for name in ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id):
         page = open_page(name, viewport={"width": 320, "height": 640}, is_mobile=True, color_scheme=scheme)
@@ -747,7 +748,7 @@ def test_the_picture_moves_unless_the_reader_wants_calm(open_page):
     ("name", "scheme"),
     [
         ("index", "light"),
-        ("PivotedBar-v0", "light"),
+        slow("PivotedBar-v0", "light"),
         ("PivotedBar-v0", "dark"),
         ("PivotedBar-v0-00000002", "dark"),
     ],

@@ -7,6 +7,7 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import slow
 from mpmath import mp, mpf
 from rollouts import actions, make
 
@@ -577,24 +578,24 @@ def returns(env_id, policy, n=500, **options):
 @pytest.mark.parametrize(
     ("env_id", "policy", "options", "known"),
     [
-        (pivoted_bar.SwingUpFree.id, None, {}, -2.9),
-        (pivoted_bar.SwingUpFree.id, 0.0, {}, 0.0),
-        ("PivotedBar-v0", None, {}, 0.6),
-        ("PivotedBar-v0", 0.0, {}, 0.0),
-        (pivoted_bar.Balance.id, None, {}, 21.0),
-        (pivoted_bar.Balance.id, 0.0, {}, 21.0),
-        (incline.Tilt.id, None, {"target": 0.0}, 9.0),
-        (incline.Tilt.id, None, {"target": 0.3}, 6.0),
-        (incline.Tilt.id, 0.0, {"target": 0.0}, 14.0),
-        (incline.Tilt.id, 0.0, {"target": 0.3}, 9.0),
+        slow(pivoted_bar.SwingUpFree.id, None, {}, -2.9),
+        slow(pivoted_bar.SwingUpFree.id, 0.0, {}, 0.0),
+        slow("PivotedBar-v0", None, {}, 0.6),
+        slow("PivotedBar-v0", 0.0, {}, 0.0),
+        slow(pivoted_bar.Balance.id, None, {}, 21.0),
+        slow(pivoted_bar.Balance.id, 0.0, {}, 21.0),
+        slow(incline.Tilt.id, None, {"target": 0.0}, 9.0),
+        slow(incline.Tilt.id, None, {"target": 0.3}, 6.0),
+        slow(incline.Tilt.id, 0.0, {"target": 0.0}, 14.0),
+        slow(incline.Tilt.id, 0.0, {"target": 0.3}, 9.0),
         (incline.Brake.id, None, {}, -4.27),
         (incline.Brake.id, -1.0, {}, -12.0),
         (incline.Brake.id, 1.0, {}, -4.66),
-        (cylinder_in_cylinder.Tilt.id, None, {"target": 0.3}, 32.0),
-        (cylinder_in_cylinder.Tilt.id, 0.0, {"target": 0.3}, 0.0),
-        (cylinder_in_cylinder.Damping.id, None, {}, 283.0),
-        (cylinder_in_cylinder.Damping.id, -1.0, {}, 9.0),
-        (cylinder_in_cylinder.Damping.id, 1.0, {}, 295.0),
+        slow(cylinder_in_cylinder.Tilt.id, None, {"target": 0.3}, 32.0),
+        slow(cylinder_in_cylinder.Tilt.id, 0.0, {"target": 0.3}, 0.0),
+        slow(cylinder_in_cylinder.Damping.id, None, {}, 283.0),
+        slow(cylinder_in_cylinder.Damping.id, -1.0, {}, 9.0),
+        slow(cylinder_in_cylinder.Damping.id, 1.0, {}, 295.0),
     ],
 )
 def test_known_returns(env_id, policy, options, known):

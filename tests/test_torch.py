@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from covering import slow
 
 import lag_envs  # noqa: F401
 from lag_envs.envs.model import Model
@@ -81,7 +82,7 @@ def test_outputs_share_memory():
     assert observations.shape == (3, 5)
 
 
-@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, pivoted_bar.Balance.id])
+@pytest.mark.parametrize("env_id", [pivoted_bar.SwingUp.id, slow(pivoted_bar.Balance.id)])
 def test_gradient_of_an_episode(env_id):
     """Through ten steps, kicks included, by differences of the environment itself."""
     envs = TorchVectorEnv(env_id, 3)
