@@ -11,6 +11,7 @@ from pathlib import Path
 
 import fake_submissions
 import pytest
+from covering import slow
 from fake_submissions import ENV, write
 
 from lag_envs import cli
@@ -208,8 +209,8 @@ def test_a_result_is_edited_so_that_it_agrees_with_itself(board):
 @pytest.mark.parametrize(
     ("change", "check"),
     [
-        (lambda result: result["robustness"].update({"mass +20 %": [1e3] * 5}), "all"),
-        (lambda result: result.update(often=[1e3] * 5), "all"),
+        slow(lambda result: result["robustness"].update({"mass +20 %": [1e3] * 5}), "all"),
+        slow(lambda result: result.update(often=[1e3] * 5), "all"),
         (lambda result: result["policies"][0].update(success=[False] * 20), "sample"),
         (lambda result: result["policies"][0].update(settle=[0.1] * 20), "sample"),
         (lambda result: result["policies"][0].update(effort=[0.0] * 20), "sample"),
