@@ -216,67 +216,95 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     what the series has is linear: inputs, places and velocities are ``constants + starts @ given``, and
     `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the cotangents of places, velocities and
     sources, where `by_end` is that of places and velocities by the state, then `direct`.
+
+    Lanes that are not done are moved together, as in `_rest`. What a round of attempts moved is written down,
+    side by side, so that it goes backwards in full vectors too.
     """
-    ends, wanted = status + 2, len(pulled)
-    rows, back = np.zeros(size * BLOCK), np.zeros((ends + wanted) * BLOCK)
-    kept = np.empty((8, 2 * n + 2, LANES))
-    count = given.shape[1]
-    for first in range(0, count, LANES):
-        filled = min(LANES, count - first)
+    ends, wanted, count = status + 2, len(pulled), given.shape[1]
+    rows, back, bars = np.zeros(size * BLOCK), np.zeros((ends + wanted) * BLOCK), np.empty((wanted, BLOCK))
+    # Columns of `kept` are substeps: places and velocities, the time since the control step began, the
+    # length; `lane` is whose they are, and the rounds' ends are in `rounds`.
+    kept, lane = np.empty((2 * n + 2, 4 * BLOCK)), np.empty(4 * BLOCK, np.int64)
+    rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
+    for first in range(0, count, BLOCK):
+        filled = min(BLOCK, count - first)
         for r in range(status):
-            row = r * BLOCK
-            for i in range(filled):
-                rows[row + i] = constants[r]
+            for i in range(BLOCK):
+                rows[r * BLOCK + i] = constants[r]
             for c in range(len(given)):
                 weight = starts[r, c]
                 if weight != 0.0:
                     for i in range(filled):
-                        rows[row + i] += weight * given[c, first + i]
-            for i in range(filled, LANES):
-                rows[row + i] = rows[row]
-            for i in range(LANES):
-                back[row + i] = rows[row + i]
+                        rows[r * BLOCK + i] += weight * given[c, first + i]
+        inputs = rows[: q * BLOCK].copy()
         for r in range(wanted):
-            for i in range(LANES):
-                back[(ends + r) * BLOCK + i] = 0.0
+            for i in range(BLOCK):
+                bars[r, i] = 0.0
             for c in range(len(cotangents) if r < 2 * n else 0):
                 weight = by_end[c, r]
                 if weight != 0.0:
                     for i in range(filled):
-                        back[(ends + r) * BLOCK + i] += weight * cotangents[c, first + i]
-        for i in range(LANES):
+                        bars[r, i] += weight * cotangents[c, first + i]
+        for i in range(BLOCK):
+            whose[i] = i
             rows[status * BLOCK + i] = 0.0
             rows[left * BLOCK + i] = dt if i < filled else 0.0
             rows[wish * BLOCK + i] = dt
-        substeps, going = 0, True
-        while going:
-            if substeps == kept.shape[0]:
-                longer = np.empty((2 * substeps, 2 * n + 2, LANES))
-                longer[:substeps] = kept
-                kept = longer
-            for i in range(LANES):
-                for r in range(2 * n):
-                    kept[substeps, r, i] = rows[(q + r) * BLOCK + i]
-                kept[substeps, 2 * n, i] = rows[left * BLOCK + i]
-            going = attempt(rows, 0, dt, order, tolerance) == 0
-            moved = False
-            for i in range(LANES):
-                used = kept[substeps, 2 * n, i] - rows[left * BLOCK + i]
-                kept[substeps, 2 * n + 1, i] = used
-                moved |= used > 0.0
-                if rows[left * BLOCK + i] > 0.0 and (
-                    rows[status * BLOCK + i] >= LARGEST_COUNT
-                    or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
-                ):
-                    return first + i + 1
-            substeps += moved
-        for j in range(substeps - 1, -1, -1):
-            for i in range(LANES):
-                for r in range(2 * n):
-                    back[(q + r) * BLOCK + i] = kept[j, r, i]
-                back[status * BLOCK + i] = dt - kept[j, 2 * n, i]
-                back[(status + 1) * BLOCK + i] = kept[j, 2 * n + 1, i]
-            pull(back, 0, order)
+        going, end, turns = filled, 0, 0
+        while going > 0:
+            if end + going > len(lane):
+                kept = np.concatenate((kept, np.empty_like(kept)), axis=1)
+                lane = np.concatenate((lane, np.empty_like(lane)))
+            if turns == len(rounds):
+                rounds = np.concatenate((rounds, np.empty_like(rounds)))
+            for r in range(2 * n):
+                for i in range(going):
+                    kept[r, end + i] = rows[(q + r) * BLOCK + i]
+            for i in range(going):
+                kept[2 * n, end + i] = rows[left * BLOCK + i]
+            for i in range(0, going, LANES):
+                attempt(rows, i, dt, order, tolerance)
+            begin, still = end, 0
+            for i in range(going):
+                remains = rows[left * BLOCK + i]
+                used = kept[2 * n, begin + i] - remains
+                if used > 0.0:
+                    for r in range(2 * n):
+                        kept[r, end] = kept[r, begin + i]
+                    kept[2 * n, end], kept[2 * n + 1, end] = dt - kept[2 * n, begin + i], used
+                    lane[end] = whose[i]
+                    end += 1
+                if remains > 0.0:
+                    if rows[status * BLOCK + i] >= LARGEST_COUNT or not (
+                        rows[wish * BLOCK + i] > SMALLEST_PART * dt
+                    ):
+                        return first + whose[i] + 1
+                    for r in range(bounds):
+                        rows[r * BLOCK + still] = rows[r * BLOCK + i]
+                    whose[still] = whose[i]
+                    still += 1
+            for i in range(still, going):
+                rows[left * BLOCK + i] = 0.0
+            going = still
+            rounds[turns] = end
+            turns += 1
+        for turn in range(turns - 1, -1, -1):
+            begin = rounds[turn - 1] if turn > 0 else 0
+            some = rounds[turn] - begin
+            for r in range(q):
+                for i in range(some):
+                    back[r * BLOCK + i] = inputs[r * BLOCK + lane[begin + i]]
+            for r in range(2 * n + 2):
+                for i in range(some):
+                    back[(q + r) * BLOCK + i] = kept[r, begin + i]
+            for r in range(wanted):
+                for i in range(some):
+                    back[(ends + r) * BLOCK + i] = bars[r, lane[begin + i]]
+            for i in range(0, some, LANES):
+                pull(back, i, order)
+            for r in range(wanted):
+                for i in range(some):
+                    bars[r, lane[begin + i]] = back[(ends + r) * BLOCK + i]
         for r in range(len(found)):
             for i in range(filled):
                 found[r, first + i] = 0.0
@@ -289,7 +317,7 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
                 weight = pulled[c, r]
                 if weight != 0.0:
                     for i in range(filled):
-                        found[r, first + i] += weight * back[(ends + c) * BLOCK + i]
+                        found[r, first + i] += weight * bars[c, i]
     return 0
 
 
