@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
-from lag_envs.stepping.series import GROUP, STRIDE, Factor, Series, Start, Target, times
+from lag_envs.stepping.series import GROUP, STRIDE, Factor, Lane, Series, Start, Target, times
 
 
 class Backward(Series):
@@ -69,18 +69,60 @@ class Backward(Series):
         return kind == "x" and self.record.nodes[i].op in KNOWN
 
     def pull(
-        self, t: Target, inputs: dict, q: Sequence, v: Sequence, h: Any, order: Any, ends: Sequence
-    ) -> tuple[list, list]:
-        """Return cotangents of places and velocities before the step, and of the sources.
+        self,
+        t: Any,
+        inputs: dict[str, Any],
+        lane: Lane,
+        dt: Any,
+        order: Any,
+        tolerance: Any,
+        bars: Sequence,
+    ) -> tuple[Lane, list, Any]:
+        """Go on with a control step as `substep` does; where that ends it, go back through the substep.
 
         Parameters
         ----------
-        t, inputs, q, v, h, order
-            See `expand`.
-        ends : sequence of number
-            Cotangents of places, then of velocities after it.
+        t, inputs, lane, dt, order
+            See `substep`.
+        tolerance : number
+            What v may leave out. Below 0 the substep was taken before, so it is only gone back through: `lane`
+            is as it was, and its wish the length that was certified.
+        bars : sequence of number
+            Cotangents of places, then of velocities after the substep, then of the sources.
+
+        Returns
+        -------
+        lane : Lane
+            What it is afterwards.
+        bars : list of number
+            Cotangents before the substep, those of the sources added up, where it was gone back through.
+        back : condition
+            Whether it was, where the control step has ended: not if that are few of several lanes.
         """
-        start = self.expand(t, inputs, q, v, h, order)
+        zero, again = t.number(0.0), t.less(tolerance, t.number(0.0))
+        wanted = t.both(t.negated(again), t.less(zero, lane.left))
+        inputs, h = self._before(t, inputs, lane, dt)
+        start = self.expand(t, inputs, lane.q, lane.v, h, order)
+        n = self.size
+
+        def certify() -> list:
+            found = self._certified(t, start, lane.q, h, order, tolerance, wanted)
+            after, _ = self._after(t, lane, order, wanted, *found)
+            return [*after.q, *after.v, *after[2:]]
+
+        after = t.when(t.negated(t.all(again)), certify, [*lane.q, *lane.v, *lane[2:]])
+        lane = Lane(after[:n], after[n : 2 * n], *after[2 * n :])
+        ended = t.either(again, t.both(wanted, t.negated(t.less(zero, lane.left))))
+        back = t.most(ended, wanted)
+
+        def go_back() -> list:
+            found = self._back(t, start, h, order, bars)
+            return [t.select(ended, new, old) for new, old in zip(found, bars, strict=True)]
+
+        return lane, t.when(back, go_back, bars), back
+
+    def _back(self, t: Target, start: Start, h: Any, order: Any, ends: Sequence) -> list:
+        """Return cotangents before the step just expanded from those after it, see `pull`."""
         self._clear(t, order)
         n = self.size
 
@@ -100,15 +142,15 @@ class Backward(Series):
         places, weights = self._first_order_back(t, start, h, order)
         velocities = [t.load(self._bar("v", i), t.index(0)) for i in range(n)]
         found = [
-            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends[:n], strict=True)
+            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends, strict=False)
         ]
         found += [
             x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
         ]
-        return found, [self._of_source(t, start, weights, source) for source in self._sources]
+        sources = zip(self._sources, ends[2 * n :], strict=True)
+        return found + [self._of_source(t, start, weights, source, total) for source, total in sources]
 
-    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str) -> Any:
-        total = t.number(0.0)
+    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str, total: Any) -> Any:
         for name, bar in weights.items():
             slope = self.record.tangents[name].get(source, 0.0)
             if slope != 0.0:
@@ -161,17 +203,19 @@ class Backward(Series):
             def later(i: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
                 m = t.minus(order, i)  # what was found last is added last
                 value = {factor: factor.load(t, t.minus(m, k)) for factor in factors}
-                total = dict(zip(factors, carried, strict=True))
-                for key, (a, b) in some:
+                sums = []
+                for (key, (a, b)), (of_a, of_b) in zip(some, carried_pairs(carried), strict=True):
                     bar = t.load(self._sums[key], m)
-                    if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
-                        total[a] = t.fma(bar, value[b], total[a])
-                    total[b] = t.fma(bar, value[a], total[b])
-                return list(total.values())
+                    sums.append(of_a if first and isinstance(key, tuple) else t.fma(bar, value[b], of_a))
+                    sums.append(t.fma(bar, value[a], of_b))
+                return sums
 
-            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * len(factors), later)
-            for factor, total in zip(factors, sums, strict=True):
-                found[factor] = t.add(found[factor], total) if factor in found else total
+            def carried_pairs(c): return list(zip(c[::2], c[1::2], strict=True))
+            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * (2*len(some)), later)
+            for (key,(a, b)), (of_a, of_b) in zip(some, carried_pairs(sums), strict=True):
+                if not (first and isinstance(key, tuple)):
+                    found[a] = t.add(found[a], of_a) if a in found else of_a
+                found[b] = t.add(found[b], of_b) if b in found else of_b
         for factor in [factor for factor in found if factor.slot in self._bars]:
             total = found.pop(factor)
             if not (first and factor.back):

@@ -8,7 +8,6 @@ neighbours.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 
@@ -217,14 +216,16 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the cotangents of places, velocities and
     sources, where `by_end` is that of places and velocities by the state, then `direct`.
 
-    Lanes that are not done are moved together, as in `_rest`. What a round of attempts moved is written down,
-    side by side, so that it goes backwards in full vectors too.
+    Lanes that are not done are moved together, as in `_rest`. Where a substep ends a step, it is mostly gone
+    back through at once, with the series at hand. The others are written down, round by round, and gone
+    through again afterwards, last round first, side by side too.
     """
-    ends, wanted, count = status + 2, len(pulled), given.shape[1]
-    rows, back, bars = np.zeros(size * BLOCK), np.zeros((ends + wanted) * BLOCK), np.empty((wanted, BLOCK))
-    # Columns of `kept` are substeps: places and velocities, the time since the control step began, the
-    # length; `lane` is whose they are, and the rounds' ends are in `rounds`.
-    kept, lane = np.empty((2 * n + 2, 4 * BLOCK)), np.empty(4 * BLOCK, np.int64)
+    wanted, count = len(pulled), given.shape[1]
+    rows, before = np.zeros((bounds + wanted) * BLOCK), np.empty((2 * n + 1, LANES))
+    again, bars = np.zeros((bounds + wanted) * BLOCK), np.empty((wanted, BLOCK))
+    # Columns of `kept` are substeps: places, velocities, what was left of the step, the length. `lanes` says
+    # whose they are, `rounds` where those of a round end.
+    kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
     rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
     for first in range(0, count, BLOCK):
         filled = min(BLOCK, count - first)
@@ -245,6 +246,8 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
                 if weight != 0.0:
                     for i in range(filled):
                         bars[r, i] += weight * cotangents[c, first + i]
+            for i in range(BLOCK):
+                rows[(bounds + r) * BLOCK + i] = bars[r, i]
         for i in range(BLOCK):
             whose[i] = i
             rows[status * BLOCK + i] = 0.0
@@ -252,37 +255,41 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
             rows[wish * BLOCK + i] = dt
         going, end, turns = filled, 0, 0
         while going > 0:
-            if end + going > len(lane):
+            if end + going > len(lanes):
                 kept = np.concatenate((kept, np.empty_like(kept)), axis=1)
-                lane = np.concatenate((lane, np.empty_like(lane)))
+                lanes = np.concatenate((lanes, np.empty_like(lanes)))
             if turns == len(rounds):
                 rounds = np.concatenate((rounds, np.empty_like(rounds)))
-            for r in range(2 * n):
-                for i in range(going):
-                    kept[r, end + i] = rows[(q + r) * BLOCK + i]
-            for i in range(going):
-                kept[2 * n, end + i] = rows[left * BLOCK + i]
-            for i in range(0, going, LANES):
-                attempt(rows, i, dt, order, tolerance)
-            begin, still = end, 0
-            for i in range(going):
-                remains = rows[left * BLOCK + i]
-                used = kept[2 * n, begin + i] - remains
-                if used > 0.0:
+            still = 0
+            for begin in range(0, going, LANES):
+                for i in range(LANES):
                     for r in range(2 * n):
-                        kept[r, end] = kept[r, begin + i]
-                    kept[2 * n, end], kept[2 * n + 1, end] = dt - kept[2 * n, begin + i], used
-                    lane[end] = whose[i]
-                    end += 1
-                if remains > 0.0:
-                    if rows[status * BLOCK + i] >= LARGEST_COUNT or not (
-                        rows[wish * BLOCK + i] > SMALLEST_PART * dt
-                    ):
-                        return first + whose[i] + 1
-                    for r in range(bounds):
-                        rows[r * BLOCK + still] = rows[r * BLOCK + i]
-                    whose[still] = whose[i]
-                    still += 1
+                        before[r, i] = rows[(q + r) * BLOCK + begin + i]
+                    before[2 * n, i] = rows[left * BLOCK + begin + i]
+                back = pull(rows, begin, dt, order, tolerance) > 0
+                some = min(LANES, going - begin)
+                if back:
+                    for r in range(wanted):
+                        for i in range(begin, begin + some):
+                            bars[r, whose[i]] = rows[(bounds + r) * BLOCK + i]
+                for i in range(begin, begin + some):
+                    remains = rows[left * BLOCK + i]
+                    used = before[2 * n, i - begin] - remains
+                    if used > 0.0 and not (back and remains == 0.0):
+                        for r in range(2 * n + 1):
+                            kept[r, end] = before[r, i - begin]
+                        kept[2 * n + 1, end] = used
+                        lanes[end] = whose[i]
+                        end += 1
+                    if remains > 0.0:
+                        if rows[status * BLOCK + i] >= LARGEST_COUNT or not (
+                            rows[wish * BLOCK + i] > SMALLEST_PART * dt
+                        ):
+                            return first + whose[i] + 1
+                        for r in range(bounds + wanted):
+                            rows[r * BLOCK + still] = rows[r * BLOCK + i]
+                        whose[still] = whose[i]
+                        still += 1
             for i in range(still, going):
                 rows[left * BLOCK + i] = 0.0
             going = still
@@ -291,20 +298,21 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
         for turn in range(turns - 1, -1, -1):
             begin = rounds[turn - 1] if turn > 0 else 0
             some = rounds[turn] - begin
-            for r in range(q):
-                for i in range(some):
-                    back[r * BLOCK + i] = inputs[r * BLOCK + lane[begin + i]]
-            for r in range(2 * n + 2):
-                for i in range(some):
-                    back[(q + r) * BLOCK + i] = kept[r, begin + i]
-            for r in range(wanted):
-                for i in range(some):
-                    back[(ends + r) * BLOCK + i] = bars[r, lane[begin + i]]
+            for i in range(some):
+                lane = lanes[begin + i]
+                for r in range(q):
+                    again[r * BLOCK + i] = inputs[r * BLOCK + lane]
+                for r in range(2 * n):
+                    again[(q + r) * BLOCK + i] = kept[r, begin + i]
+                again[left * BLOCK + i] = kept[2 * n, begin + i]
+                again[wish * BLOCK + i] = kept[2 * n + 1, begin + i]
+                for r in range(wanted):
+                    again[(bounds + r) * BLOCK + i] = bars[r, lane]
             for i in range(0, some, LANES):
-                pull(back, i, order)
+                pull(again, i, dt, order, -1.0)
             for r in range(wanted):
                 for i in range(some):
-                    bars[r, lane[begin + i]] = back[(ends + r) * BLOCK + i]
+                    bars[r, lanes[begin + i]] = again[(bounds + r) * BLOCK + i]
         for r in range(len(found)):
             for i in range(filled):
                 found[r, first + i] = 0.0
@@ -328,8 +336,4 @@ def compile_pull_all(
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
-    helpers = (
-        compile_attempt(dataclasses.replace(record, tangents={}), width),
-        compile_pull(record, sources, width),
-    )
-    return compile_python("pull_all", _pull_all, *helpers, **numbers)
+    return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), **numbers)
