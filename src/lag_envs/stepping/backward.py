@@ -1,10 +1,11 @@
 """The step of `lag_envs.stepping.series` backwards: gradients by its end as gradients by its start.
 
-The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
-Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
-Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents
-of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them
-where the series has one. Lengths of substeps are held.
+The series that ends a control step is at hand, those of earlier substeps are expanded once more. Then the
+recurrences are gone through from the highest order to the lowest. Each is a relation that is linear in the
+coefficient it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent
+P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
+Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where the series has one. Lengths of
+substeps are held.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class Backward(Series):
         t, inputs, lane, dt, order
             See `substep`.
         tolerance : number
-            What v may leave out. Below 0 the substep was taken before, so it is only gone back through: `lane`
+            What v may leave out. Below 0 the substep was taken before, and is only gone back through: `lane`
             is as it was, and its wish the length that was certified.
         bars : sequence of number
             Cotangents of places, then of velocities after the substep, then of the sources.
@@ -97,7 +98,7 @@ class Backward(Series):
         bars : list of number
             Cotangents before the substep, those of the sources added up, where it was gone back through.
         back : condition
-            Whether it was, where the control step has ended: not if that are few of several lanes.
+            Whether it was, where the control step has ended. If it has in few of several lanes, it was not.
         """
         zero, again = t.number(0.0), t.less(tolerance, t.number(0.0))
         wanted = t.both(t.negated(again), t.less(zero, lane.left))
@@ -141,9 +142,7 @@ class Backward(Series):
         t.loop(t.index(1), order, [], back)
         places, weights = self._first_order_back(t, start, h, order)
         velocities = [t.load(self._bar("v", i), t.index(0)) for i in range(n)]
-        found = [
-            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends, strict=False)
-        ]
+        found = [total if x is None else t.add(x, total) for x, total in zip(places[:n], ends, strict=False)]
         found += [
             x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
         ]
@@ -198,22 +197,20 @@ class Backward(Series):
         pairs = list(self._pairs.items())
         for begin in range(0, len(pairs), GROUP):
             some = pairs[begin : begin + GROUP]
-            factors = list(dict.fromkeys(factor for _, pair in some for factor in pair))
 
-            def later(i: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
+            def later(i: Any, carried: Sequence, some: Sequence = some) -> list:
                 m = t.minus(order, i)  # what was found last is added last
-                value = {factor: factor.load(t, t.minus(m, k)) for factor in factors}
-                sums = []
-                for (key, (a, b)), (of_a, of_b) in zip(some, carried_pairs(carried), strict=True):
-                    bar = t.load(self._sums[key], m)
-                    sums.append(of_a if first and isinstance(key, tuple) else t.fma(bar, value[b], of_a))
-                    sums.append(t.fma(bar, value[a], of_b))
-                return sums
+                found: list = []
+                for (key, (a, b)), of_a, of_b in zip(some, carried[::2], carried[1::2], strict=True):
+                    bar, x, y = t.load(self._sums[key], m), *(f.load(t, t.minus(m, k)) for f in (a, b))
+                    found += [of_a if first and isinstance(key, tuple) else t.fma(bar, y, of_a)]
+                    found += [t.fma(bar, x, of_b)]
+                return found
 
-            def carried_pairs(c): return list(zip(c[::2], c[1::2], strict=True))
-            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * (2*len(some)), later)
-            for (key,(a, b)), (of_a, of_b) in zip(some, carried_pairs(sums), strict=True):
-                if not (first and isinstance(key, tuple)):
+            # A sum for each factor of each pair: many short chains of additions keep the processor busy.
+            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * (2 * len(some)), later)
+            for (key, (a, b)), of_a, of_b in zip(some, sums[::2], sums[1::2], strict=True):
+                if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
                     found[a] = t.add(found[a], of_a) if a in found else of_a
                 found[b] = t.add(found[b], of_b) if b in found else of_b
         for factor in [factor for factor in found if factor.slot in self._bars]:

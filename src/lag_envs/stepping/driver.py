@@ -221,8 +221,10 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     through again afterwards, last round first, side by side too.
     """
     wanted, count = len(pulled), given.shape[1]
-    rows, before = np.zeros((bounds + wanted) * BLOCK), np.empty((2 * n + 1, LANES))
-    again, bars = np.zeros((bounds + wanted) * BLOCK), np.empty((wanted, BLOCK))
+    table, before = np.zeros((bounds + wanted, BLOCK)), np.empty((2 * n + 1, BLOCK))
+    inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
+    again = np.zeros_like(table)
+    rows, rows_again = table.reshape(-1), again.reshape(-1)
     # Columns of `kept` are substeps: places, velocities, what was left of the step, the length. `lanes` says
     # whose they are, `rounds` where those of a round end.
     kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
@@ -230,29 +232,24 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     for first in range(0, count, BLOCK):
         filled = min(BLOCK, count - first)
         for r in range(status):
-            for i in range(BLOCK):
-                rows[r * BLOCK + i] = constants[r]
+            fill(table[r], constants[r], BLOCK)
             for c in range(len(given)):
-                weight = starts[r, c]
-                if weight != 0.0:
-                    for i in range(filled):
-                        rows[r * BLOCK + i] += weight * given[c, first + i]
-        inputs = rows[: q * BLOCK].copy()
+                if starts[r, c] != 0.0:
+                    add(table[r], starts[r, c], given[c, first:], filled)
+        for r in range(q):
+            put(inputs[r], table[r], BLOCK)
         for r in range(wanted):
-            for i in range(BLOCK):
-                bars[r, i] = 0.0
+            fill(bars[r], 0.0, BLOCK)
             for c in range(len(cotangents) if r < 2 * n else 0):
-                weight = by_end[c, r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        bars[r, i] += weight * cotangents[c, first + i]
-            for i in range(BLOCK):
-                rows[(bounds + r) * BLOCK + i] = bars[r, i]
+                if by_end[c, r] != 0.0:
+                    add(bars[r], by_end[c, r], cotangents[c, first:], filled)
+            put(table[bounds + r], bars[r], BLOCK)
+        fill(table[status], 0.0, BLOCK)
+        fill(table[left], 0.0, BLOCK)
+        fill(table[left], dt, filled)
+        fill(table[wish], dt, BLOCK)
         for i in range(BLOCK):
             whose[i] = i
-            rows[status * BLOCK + i] = 0.0
-            rows[left * BLOCK + i] = dt if i < filled else 0.0
-            rows[wish * BLOCK + i] = dt
         going, end, turns = filled, 0, 0
         while going > 0:
             if end + going > len(lanes):
@@ -260,38 +257,36 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
                 lanes = np.concatenate((lanes, np.empty_like(lanes)))
             if turns == len(rounds):
                 rounds = np.concatenate((rounds, np.empty_like(rounds)))
+            for r in range(2 * n):
+                put(before[r], table[q + r], BLOCK)
+            put(before[2 * n], table[left], BLOCK)
             still = 0
             for begin in range(0, going, LANES):
-                for i in range(LANES):
-                    for r in range(2 * n):
-                        before[r, i] = rows[(q + r) * BLOCK + begin + i]
-                    before[2 * n, i] = rows[left * BLOCK + begin + i]
                 back = pull(rows, begin, dt, order, tolerance) > 0
-                some = min(LANES, going - begin)
+                until = min(begin + LANES, going)
                 if back:
                     for r in range(wanted):
-                        for i in range(begin, begin + some):
-                            bars[r, whose[i]] = rows[(bounds + r) * BLOCK + i]
-                for i in range(begin, begin + some):
-                    remains = rows[left * BLOCK + i]
-                    used = before[2 * n, i - begin] - remains
+                        row, bar = table[bounds + r], bars[r]
+                        for i in range(begin, until):
+                            bar[whose[i]] = row[i]
+                for i in range(begin, until):
+                    remains = table[left, i]
+                    used = before[2 * n, i] - remains
                     if used > 0.0 and not (back and remains == 0.0):
                         for r in range(2 * n + 1):
-                            kept[r, end] = before[r, i - begin]
+                            kept[r, end] = before[r, i]
                         kept[2 * n + 1, end] = used
                         lanes[end] = whose[i]
                         end += 1
                     if remains > 0.0:
-                        if rows[status * BLOCK + i] >= LARGEST_COUNT or not (
-                            rows[wish * BLOCK + i] > SMALLEST_PART * dt
-                        ):
+                        if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
                             return first + whose[i] + 1
                         for r in range(bounds + wanted):
-                            rows[r * BLOCK + still] = rows[r * BLOCK + i]
+                            table[r, still] = table[r, i]
                         whose[still] = whose[i]
                         still += 1
             for i in range(still, going):
-                rows[left * BLOCK + i] = 0.0
+                table[left, i] = 0.0
             going = still
             rounds[turns] = end
             turns += 1
@@ -301,32 +296,41 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
             for i in range(some):
                 lane = lanes[begin + i]
                 for r in range(q):
-                    again[r * BLOCK + i] = inputs[r * BLOCK + lane]
+                    again[r, i] = inputs[r, lane]
                 for r in range(2 * n):
-                    again[(q + r) * BLOCK + i] = kept[r, begin + i]
-                again[left * BLOCK + i] = kept[2 * n, begin + i]
-                again[wish * BLOCK + i] = kept[2 * n + 1, begin + i]
+                    again[q + r, i] = kept[r, begin + i]
+                again[left, i], again[wish, i] = kept[2 * n, begin + i], kept[2 * n + 1, begin + i]
                 for r in range(wanted):
-                    again[(bounds + r) * BLOCK + i] = bars[r, lane]
+                    again[bounds + r, i] = bars[r, lane]
             for i in range(0, some, LANES):
-                pull(again, i, dt, order, -1.0)
+                pull(rows_again, i, dt, order, -1.0)
             for r in range(wanted):
                 for i in range(some):
-                    bars[r, lanes[begin + i]] = again[(bounds + r) * BLOCK + i]
+                    bars[r, lanes[begin + i]] = again[bounds + r, i]
         for r in range(len(found)):
-            for i in range(filled):
-                found[r, first + i] = 0.0
+            fill(found[r, first:], 0.0, filled)
             for c in range(len(cotangents)):
-                weight = by_end[c, 2 * n + r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        found[r, first + i] += weight * cotangents[c, first + i]
+                if by_end[c, 2 * n + r] != 0.0:
+                    add(found[r, first:], by_end[c, 2 * n + r], cotangents[c, first:], filled)
             for c in range(wanted):
-                weight = pulled[c, r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        found[r, first + i] += weight * bars[c, i]
+                if pulled[c, r] != 0.0:
+                    add(found[r, first:], pulled[c, r], bars[c], filled)
     return 0
+
+
+def _fill(row, value, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] = value
+
+
+def _put(row, values, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] = values[i]
+
+
+def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] += weight * values[i]
 
 
 @cache
@@ -336,4 +340,5 @@ def compile_pull_all(
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
-    return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), **numbers)
+    loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
+    return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), *loops, **numbers)

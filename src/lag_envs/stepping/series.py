@@ -627,9 +627,7 @@ class Series:
         found = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
         return self._after(t, lane, order, wanted, *found)
 
-    def _before(
-        self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any
-    ) -> tuple[dict[str, Any], Any]:
+    def _before(self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any) -> tuple[dict[str, Any], Any]:
         """Return a substep's inputs and its length."""
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
