@@ -60,6 +60,8 @@ class Reverse:
         sizes = {"y": len(formulas.state), "a": formulas.actions, "g": formulas.targets}
         sizes |= {"z": sizes["y"], "u": formulas.controls, "e": sizes["y"]}
         sizes |= {"by_e": sizes["y"], "by_o": len(formulas.observation), "by_r": 1, "by_u": sizes["u"]}
+        sizes |= {"own_y": sizes["y"], "own_u": sizes["u"], "own_g": sizes["g"], "own_p": len(parameters)}
+        sizes |= {"moved": sizes["y"] + sizes["u"] + len(parameters)}
         self._names = {array: [f"{array}{i}" for i in range(n)] for array, n in sizes.items()}
         self._form = task.scene._form
         self._compiled: dict[str, Lanes] = {}
@@ -102,21 +104,24 @@ class Reverse:
         for first in range(0, len(others), ROWS):
             rows = others[first : first + ROWS]
             at: Any = slice(first, first + ROWS) if len(others) == count else rows
-            for x, some in zip(found, self._in_parts(kicked, rows, *(x[at] for x in given)), strict=True):
-                x[at] = some
+            out = [x[at] for x in found]  # no copies where `at` is a slice
+            self._in_parts(out, kicked, rows, *(x[at] for x in given))
+            if at is rows:
+                for x, some in zip(found, out, strict=True):
+                    x[at] = some
         return found
 
     def _in_parts(
-        self, kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
-    ) -> list[Array]:
-        """Do what `pull` does, the motion by itself; `rows` are what errors call the rows."""
+        self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
+    ) -> None:
+        """Do what `pull` does, the motion by itself, into `out`; `rows` are what errors call the rows."""
         (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
-        own_y, own_z, own_u, own_g, own_p = self._after(kicked)(self._numbers, y, u, g, z, *rest)
+        own_y, own_z, *own = self._after(kicked)(self._numbers, y, u, g, z, *rest)
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
-        by_y, by_u, by_p = np.split(moved, [y.shape[1], y.shape[1] + u.shape[1]], axis=1)
-        before = self._lanes("before", self._before_of, "y", "a", "g", "by_u")
-        last_y, last_a, last_g, last_p = before(self._numbers, y, a, g, own_u + by_u)
-        return [own_y + by_y + last_y, last_a, own_g + last_g, own_p + by_p + last_p]
+        before = self._lanes(
+            "before", self._before_of, "y", "a", "g", "own_y", "own_u", "own_g", "own_p", "moved"
+        )
+        before(self._numbers, y, a, g, own_y, *own, moved, out=out)
 
     # --- formulas ------------------------------------------------------------------------------------------
 
@@ -176,11 +181,15 @@ class Reverse:
         own_y, own_z, *rest, own_e = split(found, *map(len, by[:-1]))
         return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
-    def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, by_u: list) -> list[list]:
-        """Record the way back from controls: cotangents of y, a, g and parameters."""
+    def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
+        """Record the way back from controls, and all sums: cotangents of y, a, g and parameters."""
+        by_y, by_u, by_p = split(found["moved"], len(y), len(found["own_u"]))
         by = [y, a, g, self._parameters_of(k)]
-        found = xp.adjoint(self._control_of(xp, k, y, a, g)[0], by_u, [x for numbers in by for x in numbers])
-        return split(found, *map(len, by[:-1]))
+        bars = _sums(found["own_u"], by_u)
+        own = xp.adjoint(self._control_of(xp, k, y, a, g)[0], bars, [x for numbers in by for x in numbers])
+        last_y, last_a, last_g, last_p = split(own, *map(len, by[:-1]))
+        by_y, by_p = _sums(found["own_y"], by_y, last_y), _sums(found["own_p"], by_p, last_p)
+        return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
         """Record the way back through all: cotangents of y, a, g, no parameters; 1 for ordinary steps."""
@@ -188,10 +197,9 @@ class Reverse:
         (u,) = self._control_of(xp, k, y, a, g)
         own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)
         moved, ordinary = stepper.pull(xp, y, u, k, own_z, [*y, *u])
-        by_y, by_u = split(moved, len(y))
-        last_y, last_a, last_g, _ = self._before_of(xp, k, y, a, g, _sums(own_u, by_u))
-        by = _sums(own_y, by_y, last_y), last_a, _sums(own_g, last_g)
-        return [*by, [], [xp.where(ordinary, 1.0, 0.0)]]
+        own = {"own_y": own_y, "own_u": own_u, "own_g": own_g, "own_p": []}
+        by = self._before_of(xp, k, y, a, g, moved=moved, **own)
+        return [*by, [xp.where(ordinary, 1.0, 0.0)]]
 
 
 def _sums(*lists: list) -> list:

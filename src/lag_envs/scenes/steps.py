@@ -189,12 +189,12 @@ class _Derivatives(NamedTuple):
 
 def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     """Return the derivatives of steps by states, controls and parameters."""
-    from lag_envs.stepping.general import stepper_of
-    from lag_envs.stepping.normal_forms import normal_form
-
     known = vars(scene).setdefault("_cached_derivatives", {})
     if by in known:
         return known[by]
+    from lag_envs.stepping.general import stepper_of
+    from lag_envs.stepping.normal_forms import normal_form
+
     mechanics = scene._mechanics_by(by)
     form, numbers = normal_form(mechanics), {name: getattr(scene, name) for name in scene._numbers()}
     try:

@@ -199,7 +199,7 @@ class Lanes:
         self._sizes = [len(numbers) for numbers in found]
         self._kinds: dict[tuple[str, ...], Callable] = {}
 
-    def __call__(self, numbers: Any, *given: Any) -> list[Any]:
+    def __call__(self, numbers: Any, *given: Any, out: Sequence[Any] | None = None) -> list[Any]:
         """Return the results, arrays of shape (lanes, columns).
 
         Parameters
@@ -208,8 +208,10 @@ class Lanes:
             The constants.
         *given : ndarray, shape (lanes, columns)
             Numbers of float64 or float32, with any strides.
+        out : sequence of ndarray, optional
+            Where results are to be written.
         """
-        found = [np.empty((size, len(given[0]))).T for size in self._sizes]
+        found = [np.empty((n, len(given[0]))).T for n in self._sizes] if out is None else list(out)
         kinds = tuple(x.dtype.char for x in given)
         if kinds not in self._kinds:
             self._kinds[kinds] = self._compile(kinds)

@@ -1,10 +1,11 @@
 """The step of `lag_envs.stepping.series` backwards: gradients by its end as gradients by its start.
 
-The series are expanded once more. Then the recurrences are gone through from the highest order to the lowest.
-Each is a relation that is linear in the coefficient it gives and bilinear in the others, such as
-Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents
-of its factors are sums of products too: Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them
-where the series has one. Lengths of substeps are held.
+The series that ends a control step is at hand, those of earlier substeps are expanded once more. Then the
+recurrences are gone through from the highest order to the lowest. Each is a relation that is linear in the
+coefficient it gives and bilinear in the others, such as Σ_j x_j z_{k-j} = 0 of a reciprocal. The cotangent
+P_k of its Σ_j A_j B_{k-j} is kept, so that the cotangents of its factors are sums of products too:
+Σ_{k>j} P_k B_{k-j} that of A_j. An order thus costs two of them where the series has one. Lengths of
+substeps are held.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lag_envs.stepping.lowering import FUNCTIONS, KNOWN, SeriesRecord
-from lag_envs.stepping.series import GROUP, STRIDE, Factor, Series, Start, Target, times
+from lag_envs.stepping.series import GROUP, STRIDE, Factor, Lane, Series, Start, Target, times
 
 
 class Backward(Series):
@@ -69,18 +70,60 @@ class Backward(Series):
         return kind == "x" and self.record.nodes[i].op in KNOWN
 
     def pull(
-        self, t: Target, inputs: dict, q: Sequence, v: Sequence, h: Any, order: Any, ends: Sequence
-    ) -> tuple[list, list]:
-        """Return cotangents of places and velocities before the step, and of the sources.
+        self,
+        t: Any,
+        inputs: dict[str, Any],
+        lane: Lane,
+        dt: Any,
+        order: Any,
+        tolerance: Any,
+        bars: Sequence,
+    ) -> tuple[Lane, list, Any]:
+        """Go on with a control step as `substep` does; where that ends it, go back through the substep.
 
         Parameters
         ----------
-        t, inputs, q, v, h, order
-            See `expand`.
-        ends : sequence of number
-            Cotangents of places, then of velocities after it.
+        t, inputs, lane, dt, order
+            See `substep`.
+        tolerance : number
+            What v may leave out. Below 0 the substep was taken before, and is only gone back through: `lane`
+            is as it was, and its wish the length that was certified.
+        bars : sequence of number
+            Cotangents of places, then of velocities after the substep, then of the sources.
+
+        Returns
+        -------
+        lane : Lane
+            What it is afterwards.
+        bars : list of number
+            Cotangents before the substep, those of the sources added up, where it was gone back through.
+        back : condition
+            Whether it was, where the control step has ended. If it has in few of several lanes, it was not.
         """
-        start = self.expand(t, inputs, q, v, h, order)
+        zero, again = t.number(0.0), t.less(tolerance, t.number(0.0))
+        wanted = t.both(t.negated(again), t.less(zero, lane.left))
+        inputs, h = self._before(t, inputs, lane, dt)
+        start = self.expand(t, inputs, lane.q, lane.v, h, order)
+        n = self.size
+
+        def certify() -> list:
+            found = self._certified(t, start, lane.q, h, order, tolerance, wanted)
+            after, _ = self._after(t, lane, order, wanted, *found)
+            return [*after.q, *after.v, *after[2:]]
+
+        after = t.when(t.negated(t.all(again)), certify, [*lane.q, *lane.v, *lane[2:]])
+        lane = Lane(after[:n], after[n : 2 * n], *after[2 * n :])
+        ended = t.either(again, t.both(wanted, t.negated(t.less(zero, lane.left))))
+        back = t.most(ended, wanted)
+
+        def go_back() -> list:
+            found = self._back(t, start, h, order, bars)
+            return [t.select(ended, new, old) for new, old in zip(found, bars, strict=True)]
+
+        return lane, t.when(back, go_back, bars), back
+
+    def _back(self, t: Target, start: Start, h: Any, order: Any, ends: Sequence) -> list:
+        """Return cotangents before the step just expanded from those after it, see `pull`."""
         self._clear(t, order)
         n = self.size
 
@@ -99,16 +142,14 @@ class Backward(Series):
         t.loop(t.index(1), order, [], back)
         places, weights = self._first_order_back(t, start, h, order)
         velocities = [t.load(self._bar("v", i), t.index(0)) for i in range(n)]
-        found = [
-            total if x is None else t.add(x, total) for x, total in zip(places[:n], ends[:n], strict=True)
-        ]
+        found = [total if x is None else t.add(x, total) for x, total in zip(places[:n], ends, strict=False)]
         found += [
             x if more is None else t.add(x, more) for x, more in zip(velocities, places[n:], strict=True)
         ]
-        return found, [self._of_source(t, start, weights, source) for source in self._sources]
+        sources = zip(self._sources, ends[2 * n :], strict=True)
+        return found + [self._of_source(t, start, weights, source, total) for source, total in sources]
 
-    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str) -> Any:
-        total = t.number(0.0)
+    def _of_source(self, t: Target, start: Start, weights: dict[str, Any], source: str, total: Any) -> Any:
         for name, bar in weights.items():
             slope = self.record.tangents[name].get(source, 0.0)
             if slope != 0.0:
@@ -156,22 +197,22 @@ class Backward(Series):
         pairs = list(self._pairs.items())
         for begin in range(0, len(pairs), GROUP):
             some = pairs[begin : begin + GROUP]
-            factors = list(dict.fromkeys(factor for _, pair in some for factor in pair))
 
-            def later(i: Any, carried: Sequence, some: Sequence = some, factors: Sequence = factors) -> list:
+            def later(i: Any, carried: Sequence, some: Sequence = some) -> list:
                 m = t.minus(order, i)  # what was found last is added last
-                value = {factor: factor.load(t, t.minus(m, k)) for factor in factors}
-                total = dict(zip(factors, carried, strict=True))
-                for key, (a, b) in some:
-                    bar = t.load(self._sums[key], m)
-                    if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
-                        total[a] = t.fma(bar, value[b], total[a])
-                    total[b] = t.fma(bar, value[a], total[b])
-                return list(total.values())
+                found: list = []
+                for (key, (a, b)), of_a, of_b in zip(some, carried[::2], carried[1::2], strict=True):
+                    bar, x, y = t.load(self._sums[key], m), *(f.load(t, t.minus(m, k)) for f in (a, b))
+                    found += [of_a if first and isinstance(key, tuple) else t.fma(bar, y, of_a)]
+                    found += [t.fma(bar, x, of_b)]
+                return found
 
-            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * len(factors), later)
-            for factor, total in zip(factors, sums, strict=True):
-                found[factor] = t.add(found[factor], total) if factor in found else total
+            # A sum for each factor of each pair: many short chains of additions keep the processor busy.
+            sums = t.loop(t.index(1), t.minus(order, k), [t.number(0.0)] * (2 * len(some)), later)
+            for (key, (a, b)), of_a, of_b in zip(some, sums[::2], sums[1::2], strict=True):
+                if not (first and isinstance(key, tuple)):  # what M_0 gets is in its cells
+                    found[a] = t.add(found[a], of_a) if a in found else of_a
+                found[b] = t.add(found[b], of_b) if b in found else of_b
         for factor in [factor for factor in found if factor.slot in self._bars]:
             total = found.pop(factor)
             if not (first and factor.back):

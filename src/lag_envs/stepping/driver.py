@@ -8,7 +8,6 @@ neighbours.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 
@@ -216,81 +215,122 @@ def _pull_all(given, cotangents, found, constants, starts, pulled, by_end, dt, o
     what the series has is linear: inputs, places and velocities are ``constants + starts @ given``, and
     `found` becomes ``direct.T @ cotangents`` plus ``pulled.T`` times the cotangents of places, velocities and
     sources, where `by_end` is that of places and velocities by the state, then `direct`.
+
+    Lanes that are not done are moved together, as in `_rest`. Where a substep ends a step, it is mostly gone
+    back through at once, with the series at hand. The others are written down, round by round, and gone
+    through again afterwards, last round first, side by side too.
     """
-    ends, wanted = status + 2, len(pulled)
-    rows, back = np.zeros(size * BLOCK), np.zeros((ends + wanted) * BLOCK)
-    kept = np.empty((8, 2 * n + 2, LANES))
-    count = given.shape[1]
-    for first in range(0, count, LANES):
-        filled = min(LANES, count - first)
+    wanted, count = len(pulled), given.shape[1]
+    table, before = np.zeros((bounds + wanted, BLOCK)), np.empty((2 * n + 1, BLOCK))
+    inputs, bars = np.empty((q, BLOCK)), np.empty((wanted, BLOCK))
+    again = np.zeros_like(table)
+    rows, rows_again = table.reshape(-1), again.reshape(-1)
+    # Columns of `kept` are substeps: places, velocities, what was left of the step, the length. `lanes` says
+    # whose they are, `rounds` where those of a round end.
+    kept, lanes = np.empty((2 * n + 2, BLOCK)), np.empty(BLOCK, np.int64)
+    rounds, whose = np.empty(64, np.int64), np.empty(BLOCK, np.int64)
+    for first in range(0, count, BLOCK):
+        filled = min(BLOCK, count - first)
         for r in range(status):
-            row = r * BLOCK
-            for i in range(filled):
-                rows[row + i] = constants[r]
+            fill(table[r], constants[r], BLOCK)
             for c in range(len(given)):
-                weight = starts[r, c]
-                if weight != 0.0:
-                    for i in range(filled):
-                        rows[row + i] += weight * given[c, first + i]
-            for i in range(filled, LANES):
-                rows[row + i] = rows[row]
-            for i in range(LANES):
-                back[row + i] = rows[row + i]
+                if starts[r, c] != 0.0:
+                    add(table[r], starts[r, c], given[c, first:], filled)
+        for r in range(q):
+            put(inputs[r], table[r], BLOCK)
         for r in range(wanted):
-            for i in range(LANES):
-                back[(ends + r) * BLOCK + i] = 0.0
+            fill(bars[r], 0.0, BLOCK)
             for c in range(len(cotangents) if r < 2 * n else 0):
-                weight = by_end[c, r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        back[(ends + r) * BLOCK + i] += weight * cotangents[c, first + i]
-        for i in range(LANES):
-            rows[status * BLOCK + i] = 0.0
-            rows[left * BLOCK + i] = dt if i < filled else 0.0
-            rows[wish * BLOCK + i] = dt
-        substeps, going = 0, True
-        while going:
-            if substeps == kept.shape[0]:
-                longer = np.empty((2 * substeps, 2 * n + 2, LANES))
-                longer[:substeps] = kept
-                kept = longer
-            for i in range(LANES):
+                if by_end[c, r] != 0.0:
+                    add(bars[r], by_end[c, r], cotangents[c, first:], filled)
+            put(table[bounds + r], bars[r], BLOCK)
+        fill(table[status], 0.0, BLOCK)
+        fill(table[left], 0.0, BLOCK)
+        fill(table[left], dt, filled)
+        fill(table[wish], dt, BLOCK)
+        for i in range(BLOCK):
+            whose[i] = i
+        going, end, turns = filled, 0, 0
+        while going > 0:
+            if end + going > len(lanes):
+                kept = np.concatenate((kept, np.empty_like(kept)), axis=1)
+                lanes = np.concatenate((lanes, np.empty_like(lanes)))
+            if turns == len(rounds):
+                rounds = np.concatenate((rounds, np.empty_like(rounds)))
+            for r in range(2 * n):
+                put(before[r], table[q + r], BLOCK)
+            put(before[2 * n], table[left], BLOCK)
+            still = 0
+            for begin in range(0, going, LANES):
+                back = pull(rows, begin, dt, order, tolerance) > 0
+                until = min(begin + LANES, going)
+                if back:
+                    for r in range(wanted):
+                        row, bar = table[bounds + r], bars[r]
+                        for i in range(begin, until):
+                            bar[whose[i]] = row[i]
+                for i in range(begin, until):
+                    remains = table[left, i]
+                    used = before[2 * n, i] - remains
+                    if used > 0.0 and not (back and remains == 0.0):
+                        for r in range(2 * n + 1):
+                            kept[r, end] = before[r, i]
+                        kept[2 * n + 1, end] = used
+                        lanes[end] = whose[i]
+                        end += 1
+                    if remains > 0.0:
+                        if table[status, i] >= LARGEST_COUNT or not table[wish, i] > SMALLEST_PART * dt:
+                            return first + whose[i] + 1
+                        for r in range(bounds + wanted):
+                            table[r, still] = table[r, i]
+                        whose[still] = whose[i]
+                        still += 1
+            for i in range(still, going):
+                table[left, i] = 0.0
+            going = still
+            rounds[turns] = end
+            turns += 1
+        for turn in range(turns - 1, -1, -1):
+            begin = rounds[turn - 1] if turn > 0 else 0
+            some = rounds[turn] - begin
+            for i in range(some):
+                lane = lanes[begin + i]
+                for r in range(q):
+                    again[r, i] = inputs[r, lane]
                 for r in range(2 * n):
-                    kept[substeps, r, i] = rows[(q + r) * BLOCK + i]
-                kept[substeps, 2 * n, i] = rows[left * BLOCK + i]
-            going = attempt(rows, 0, dt, order, tolerance) == 0
-            moved = False
-            for i in range(LANES):
-                used = kept[substeps, 2 * n, i] - rows[left * BLOCK + i]
-                kept[substeps, 2 * n + 1, i] = used
-                moved |= used > 0.0
-                if rows[left * BLOCK + i] > 0.0 and (
-                    rows[status * BLOCK + i] >= LARGEST_COUNT
-                    or not rows[wish * BLOCK + i] > SMALLEST_PART * dt
-                ):
-                    return first + i + 1
-            substeps += moved
-        for j in range(substeps - 1, -1, -1):
-            for i in range(LANES):
-                for r in range(2 * n):
-                    back[(q + r) * BLOCK + i] = kept[j, r, i]
-                back[status * BLOCK + i] = dt - kept[j, 2 * n, i]
-                back[(status + 1) * BLOCK + i] = kept[j, 2 * n + 1, i]
-            pull(back, 0, order)
+                    again[q + r, i] = kept[r, begin + i]
+                again[left, i], again[wish, i] = kept[2 * n, begin + i], kept[2 * n + 1, begin + i]
+                for r in range(wanted):
+                    again[bounds + r, i] = bars[r, lane]
+            for i in range(0, some, LANES):
+                pull(rows_again, i, dt, order, -1.0)
+            for r in range(wanted):
+                for i in range(some):
+                    bars[r, lanes[begin + i]] = again[bounds + r, i]
         for r in range(len(found)):
-            for i in range(filled):
-                found[r, first + i] = 0.0
+            fill(found[r, first:], 0.0, filled)
             for c in range(len(cotangents)):
-                weight = by_end[c, 2 * n + r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        found[r, first + i] += weight * cotangents[c, first + i]
+                if by_end[c, 2 * n + r] != 0.0:
+                    add(found[r, first:], by_end[c, 2 * n + r], cotangents[c, first:], filled)
             for c in range(wanted):
-                weight = pulled[c, r]
-                if weight != 0.0:
-                    for i in range(filled):
-                        found[r, first + i] += weight * back[(ends + c) * BLOCK + i]
+                if pulled[c, r] != 0.0:
+                    add(found[r, first:], pulled[c, r], bars[c], filled)
     return 0
+
+
+def _fill(row, value, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] = value
+
+
+def _put(row, values, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] = values[i]
+
+
+def _add(row, weight, values, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        row[i] += weight * values[i]
 
 
 @cache
@@ -300,8 +340,5 @@ def compile_pull_all(
     """Compile ``pull_all(given, cotangents, found, ..., dt, order)``, see `_pull_all` and `compile_pull`."""
     width = width or lanes(record)
     numbers = _numbers(record, tolerance) | {"BLOCK": BLOCK, "LANES": width}
-    helpers = (
-        compile_attempt(dataclasses.replace(record, tangents={}), width),
-        compile_pull(record, sources, width),
-    )
-    return compile_python("pull_all", _pull_all, *helpers, **numbers)
+    loops = (compile_python(f.__name__.removeprefix("_"), f) for f in (_fill, _put, _add))
+    return compile_python("pull_all", _pull_all, compile_pull(record, sources, width), *loops, **numbers)

@@ -112,6 +112,13 @@ class Machine:
         kind = ir.IntType(self._lanes)
         return self._b.icmp_unsigned("==", self._b.bitcast(condition, kind), ir.Constant(kind, -1))
 
+    def most(self, condition: Any, of: Any) -> ir.Value:
+        """Tell whether a condition holds in two thirds, at least, of the lanes in which another does."""
+        kind = ir.IntType(self._lanes)
+        count, total = (self._b.zext(self._b.ctpop(self._b.bitcast(x, kind)), _INT) for x in (condition, of))
+        three, two = ir.Constant(_INT, 3), ir.Constant(_INT, 2)
+        return self._b.icmp_unsigned(">=", self._b.mul(three, count), self._b.mul(two, total))
+
     def negated(self, condition: Any) -> ir.Value:
         return self._b.not_(condition)
 
@@ -420,11 +427,11 @@ def _write_tangent(
 
 
 def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> Callable:
-    """Return ``pull(rows, at, order)``: steps of given lengths backwards, for compiled code.
+    """Return ``pull(rows, at, dt, order, tolerance)``: attempts, and steps backwards, for compiled code.
 
-    Rows are `BLOCK` numbers apart: inputs, places and velocities as in `Layout`, the time since the control
-    step began, the step, cotangents of places and velocities after it, and of the sources. The cotangents of
-    places and velocities are replaced by those before the step, those of the sources are added to.
+    Rows are `BLOCK` numbers apart: those of `Layout` up to `wish`, then cotangents of places and velocities
+    after the substep, and of the sources. All but inputs are replaced. It returns 1 where lanes that are done
+    have been gone back through, see `Backward.pull`.
 
     Parameters
     ----------
@@ -436,7 +443,7 @@ def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> 
         How many steps are taken at once.
     """
     digest = hashlib.sha256(f"{_version()} {record.digest} {sources} {lanes} pull".encode()).hexdigest()[:16]
-    kind = ir.FunctionType(ir.VoidType(), [_DOUBLE.as_pointer(), _INT])
+    kind = ir.FunctionType(_INT, [_DOUBLE.as_pointer(), _DOUBLE, _INT, _DOUBLE])
     return _linked(
         f"pull_{digest}", kind, lambda module, name: _write_pull(module, name, kind, record, sources, lanes)
     )
@@ -445,11 +452,12 @@ def compile_pull(record: SeriesRecord, sources: tuple[str, ...], lanes: int) -> 
 def _write_pull(
     module: ir.Module, name: str, kind: ir.FunctionType, record: SeriesRecord, sources: tuple, lanes: int
 ) -> ir.Function:
-    """Write the function ``name(rows, order)`` into a module."""
+    """Write the function ``name(rows, dt, order, tolerance)`` into a module."""
     step, layout, n = Backward(record, sources), Layout(record), record.size
     function = ir.Function(module, kind, name)
+    set.add(function.attributes, "noinline")
     set.add(function.attributes, '"prefer-vector-width"="512"')
-    rows, order = function.args
+    rows, dt, order, tolerance = function.args
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     t = Machine(builder, step.entries, lanes, True)
 
@@ -462,13 +470,11 @@ def _write_pull(
         return value
 
     inputs = {name: read(row) for name, row in layout.inputs.items()}
-    inputs[ELAPSED] = read(layout.status)
     q, v = ([read(first + i) for i in range(n)] for first in (layout.q, layout.v))
-    ends = layout.status + 2
-    seeds = [read(ends + i) for i in range(2 * n)]
-    starts, by_sources = step.pull(t, inputs, q, v, read(layout.status + 1), order, seeds)
-    by_sources = [t.add(read(ends + 2 * n + i), x) for i, x in enumerate(by_sources)]
-    for i, value in enumerate([*starts, *by_sources]):
-        builder.store(value, pointer(ends + i)).align = 8
-    builder.ret_void()
+    before = Lane(q, v, read(layout.status), read(layout.left), read(layout.wish))
+    bars = [read(layout.bounds + i) for i in range(2 * n + len(sources))]
+    lane, bars, back = step.pull(t, inputs, before, t.broadcast(dt), order, t.broadcast(tolerance), bars)
+    for row, value in enumerate([*lane.q, *lane.v, *lane[2:], *bars], layout.q):
+        builder.store(value, pointer(row)).align = 8
+    builder.ret(builder.zext(back, _INT))
     return function

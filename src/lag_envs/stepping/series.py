@@ -559,6 +559,12 @@ class Series:
             Bounds on what v leaves out; q leaves out at most h/(N+2) times as much.
         """
         start = self.expand(t, inputs, q, v, h, order)
+        return self._certified(t, start, q, h, order, tolerance, wanted)
+
+    def _certified(
+        self, t: Target, start: Start, q: Sequence, h: Any, order: Any, tolerance: Any, wanted: Any
+    ) -> tuple[Any, Any, list, list, list]:
+        """Do what `attempt` does, after the expansion."""
         certificate = Certificate(self, t, start, h, order, tolerance)
         one = t.number(1.0)
 
@@ -616,12 +622,31 @@ class Series:
         bounds : list of number
             Bounds on what places and velocities leave out.
         """
-        zero = t.number(0.0)
+        wanted = t.less(t.number(0.0), lane.left)
+        inputs, wish = self._before(t, inputs, lane, dt)
+        found = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
+        return self._after(t, lane, order, wanted, *found)
+
+    def _before(self, t: Target, inputs: dict[str, Any], lane: Lane, dt: Any) -> tuple[dict[str, Any], Any]:
+        """Return a substep's inputs and its length."""
         if ELAPSED in self.record.inputs:
             inputs = inputs | {ELAPSED: t.sub(dt, lane.left)}
-        wanted = t.less(zero, lane.left)
-        wish = self._within_lags(t, inputs, lane.wish)
-        done, tried, q, v, bounds = self.attempt(t, inputs, lane.q, lane.v, wish, order, tolerance, wanted)
+        return inputs, self._within_lags(t, inputs, lane.wish)
+
+    def _after(
+        self,
+        t: Target,
+        lane: Lane,
+        order: Any,
+        wanted: Any,
+        done: Any,
+        tried: Any,
+        q: Sequence,
+        v: Sequence,
+        bounds: Sequence,
+    ) -> tuple[Lane, list]:
+        """Return what `substep` does, from what `attempt` found."""
+        zero = t.number(0.0)
         done = t.both(done, wanted)
         used = t.select(done, tried, zero)
         left = t.sub(lane.left, used)
