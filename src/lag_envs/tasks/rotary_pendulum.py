@@ -112,7 +112,6 @@ class RotarySwingUp(Task):
             "n_timesteps": 5e5, "n_steps": 32, "gamma": 0.97, "max_grad_norm": 1.0, "reward_scale": 1.0,
             "state_noise": False, "log_std_init": 0.5, "critic": [64, 64],
         },
-        "td3": {"n_timesteps": 6e4, "gradient_steps": 4},
     }  # fmt: skip
     examples = Examples(
         start={"state": [0.3, -2.0, 2.0, 3.0]},
