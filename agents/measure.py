@@ -32,10 +32,13 @@ from lag_envs import TASKS, __version__, controllers, store
 from lag_envs.evaluation.conditions import NOMINAL, Condition, Sensor, conditions
 from lag_envs.evaluation.rollout import Meter, Rollout, Step, observation_std
 from lag_envs.evaluation.statistics import rounded
+from lag_envs.leaderboard import export
+from lag_envs.leaderboard.export import exported, find
 
 AGENTS = Path(__file__).parent
 OPTIMA = AGENTS / "results" / "optimum"
 CONTROLLERS = Path(controllers.__file__).parent
+EXPORT = Path(export.__file__)
 #: Episodes of agents that take long, where something is changed.
 PLANNED = 200
 #: First seed of the episodes of random actions from which the noise's size is taken.
@@ -99,13 +102,16 @@ def _optimal(env_id: str) -> Any:
     return Optimal(env_id)
 
 
-def _policy(folder: Path) -> Any:
+def _policy(env_id: str, folder: Path) -> Any:
+    """Return a learner's policy as the board plays it.
+
+    Models of Stable-Baselines3 act alike to float32's rounding only, which chaotic motion makes much of.
+    """
     import torch
 
-    from agents.learners import load_policy
-
     torch.set_num_threads(1)
-    return load_policy(folder)
+    (source,) = find([folder])
+    return exported(source, env_id).agent
 
 
 def learned(env_id: str, folder: Path) -> Entrant:
@@ -124,8 +130,8 @@ def learned(env_id: str, folder: Path) -> Entrant:
         raise UserError(f"{folder / RESULT} cannot be read ({error!r}); train the run anew") from error
     if not (folder / MODEL).exists():
         raise UserError(f"{folder} has a result but no {MODEL}; train the run anew, or remove it")
-    mark = digest(folder / MODEL, folder / NORMALISATION)
-    return Entrant(env_id, own[1], "learned", partial(_policy, folder), mark, result)
+    mark = digest(folder / MODEL, folder / NORMALISATION, EXPORT)
+    return Entrant(env_id, own[1], "learned", partial(_policy, env_id, folder), mark, result)
 
 
 def check_alike(entrant: Entrant, first: Entrant) -> None:

@@ -151,7 +151,7 @@ def command(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(measure.controllers, "controllers", lambda task: {"zero": KNOW_NOTHING["zero"]})
     monkeypatch.setattr(figures, "figures", lambda data, folder: [])  # another test draws
     monkeypatch.setattr(measure, "no_optimum", lambda env_id: "not computed")
-    monkeypatch.setattr(measure, "_policy", lambda folder: Constant(0.1 * int(folder.name[-1])))
+    monkeypatch.setattr(measure, "_policy", lambda env_id, folder: Constant(0.1 * int(folder.name[-1])))
     monkeypatch.setattr(measure, "observation_std", lambda env_id, seeds: np.array([0.5, 0.1]))
 
     def run(*arguments):
@@ -209,7 +209,7 @@ def test_command_leaves_out_what_is_broken(command, tmp_path, monkeypatch):
     leave_run(tmp_path / "runs", 5, curve="?")
     leave_run(tmp_path / "runs", 6)
 
-    def policy(folder):
+    def policy(env_id, folder):
         if folder.name == "seed6":
             raise results.UserError("the policy cannot be read")
         return Constant(0.0)

@@ -299,6 +299,46 @@ def _lost(worth: NDArray, chosen: NDArray, choices: Sequence[int]) -> float:
     return 0.0
 
 
+@dataclass
+class Exported:
+    """A model as a submission has it.
+
+    Attributes
+    ----------
+    table, arrays : mapping
+        The table ``[policy]`` and its arrays.
+    agent : object
+        What acts, as on the board.
+    model, normalise : object or None
+        What it was made of; a file that holds arrays has neither.
+    """
+
+    table: dict[str, Any]
+    arrays: dict[str, NDArray[Any]]
+    agent: Any
+    model: Any = None
+    normalise: Any = None
+
+
+def exported(source: Source, env: str, algo: str | None = None) -> Exported:
+    """Return a model of an environment as a submission has it; raise ExportError where it cannot be one."""
+    model, normalise = None, None
+    if (ready := arrays_of(source.model)) is not None:
+        table, arrays = ready
+    else:
+        model, normalise = _load(source, algo or _algorithm(source))
+        table, arrays = convert(model, normalise, bool(TASKS[env]().formulas.choices))
+    try:
+        made = architecture(env, table)
+        shapes = {key: value.shape for key, value in arrays.items()}
+        if shapes != made.arrays:
+            raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
+        agent = made.agent({k: v.astype(np.float64) for k, v in arrays.items()})
+    except Refused as error:
+        raise ExportError(f"{source.model}: {error}") from error
+    return Exported(table, arrays, agent, model, normalise)
+
+
 # --- exporting ----------------------------------------------------------------------------------------------
 
 
@@ -358,22 +398,9 @@ def export(
         raise ExportError("it is not known how long a training took; give --seconds")
     tables, arrays, curves, steps, took, off, count = [], {}, [], [], [], 0.0, 0
     for number, source in enumerate(sources):
-        model, normalise = None, None
-        if (ready := arrays_of(source.model)) is not None:
-            table, content = ready
-        else:
-            kind = algo or _algorithm(source)
-            model, normalise = _load(source, kind)
-            table, content = convert(model, normalise, bool(TASKS[env]().formulas.choices))
-        try:
-            made = architecture(env, table)
-            shapes = {key: value.shape for key, value in content.items()}
-            if shapes != made.arrays:
-                raise Refused(f"arrays of {shapes} do not fit {env}, which asks for {made.arrays}")
-            agent = made.agent({k: v.astype(np.float64) for k, v in content.items()})
-        except Refused as error:
-            raise ExportError(f"{source.model}: {error}") from error
-        one, count = (0.0, 0) if model is None else difference(model, normalise, agent, env)
+        made = exported(source, env, algo)
+        table, content, model = made.table, made.arrays, made.model
+        one, count = (0.0, 0) if model is None else difference(model, made.normalise, made.agent, env)
         if not one <= DIFFERENCE:
             raise ExportError(
                 f"{source.model}: model and export differ by {one:.1e} in an action, more than {DIFFERENCE:g}"
