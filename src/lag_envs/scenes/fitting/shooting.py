@@ -103,7 +103,7 @@ class Shooting:
         return self._known[1]
 
     def residuals(self, z: Array) -> Array:
-        """Return the residuals divided by their expected sizes; infinite if the motion cannot be simulated."""
+        """Return the residuals divided by their expected sizes; infinite if the simulation is refused."""
         try:
             _, motions = self.simulate(z)
         except (StepRefused, ValueError):
