@@ -24,7 +24,7 @@ from lag_envs.commands.report import REPORT
 from lag_envs.commands.show import PLAY, WATCH
 from lag_envs.errors import UserError
 
-#: In the order in which ``lag-envs --help`` tells of them.
+#: In the order of ``lag-envs --help``.
 COMMANDS: tuple[Command, ...] = (
     LIST, INFO, BENCH, ORDER, REPORT, PLAY, WATCH, NEW, COMPLETION, HYPERPARAMS, EXPORT, VERIFY, REPLAY,
     CACHE, LEADERBOARD,
@@ -43,7 +43,7 @@ EXAMPLES = """examples:
 
 
 def parser(command_name: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of the whole command; given a subcommand, only its arguments are declared."""
+    """Return the parser of the whole command; only the given subcommand's arguments are declared, if any."""
     whole = argparse.ArgumentParser(
         prog="lag-envs",
         description="Mechanics as Gymnasium environments, stepped to near machine precision.",
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # The reader, such as `head`, has left; nothing more is to be written, at exit either.
+        # The reader, such as `head`, has left; nothing more must be written, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 

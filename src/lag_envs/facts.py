@@ -1,4 +1,4 @@
-"""What there is to know about a task of the general contract, as text; the command ``lag-envs info``."""
+"""Facts about a task of the general contract, as text; the command ``lag-envs info``."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _indented(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _description(task: Task) -> str:
-    """Return what the class's docstring says, up to its tables."""
+    """Return the class's docstring up to its tables."""
     text = inspect.getdoc(type(task)) or ""
     summary, _, rest = text.partition("\n\n## Description\n\n")
     return (
@@ -111,7 +111,7 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
 
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
-    """Yield the corners of the starts' box, or some of many, each with the controls at both ends."""
+    """Yield the corners of the starts' box, or a sample if there are many, with controls at both limits."""
     boxes = list(zip(task.centre, task.half_widths, strict=True))
     ends = {a.control: (a.low, a.high) for a in task.formulas.acting}
     for side in (0, 1):
@@ -122,7 +122,7 @@ def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
 
 
 def _accuracy(task: Task) -> list[str]:
-    """Say what is proved of steps from the edges of the starts under the largest controls."""
+    """Describe the proved accuracy of steps from the edges of the starts under the largest controls."""
     scene: Any = task.scene
     found, refused = [], 0
     for state, held in _edges(task):
