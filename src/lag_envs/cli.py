@@ -31,14 +31,14 @@ COMMANDS: tuple[Command, ...] = (
 )  # fmt: skip
 
 EXAMPLES = """examples:
-  lag-envs list                      what environments there are
-  lag-envs info PivotedBar-v0        all about one of them
-  lag-envs play PivotedBar-v0        drive it
-  lag-envs watch PivotedBar-v0       see how it is done
+  lag-envs list                      list the environments
+  lag-envs info PivotedBar-v0        describe one of them
+  lag-envs play PivotedBar-v0        drive it yourself
+  lag-envs watch PivotedBar-v0       watch an agent do it
   lag-envs new my_scene.py           start one of your own
-  lag-envs bench --quick             how fast they are, beside others
-  lag-envs report --quick            how accurate they are, beside others
-  lag-envs leaderboard list          who is best at them
+  lag-envs bench --quick             compare their speed with others
+  lag-envs report --quick            compare their accuracy with others
+  lag-envs leaderboard list          see who is best at them
   lag-envs bench --help              more about one command"""
 
 

@@ -105,7 +105,7 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
     return [
         *rows,
         ("show_arrows", "False", "forces in pictures"),
-        ("show_trail", "0 s", "the way of the last seconds in pictures"),
+        ("show_trail", "0 s", "length of the bodies' trails in pictures"),
         ("show_readout", "False", "time, return, score, controls and state below pictures"),
     ]
 
@@ -151,7 +151,7 @@ def _accuracy(task: Task) -> list[str]:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{scene._layout.free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
-        lines += ["no step is certified for one substep: the number follows from the bound before each step"]
+        lines += ["no speed is certified for one substep: the bound before each step decides their number"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

@@ -77,7 +77,7 @@ def load(path: str) -> ModuleType:
     except SystemExit as error:
         del sys.modules[name]
         raise UserError(
-            f'{path} exits when it is loaded; what is only for a script goes under if __name__ == "__main__":'
+            f'{path} exits when it is loaded; put code for scripts only under if __name__ == "__main__":'
         ) from error
     return module
 

@@ -104,7 +104,7 @@ class Gamepad:
         if self._pad is not None and before is None:
             print(f"gamepad: {self._pad.get_name()}", flush=True)
         elif self._pad is None and before is not None:
-            print("the gamepad has left; the keys go on", flush=True)
+            print("gamepad unplugged; the keys still work", flush=True)
 
     def close(self) -> None:
         """Release the gamepad."""
@@ -121,7 +121,11 @@ def help_of(task: Any, space: gym.Space) -> list[str]:
     names = [acting.control for acting in getattr(task.formulas, "acting", ())] or ["control"]
     ways = zip(names, keys_of(space), STICKS, strict=False)
     lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
-    return [*(lines or ["nothing acts here: look on"]), "r: start anew", "q, or close the window: end"]
+    return [
+        *(lines or ["there is nothing to control: just watch"]),
+        "r: start anew",
+        "q, or close the window: end",
+    ]
 
 
 def play(id: str, *, steps: int | None = None, seed: int | None = None, **options: Any) -> list[float]:

@@ -168,7 +168,7 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     try:
         env = Unfused(task)
     except FormulaError as error:
-        raise LinkError(f"nobody can have driven {drive.id}: {error}") from error
+        raise LinkError(f"this drive of {drive.id} is impossible: {error}") from error
     if env.program.digest != drive.step:
         raise LinkError(
             f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "
@@ -271,7 +271,7 @@ def _short(text: str) -> str:
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``replay``."""
-    parser.add_argument("link", metavar="LINK", help="the link, or what follows #; quote it")
+    parser.add_argument("link", metavar="LINK", help="the link, or its part after #; quote it")
     parser.add_argument("--file", metavar="FILE", help="the Python file of your own that has the environment")
 
 

@@ -463,11 +463,11 @@ def _checked_task(task: Any) -> Task:
     """Return a task whose steps are differentiable, or raise a ValueError."""
     name = type(task).__name__
     if task.formulas.choices:
-        raise ValueError(f"{name} has a list of actions to choose from, by which no step has derivatives")
+        raise ValueError(f"{name} has a list of actions to choose from, which have no derivatives")
     if task.imperfections:
         raise ValueError(
-            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there "
-            "are no derivatives; leave these keywords out, or take the id without them"
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, which have no "
+            "derivatives; leave these keywords out, or take the id without them"
         )
     return task
 

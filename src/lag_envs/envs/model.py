@@ -253,8 +253,7 @@ class Model:
         formulas, form, k = self.task.formulas, self.task.scene._form, self._constants
         if formulas.choices:
             raise ValueError(
-                f"{type(self.task).__name__} has a list of actions to choose from, by which no step has "
-                "derivatives"
+                f"{type(self.task).__name__} has a list of actions to choose from, which have no derivatives"
             )
         ends, _, _ = self(states, actions, targets)
         states = real_array("states", states)

@@ -50,8 +50,7 @@ class Reverse:
         self._task, self._parameters = task, parameters
         if formulas.choices:
             raise ValueError(
-                f"{type(task).__name__} has a list of actions to choose from, by which no step has "
-                "derivatives"
+                f"{type(task).__name__} has a list of actions to choose from, which have no derivatives"
             )
         constants = constants_of(task)
         self._constants = [f"k_{name}" for name in constants]

@@ -120,8 +120,8 @@ class UnfusedProgram:
     def __init__(self, task: Task, single: bool = False) -> None:
         if task.imperfections:
             raise FormulaError(
-                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which no "
-                "script has; switch them off with None, as in observation_noise=None"
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which "
+                "scripts lack; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
         self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
@@ -429,8 +429,8 @@ class UnfusedImperfectProgram(UnfusedProgram):
         if found != known or least % 1.0:
             raise FormulaError(
                 f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, of which "
-                "scripts have randomize, observation_noise, and action_delay in whole steps only; switch the "
-                "others off with None, as in lag=None"
+                "scripts support only randomize, observation_noise, and action_delay in whole steps; switch "
+                "the others off with None, as in lag=None"
             )
         super().__init__(task.drawn.inner if task.drawn else task.varied())
         self._options, self._box = found, seen_box(task)

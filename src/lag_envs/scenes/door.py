@@ -97,7 +97,7 @@ def _check_names(scene: Any, base: type) -> None:
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         for name in (*own_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
-                raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
+                raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
     layout = scene._layout
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {

@@ -213,8 +213,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
         raise ValueError(
-            f"the motion has no derivative by the parameters at {given}: {error}; leave out those that "
-            "are 0 where a formula divides by them"
+            f"the motion has no derivative with respect to the parameters at {given}: {error}; leave out "
+            "those that are 0 and that a formula divides by"
         ) from error
     return known[by]
 

@@ -89,5 +89,5 @@ class Determined:
         if texts:
             raise ValueError(
                 f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
-                "held, or add recordings that it shows in, such as some under known controls"
+                "held, or add recordings in which it has an effect, such as some under known controls"
             )

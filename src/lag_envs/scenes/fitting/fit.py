@@ -50,7 +50,7 @@ def fit(
 ) -> Fit:
     """See `Scene.fit`."""
     if importlib.util.find_spec("scipy") is None:
-        raise ModuleNotFoundError('to fit needs SciPy: pip install "lag-envs[fit]"', name="scipy")
+        raise ModuleNotFoundError('fitting needs SciPy: pip install "lag-envs[fit]"', name="scipy")
     try:
         names = check_parameters(scene, free)
     except ValueError as error:
