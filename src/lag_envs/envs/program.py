@@ -9,7 +9,7 @@ minus the kind of its end: 1 terminated, 2 truncated, 3 both). Rows needed withi
 end ``z``, reward ``r``, kind of end ``over``, whether the step was ``ordinary`` (1; 0 special; 2 a restart
 instead of a step), observation ``o``.
 
-A batch is cut into blocks of `BLOCK` environments. The rows of a block lie behind one another at distances
+A batch is cut into blocks of `BLOCK` environments. The rows of a block lie one after another at distances
 known at compile time, so the compiler sees that they do not overlap and turns the loop over a block into
 vector instructions; with one array per row it fails to prove that. Rows needed only within a step exist once
 for all blocks and so stay in the processor's nearest cache.

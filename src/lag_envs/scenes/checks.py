@@ -75,7 +75,7 @@ def is_masked(values: Any) -> bool:
 def check_step(dt: Any) -> float:
     """Return the step as float, or raise a ValueError."""
     dt = check_number("dt", dt, "s")
-    if not dt >= sys.float_info.min:  # subnormal numbers have no finite inverse
+    if not dt >= sys.float_info.min:  # a subnormal number may have no finite inverse
         raise ValueError(f"dt must be above 0 s, got {dt:g} s")
     return dt
 

@@ -26,7 +26,8 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
 
-#: Replaces a parameter that is 0 when a step is divided, so that derivatives with respect to it are accurate.
+#: Stands in for a parameter that is 0 when deciding how to divide a step, so that derivatives with respect to
+#: it are accurate.
 GUIDE = 1e-2
 
 

@@ -103,7 +103,7 @@ class Shooting:
         return self._known[1]
 
     def residuals(self, z: Array) -> Array:
-        """Return the residuals divided by their expected sizes; infinite if the simulation is refused."""
+        """Return the residuals divided by their expected sizes; infinite if the simulation fails."""
         try:
             _, motions = self.simulate(z)
         except (StepRefused, ValueError):
