@@ -274,7 +274,7 @@ def test_a_gamepad_may_come_and_go(window, monkeypatch, capsys):
     assert gamepad.sticks() == [0.5, 0.25, 0.0, -1.0]
     pads.clear()
     assert gamepad.sticks() == [] and gamepad.sticks() == []
-    assert capsys.readouterr().out.splitlines() == ["gamepad: Pad", "the gamepad has left; the keys go on"]
+    assert capsys.readouterr().out.splitlines() == ["gamepad: Pad", "gamepad unplugged; the keys still work"]
     gamepad.close()
 
 

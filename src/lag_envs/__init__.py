@@ -1,6 +1,6 @@
 """Gymnasium environments whose dynamics are derived from a Lagrangian and stepped to near machine precision.
 
-Importing the package registers its environments; ``gym.make("PivotedBar-v0")`` and its siblings then work.
+Importing the package registers its environments, so that ``gym.make("PivotedBar-v0")`` works, for example.
 """
 
 from lag_envs.tasks import TASKS

@@ -24,26 +24,26 @@ from lag_envs.commands.report import REPORT
 from lag_envs.commands.show import PLAY, WATCH
 from lag_envs.errors import UserError
 
-#: In the order in which ``lag-envs --help`` tells of them.
+#: In the order of ``lag-envs --help``.
 COMMANDS: tuple[Command, ...] = (
     LIST, INFO, BENCH, ORDER, REPORT, PLAY, WATCH, NEW, COMPLETION, HYPERPARAMS, EXPORT, VERIFY, REPLAY,
     CACHE, LEADERBOARD,
 )  # fmt: skip
 
 EXAMPLES = """examples:
-  lag-envs list                      what environments there are
-  lag-envs info PivotedBar-v0        all about one of them
-  lag-envs play PivotedBar-v0        drive it
-  lag-envs watch PivotedBar-v0       see how it is done
+  lag-envs list                      list the environments
+  lag-envs info PivotedBar-v0        describe one of them
+  lag-envs play PivotedBar-v0        drive it yourself
+  lag-envs watch PivotedBar-v0       watch an agent do it
   lag-envs new my_scene.py           start one of your own
-  lag-envs bench --quick             how fast they are, beside others
-  lag-envs report --quick            how accurate they are, beside others
-  lag-envs leaderboard list          who is best at them
+  lag-envs bench --quick             compare their speed with others
+  lag-envs report --quick            compare their accuracy with others
+  lag-envs leaderboard list          see who is best at them
   lag-envs bench --help              more about one command"""
 
 
 def parser(command_name: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of the whole command; given a subcommand, only its arguments are declared."""
+    """Return the parser of the whole command; only the given subcommand's arguments are declared, if any."""
     whole = argparse.ArgumentParser(
         prog="lag-envs",
         description="Mechanics as Gymnasium environments, stepped to near machine precision.",
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # The reader, such as `head`, has left; nothing more is to be written, at exit either.
+        # The reader, such as `head`, has left; nothing more must be written, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 

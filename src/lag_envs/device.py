@@ -1,7 +1,7 @@
 """Environments of one task whose whole step runs on a GPU, one thread for each; see `lag_envs.torch`.
 
-The kernels are those of `lag_envs.envs.kernels`. What compiles and starts them is a parameter: tests take any
-C++ compiler and the CPU's memory.
+The kernels are those of `lag_envs.envs.kernels`. The function that compiles and starts them is a parameter:
+tests use any C++ compiler and the CPU's memory.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Tensor = torch.Tensor
 #: Starts a kernel: its name, number of environments, arguments.
 Launch = Callable[..., None]
 Load = Callable[[str, torch.device, bool], Launch]
-#: As good as no limit of steps.
+#: Practically no limit of steps.
 ENDLESS = 2**62
 
 
@@ -39,17 +39,17 @@ class DeviceEnvs:
     task, num_envs, device, dtype, **options
         See `lag_envs.torch.TorchVectorEnv`.
     load : callable, optional
-        Compiles the kernels' text and returns what starts them.
+        Compiles the kernels' text and returns a function that starts them.
 
     Attributes
     ----------
     rows : Tensor, shape (n_rows, num_envs)
-        What is kept of the environments: states, targets and controls among it.
+        The numbers kept of the environments, including states, targets and controls.
 
     Raises
     ------
     ValueError
-        For tasks and options that no kernel has, with the remedy.
+        For tasks and options that kernels do not support; the message gives the remedy.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class DeviceEnvs:
         )
         if not isinstance(sample, LagrangianVectorEnv):
             raise ValueError(f"{name} cannot be on a GPU: it is not an environment of this package")
-        #: One environment on the CPU, which knows task, spaces and modes.
+        #: One environment on the CPU, which provides task, spaces and modes.
         self.sample: LagrangianVectorEnv = sample
         if sample.render_mode or sample.diagnostics:
             raise ValueError("a GPU has neither render_mode nor diagnostics; leave them out")
@@ -107,17 +107,17 @@ class DeviceEnvs:
 
     @property
     def state(self) -> Tensor:
-        """The states, shape (num_envs, n_state): memory that the next step writes."""
+        """The states, shape (num_envs, n_state): memory that the next step overwrites."""
         return self.rows[self._states].T
 
     @property
     def target(self) -> Tensor:
-        """The targets, shape (num_envs, n_targets), as `state`."""
+        """The targets, shape (num_envs, n_targets), in the same way as `state`."""
         return self.rows[self._targets].T
 
     @property
     def control(self) -> Tensor:
-        """The controls applied last, shape (num_envs, n_controls), as `state`."""
+        """The controls applied last, shape (num_envs, n_controls), in the same way as `state`."""
         return self.rows[self._controls].T
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Tensor:
@@ -196,7 +196,7 @@ class DeviceEnvs:
         return found.to(self.device)
 
     def _given(self, name: str, values: Any, width: int, mask: Tensor, check: Callable) -> Tensor | None:
-        """Return starts that were given, those of the mask checked, as the kernels take them."""
+        """Return given starts in the form that kernels take, checked for the environments of the mask."""
         if values is None:
             return None
         array = torch.as_tensor(values).detach().to("cpu", torch.float64).numpy()
@@ -210,13 +210,13 @@ class DeviceEnvs:
 
 
 def load_nvrtc(source: str, device: torch.device, single: bool) -> Launch:
-    """Compile kernels for a GPU; return what starts them on its current stream."""
+    """Compile kernels for a GPU; return a function that starts them on its current stream."""
     major, minor = torch.cuda.get_device_capability(device)
     target, options = f"sm_{major}{minor}", () if single else APART[:1]
     parts = repr((source, target, options, nvrtc.version()))
     code = kept("kernels", parts, lambda: nvrtc.compiled(source, target, options))
     with torch.cuda.device(device):
-        torch.cuda.synchronize()  # makes the context in which the module is loaded
+        torch.cuda.synchronize()  # creates the context in which the module is loaded
         module = nvrtc.Module(code)
 
     def launch(name: str, count: int, *arguments: Any) -> None:
@@ -227,14 +227,14 @@ def load_nvrtc(source: str, device: torch.device, single: bool) -> Launch:
 
 
 def address(argument: Tensor | int | None) -> int:
-    """Return a kernel's argument as a whole number: a tensor's memory, a number, or no memory."""
+    """Return a kernel's argument as an integer: a tensor's address, a number, or a null pointer."""
     if argument is None:
         return 0
     return argument.data_ptr() if isinstance(argument, Tensor) else argument
 
 
 def checked_device(device: str | torch.device) -> torch.device:
-    """Return an NVIDIA GPU that is there, with its number, or raise a ValueError."""
+    """Return an available NVIDIA GPU, with its number, or raise a ValueError."""
     found = torch.device(device)
     if found.type != "cuda":
         raise ValueError(f"device must be 'cpu' or 'cuda', got {str(device)!r}")

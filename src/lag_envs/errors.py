@@ -1,24 +1,24 @@
-"""The error that commands show as they are, and hints for names that do not exist."""
+"""The error that commands show without a traceback, and hints for names that do not exist."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class UserError(Exception):
-    """A mistake of the user's; its text is shown, without a traceback."""
+    """A user's mistake; only its text is shown, without a traceback."""
 
 
 def hint(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return which of the known names might be meant, or where to find them.
+    """Return the known names that might be meant, or where to find them.
 
     Parameters
     ----------
     name : str
         The unknown name.
     known : iterable of str
-        Those that there are.
+        The names that exist.
     otherwise : str, optional
-        What to say where none is close; by default all known names.
+        The text if no name is close; by default all known names.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""What there is to know about a task of the general contract, as text; the command ``lag-envs info``."""
+"""Facts about a task of the general contract, as text; the command ``lag-envs info``."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _indented(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _description(task: Task) -> str:
-    """Return what the class's docstring says, up to its tables."""
+    """Return the class's docstring up to its tables."""
     text = inspect.getdoc(type(task)) or ""
     summary, _, rest = text.partition("\n\n## Description\n\n")
     return (
@@ -105,13 +105,13 @@ def _parameters(task: Task) -> list[tuple[str, ...]]:
     return [
         *rows,
         ("show_arrows", "False", "forces in pictures"),
-        ("show_trail", "0 s", "the way of the last seconds in pictures"),
+        ("show_trail", "0 s", "length of the bodies' trails in pictures"),
         ("show_readout", "False", "time, return, score, controls and state below pictures"),
     ]
 
 
 def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
-    """Yield the corners of the starts' box, or some of many, each with the controls at both ends."""
+    """Yield the corners of the starts' box, or a sample if there are many, with controls at both limits."""
     boxes = list(zip(task.centre, task.half_widths, strict=True))
     ends = {a.control: (a.low, a.high) for a in task.formulas.acting}
     for side in (0, 1):
@@ -122,7 +122,7 @@ def _edges(task: Task) -> Iterator[tuple[list[float], list[float]]]:
 
 
 def _accuracy(task: Task) -> list[str]:
-    """Say what is proved of steps from the edges of the starts under the largest controls."""
+    """Describe the proved accuracy of steps from the edges of the starts under the largest controls."""
     scene: Any = task.scene
     found, refused = [], 0
     for state, held in _edges(task):
@@ -151,7 +151,7 @@ def _accuracy(task: Task) -> list[str]:
         shown, rate = math.floor(10.0 * speed) / 10.0, f"{scene._layout.free[0]}_dot"
         lines += [f"one substep is certified up to |{rate}| = {shown:g} rad/s, whatever the control"]
     elif speed is not None:
-        lines += ["no step is certified for one substep: the number follows from the bound before each step"]
+        lines += ["no speed is certified for one substep: the bound before each step decides their number"]
     if refused:
         lines += [f"{refused} of these steps are refused: take a smaller dt or milder parameters"]
     return lines

@@ -1,10 +1,10 @@
-"""Parts of documents that commands write."""
+"""Parts of documents that commands generate."""
 
 from __future__ import annotations
 
 
 def replaced(text: str, name: str, block: str) -> str:
-    r"""Return the text with what stands between two marks replaced.
+    r"""Return the text with the part between two marks replaced.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The machine that measures: what results note of it, and how its libraries are kept to one thread."""
+"""The machine that measures: its description in results, and how its libraries are limited to one thread."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-#: Environment of a process that measures, or works beside others: no library may start threads.
+#: Environment variables of a process that measures, or works beside others: no library may start threads.
 ONE_THREAD = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
     "JAX_PLATFORMS": "cpu",
@@ -41,7 +41,7 @@ def usable_cores() -> int:
 
 
 def installed(libraries: Iterable[str]) -> dict[str, str]:
-    """Return the versions of those libraries that are installed."""
+    """Return the versions of the libraries that are installed."""
     found = {}
     for name in libraries:
         with suppress(PackageNotFoundError):

@@ -1,6 +1,6 @@
 """Hyperparameters of learners: of Stable-Baselines3's in the form of the RL Zoo, and of our own.
 
-A task says what differs for it (`Task.hyperparameters`). Measured at these steps; see docs/agents.md.
+A task states its own deviations (`Task.hyperparameters`). Measured with these steps; see docs/agents.md.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 DISCRETISE = "gymnasium.wrappers.DiscretizeAction"
-#: Learners that the Zoo does not know.
+#: Learners that the Zoo does not have.
 OWN = ("fast_ppo", "shac", "cloning")
-#: Those that learn from a memory of steps. A task may say what differs for all of them, as "off_policy".
+#: Learners with a replay buffer. A task may state deviations for all of them, as "off_policy".
 OFF_POLICY = ("sac", "td3", "tqc")
-#: One update of 256 steps for 16 new ones, as quick as that may be. Noise is kept for some steps.
+#: One update of 256 steps for 16 new ones, for speed. Noise is kept for some steps.
 _OFF_POLICY: Mapping[str, Any] = {
     "n_envs": 16,
     "n_timesteps": 1e5,
@@ -28,11 +28,11 @@ _OFF_POLICY: Mapping[str, Any] = {
     "tau": 0.02,
 }
 _POLICY: Mapping[str, Any] = {"net_arch": [64, 64], "noise_steps": 8, "first_layer_scale": 3.0}
-#: By learner what any task is trained with.
+#: For each learner, the hyperparameters for any task.
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
-    # Exploration by noise that depends on the state (gSDE) and is kept for some steps moves the bar where
-    # noise drawn anew at each step averages out. Observations are of order one already; rewards are scaled by
-    # their running spread.
+    # Exploration uses noise that depends on the state (gSDE) and is kept for some steps; it moves the bar,
+    # whereas noise drawn anew at each step averages out. Observations are of order one already; rewards are
+    # scaled by their running spread.
     "ppo": {
         "n_envs": 64,
         "n_timesteps": 5e5,
@@ -73,7 +73,7 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         # With 25 quantiles, the library's default, an update takes two and a half times as long.
         "policy_kwargs": {**_POLICY, "n_quantiles": 10},
     },
-    # For choices; a control of another kind is cut into 9 by Gymnasium's wrapper.
+    # For discrete actions; a continuous control is split into 9 by Gymnasium's wrapper.
     "dqn": {
         **_OFF_POLICY,
         "policy": "MlpPolicy",
@@ -87,8 +87,8 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
         "env_wrapper": [{DISCRETISE: {"bins": 9}}],
         "policy_kwargs": {"net_arch": [128, 128]},
     },
-    # PPO in one file (agents/ppo.py), whose settings these are. Weights of the first layer are multiplied at
-    # the start, for otherwise observations of order one hardly bend its tanh.
+    # PPO in one file (agents/ppo.py), with the settings below. The initial weights of the first layer are
+    # multiplied, because observations of order one would otherwise hardly leave the linear part of its tanh.
     "fast_ppo": {
         "n_timesteps": 4e5,
         "n_envs": 64,
@@ -153,15 +153,15 @@ def learners() -> list[str]:
 
 
 def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
-    """Return what a learner is trained with on a task.
+    """Return a learner's hyperparameters for a task.
 
     Parameters
     ----------
     learner : str
         One of `learners`.
     task : Task
-        The task. Where its actions are choices, none are numbered and none explored by gSDE; our own learners
-        look after that themselves.
+        The task. Discrete actions are not discretised again, nor explored by gSDE; our own learners take
+        care of that themselves.
     """
     families = ["off_policy"] * (learner in OFF_POLICY) + [learner]
     found = dict(DEFAULTS[learner])
@@ -175,7 +175,7 @@ def hyperparameters(learner: str, task: Any) -> dict[str, Any]:
 
 
 def as_yaml(learner: str, tasks: Mapping[str, Any]) -> str:
-    """Return the hyperparameters of tasks, by id, as a file of the RL Zoo or for ``--config``."""
+    """Return the hyperparameters of tasks, by id, as a file for the RL Zoo or for ``--config``."""
     use = "for `python -m agents.train --config`" if learner in OWN else "in the form of the RL Zoo"
     lines = [f"# {learner.upper()}, {use}."]
     for env_id, task in tasks.items():
@@ -185,7 +185,7 @@ def as_yaml(learner: str, tasks: Mapping[str, Any]) -> str:
 
 
 def _yaml(value: Any) -> str:
-    """Return a value in YAML's flow style, which is JSON's but for numbers such as 1e-05."""
+    """Return a value in YAML's flow style, which is that of JSON except for numbers such as 1e-05."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name}: {_yaml(each)}" for name, each in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Compiles and starts kernels on an NVIDIA GPU, by the bindings that come with PyTorch's builds for CUDA."""
+"""Compiles and starts kernels on an NVIDIA GPU, using the bindings that come with CUDA builds of PyTorch."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-#: Threads of a block: each of them has a whole environment in its registers, so few blocks fit at once.
+#: Threads per block: each has a whole environment in its registers, so few blocks fit at once.
 BLOCK = 128
 
 
@@ -19,14 +19,14 @@ def version() -> tuple[int, int]:
 
 
 def compiled(source: str, architecture: str, options: tuple[str, ...] = ()) -> bytes:
-    """Return a GPU's machine code of a C++ text.
+    """Return a GPU's machine code for a C++ text.
 
     Parameters
     ----------
     source : str
         The text.
     architecture : str
-        For which GPUs, such as ``"sm_90"``.
+        The GPUs' architecture, such as ``"sm_90"``.
     options : tuple of str
         Further options of NVRTC.
 
@@ -35,7 +35,7 @@ def compiled(source: str, architecture: str, options: tuple[str, ...] = ()) -> b
     ModuleNotFoundError
         Without `cuda.bindings`.
     RuntimeError
-        With the compiler's messages, where the text cannot be compiled.
+        With the compiler's messages, if the text cannot be compiled.
     """
     _, nvrtc = _bindings()
     program = _checked(nvrtc.nvrtcCreateProgram(source.encode(), b"environment.cu", 0, [], []))
@@ -52,12 +52,12 @@ def compiled(source: str, architecture: str, options: tuple[str, ...] = ()) -> b
 
 
 class Module:
-    """Machine code on the GPU whose context is current.
+    """Machine code on the GPU of the current context.
 
     Parameters
     ----------
     code : bytes
-        What `compiled` returned.
+        The result of `compiled`.
     """
 
     def __init__(self, code: bytes) -> None:
@@ -76,15 +76,15 @@ class Module:
         count : int
             Number of threads.
         stream : int
-            Address of the stream; what was given to it earlier comes first.
+            Address of the stream; its earlier work is done first.
         arguments : sequence of int
-            Addresses and whole numbers of 64 bits.
+            Addresses and 64-bit integers.
         """
         if name not in self._kernels:
             self._kernels[name] = _checked(self._driver.cuModuleGetFunction(self._module, name.encode()))
         given = tuple(arguments), (ctypes.c_longlong,) * len(arguments)
         grid, block = (-(-count // BLOCK), 1, 1), (BLOCK, 1, 1)
-        _checked(self._driver.cuCtxPushCurrent(self._context))  # another thread may have none
+        _checked(self._driver.cuCtxPushCurrent(self._context))  # another thread may not have a context
         try:
             _checked(self._driver.cuLaunchKernel(self._kernels[name], *grid, *block, 0, stream, given, 0))
         finally:
@@ -104,7 +104,7 @@ def _bindings() -> tuple[Any, Any]:
 
 
 def _checked(result: tuple) -> Any:
-    """Return what a function of the bindings found, or raise a RuntimeError with its status."""
+    """Return the result of a function of the bindings, or raise a RuntimeError with its status."""
     status, *found = result
     if status.value:
         raise RuntimeError(f"CUDA reports {status.name}")

@@ -1,4 +1,4 @@
-"""What the order of the series costs in a task's own episodes: ``lag-envs order``."""
+"""The cost of each order of the series in a task's own episodes: ``lag-envs order``."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lag_envs.envs.vector import LagrangianVectorEnv
 from lag_envs.errors import UserError
 from lag_envs.stepping.series import LARGEST_ORDER
 
-#: An odd order takes the work of the next even one.
+#: Even orders only: an odd one takes as much work as the next even one.
 ORDERS = tuple(range(6, LARGEST_ORDER + 1, 2))
-#: A lower order is preferred to one that is faster by less than this: times differ that much by chance.
+#: A lower order is preferred to one that is faster by less than this factor, which is within the noise.
 SAME = 1.02
 
 
@@ -24,10 +24,10 @@ def measure(
     steps: int = 20,
     advance: Callable[[], Any] = lambda: None,
 ) -> dict[int, float]:
-    """Return the time of a step [ns] by the order of the series.
+    """Return the time of a step [ns] for each order of the series.
 
-    One batch goes on and on under random actions, its episodes restarted as they end; each round steps it by
-    every order in turn. Whatever the order, each step is certified to the same tolerance.
+    One batch continues under random actions, with its episodes restarted as they end; each round steps it
+    with every order in turn. With any order, each step is certified to the same tolerance.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def measure(
     num_envs : int
         Size of the batch.
     rounds, steps : int
-        Samples, and steps of one of them.
+        Number of samples, and steps of each.
     advance : callable
         Called after each sample.
     """
@@ -49,7 +49,7 @@ def measure(
     envs.reset(seed=0)
     envs.action_space.seed(0)
     actions = [envs.action_space.sample() for _ in range(64)]
-    # Episodes are to have come of different ages before anything is measured.
+    # Let the ages of the episodes spread before measuring.
     for action in actions * max(1, min(8, round(envs.task.limit / 64))):
         envs.step(action)
     samples: dict[int, list[float]] = {order: [] for order in ORDERS}
@@ -66,13 +66,13 @@ def measure(
 
 
 def best(times: dict[int, float]) -> int:
-    """Return the lowest order that takes no more time than the fastest, but for chance."""
+    """Return the lowest order whose time does not differ from the fastest by more than noise."""
     fastest = min(times.values())
     return next(order for order, taken in times.items() if taken <= SAME * fastest)
 
 
 def lines(task: type[Any], times: dict[int, float], now: int) -> Sequence[str]:
-    """Return the table, and what to write into the task."""
+    """Return the table, and the advice for the task."""
     found = best(times)
     rows = [f"{order:5}  {taken:8.1f}  {taken / times[found]:5.2f}" for order, taken in times.items()]
     if times[now + now % 2] <= SAME * times[found]:

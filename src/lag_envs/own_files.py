@@ -1,6 +1,6 @@
-"""Scenes and tasks of a user's own file, for the commands: ``FILE`` or ``FILE:Class`` in place of an id.
+"""Scenes and tasks in users' own files, for the commands: ``FILE`` or ``FILE:Class`` in place of an id.
 
-Loading a file runs its code. The leaderboard has no path here.
+Loading a file runs its code. The leaderboard never does this.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GUIDE = "docs/tutorial.md and examples/ball_on_beam.py show how"
 
 
 def is_file(name: str) -> bool:
-    """Tell whether a name on the command line means a file, and not an id.
+    """Tell whether a name on the command line is a file rather than an id.
 
     Examples
     --------
@@ -33,7 +33,7 @@ def is_file(name: str) -> bool:
 
 
 def split(name: str) -> tuple[str, str]:
-    r"""Return path and class; on Windows a path may have a colon of its own.
+    r"""Return path and class; on Windows a path may contain a colon itself.
 
     Examples
     --------
@@ -51,7 +51,7 @@ def load(path: str) -> ModuleType:
     Raises
     ------
     UserError
-        Where there is no such file, it is no Python, or it fails; with the line.
+        If there is no such file, or it is not Python, or fails; with the line.
     """
     file = Path(path)
     if file.is_dir():
@@ -65,7 +65,7 @@ def load(path: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, file)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # As for `python FILE`: what lies beside it can be imported.
+    # As for `python FILE`: modules in its folder can be imported.
     if str(file.parent) not in sys.path:
         sys.path.insert(0, str(file.parent))
     sys.modules[name] = module
@@ -77,13 +77,13 @@ def load(path: str) -> ModuleType:
     except SystemExit as error:
         del sys.modules[name]
         raise UserError(
-            f'{path} exits when it is loaded; what is only for a script goes under if __name__ == "__main__":'
+            f'{path} exits when it is loaded; put code for scripts only under if __name__ == "__main__":'
         ) from error
     return module
 
 
 def _name(file: Path) -> str:
-    """Return the name of a file's module: its own, unless another module has it."""
+    """Return the name of a file's module: the file's own, unless another module has it."""
     name = file.stem
     if not name.isidentifier():
         return "own_" + re.sub(r"\W", "_", name)
@@ -96,7 +96,7 @@ def _name(file: Path) -> str:
 
 
 def _told(path: str, file: Path, error: Exception) -> str:
-    """Say in a line what went wrong and where in the file."""
+    """Describe in one line what went wrong, and where in the file."""
     if isinstance(error, SyntaxError) and error.filename == str(file):
         return f"{path}, line {error.lineno}: {type(error).__name__}: {error.msg}"
     lines = [
@@ -135,12 +135,12 @@ def _classes(module: ModuleType) -> dict[str, type]:
 
 
 def chosen(name: str) -> dict[str, type[Any]]:
-    """Return the tasks that ``FILE`` or ``FILE:Class`` means, by name.
+    """Return the tasks of ``FILE`` or ``FILE:Class``, by name.
 
     Raises
     ------
     UserError
-        Where there are none.
+        If there are none.
     """
     path, kind = split(name)
     found = tasks(path)
@@ -158,7 +158,7 @@ def chosen(name: str) -> dict[str, type[Any]]:
 
 
 def one(name: str) -> type[Any]:
-    """Return the one task that ``FILE`` or ``FILE:Class`` means, or raise a UserError that lists them."""
+    """Return the only task of ``FILE`` or ``FILE:Class``, or raise a UserError that lists them."""
     found = chosen(name)
     if len(found) > 1:
         path = split(name)[0]
@@ -169,7 +169,7 @@ def one(name: str) -> type[Any]:
 
 
 def made(kind: type[Any], path: str) -> Any:
-    """Return a task or scene with its defaults, or raise a UserError with what its formulas lack."""
+    """Return a task or scene with its defaults, or raise a UserError with the fault in its formulas."""
     try:
         return kind()
     except (TypeError, ValueError) as error:
@@ -177,7 +177,7 @@ def made(kind: type[Any], path: str) -> Any:
 
 
 def registered(name: str) -> list[str]:
-    """Return the ids of the tasks that ``FILE`` or ``FILE:Class`` means; what has none yet gets one."""
+    """Return the ids of the tasks of ``FILE`` or ``FILE:Class``; those without an id get one."""
     import gymnasium as gym
 
     ids = []

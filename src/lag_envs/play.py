@@ -1,4 +1,4 @@
-"""Drive an environment by keys or gamepad; the command ``lag-envs play``."""
+"""Drive an environment with keys or a gamepad; the command ``lag-envs play``."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 from lag_envs.scenes import StepRefused
 from lag_envs.scores import in_words
 
-#: Keys of the controls, in order: towards the lower and towards the upper end.
+#: Keys of the controls, in order: towards the lower and the upper end.
 PAIRS = (("left", "right"), ("down", "up"), ("a", "d"), ("s", "w"))
-#: What of a gamepad does the same.
+#: The gamepad's sticks for the same controls.
 STICKS = ("left stick, to the sides", "left stick, up and down", "right stick, to the sides", "right stick")
-#: Below this a stick is at rest.
+#: A stick pushed less than this is at rest.
 DEAD = 0.12
 
 
 def keys_of(space: gym.Space) -> list[tuple[str, str]]:
-    """Return the keys that drive each number of an action; controls beyond the pairs of keys rest."""
+    """Return the keys for each number of an action; controls beyond the pairs of keys stay at rest."""
     if isinstance(space, gym.spaces.Discrete):
         count = 1
     else:
@@ -35,18 +35,18 @@ def action_of(
     rest: Sequence[float],
     sticks: Sequence[float] = (),
 ) -> Any:
-    """Return the action that the pressed keys, or else the sticks, mean.
+    """Return the action for the pressed keys, or else the sticks.
 
     Parameters
     ----------
     space : gym.Space
         The environment's actions: a Box, Discrete or MultiDiscrete.
     pressed : callable
-        Tells whether the key of a name is pressed.
+        Tells whether the key with a name is pressed.
     rest : sequence of float
-        What each number of the action is without a key; for a choice its index.
+        Each number of the action without a key; for a discrete action its index.
     sticks : sequence of float, optional
-        How far a gamepad's sticks are pushed, in [-1, 1], in the order of the pairs of keys.
+        Displacements of a gamepad's sticks, in [-1, 1], in the order of the pairs of keys.
     """
     numbers = list(rest)
     sizes = [int(space.n)] if isinstance(space, gym.spaces.Discrete) else getattr(space, "nvec", None)
@@ -57,7 +57,7 @@ def action_of(
         if pressed(down) != pressed(up):
             push = -1.0 if pressed(down) else 1.0
         if abs(push) > DEAD:
-            # From where it rests all the way to either end.
+            # From the rest value all the way to either end.
             end = low if push < 0.0 else high
             numbers[i] = numbers[i] + abs(push) * (end - numbers[i])
             numbers[i] = numbers[i] if sizes is None else float(round(numbers[i]))
@@ -67,7 +67,7 @@ def action_of(
 
 
 class Gamepad:
-    """The first gamepad there is, if any; it may come and go."""
+    """The first gamepad, if there is one; it may be plugged in or out at any time."""
 
     def __init__(self) -> None:
         import pygame
@@ -77,9 +77,9 @@ class Gamepad:
         pygame.joystick.init()
 
     def sticks(self) -> list[float]:
-        """Return how far the sticks are pushed, right and up being positive; nothing without a gamepad."""
+        """Return the displacements of the sticks, right and up positive; nothing without a gamepad."""
         pygame = self._pygame
-        # Events that tell of gamepads are those of the joystick part; keys are left to the program.
+        # Only events about gamepads, of the joystick module, are taken; keys are left to the program.
         kinds = (pygame.JOYDEVICEADDED, pygame.JOYDEVICEREMOVED)
         changed = pygame.display.get_init() and bool(pygame.event.get(kinds))
         if changed or (self._pad is None and pygame.joystick.get_count()):
@@ -95,7 +95,7 @@ class Gamepad:
         return [axis if i % 2 == 0 else -axis for i, axis in enumerate(axes)]
 
     def _find(self) -> None:
-        """Take the first gamepad there is, and say where that is another than before."""
+        """Take the first gamepad, and say so if it is another than before."""
         joystick, before = self._pygame.joystick, self._pad
         try:
             self._pad = joystick.Joystick(0) if joystick.get_count() else None
@@ -104,24 +104,28 @@ class Gamepad:
         if self._pad is not None and before is None:
             print(f"gamepad: {self._pad.get_name()}", flush=True)
         elif self._pad is None and before is not None:
-            print("the gamepad has left; the keys go on", flush=True)
+            print("gamepad unplugged; the keys still work", flush=True)
 
     def close(self) -> None:
-        """Leave the gamepad to others."""
+        """Release the gamepad."""
         self._pygame.joystick.quit()
 
 
 def resting(task: Any) -> list[float]:
-    """Return the action that comes nearest to controls of 0."""
+    """Return the action closest to controls of 0."""
     return [float(number) for number in np.atleast_1d(task.rest_action)]
 
 
 def help_of(task: Any, space: gym.Space) -> list[str]:
-    """Return what to tell whoever drives."""
+    """Return the instructions for the driver."""
     names = [acting.control for acting in getattr(task.formulas, "acting", ())] or ["control"]
     ways = zip(names, keys_of(space), STICKS, strict=False)
     lines = [f"{name}: keys {down} and {up}, or {stick}" for name, (down, up), stick in ways]
-    return [*(lines or ["nothing acts here: look on"]), "r: start anew", "q, or close the window: end"]
+    return [
+        *(lines or ["there is nothing to control: just watch"]),
+        "r: start anew",
+        "q, or close the window: end",
+    ]
 
 
 def play(id: str, *, steps: int | None = None, seed: int | None = None, **options: Any) -> list[float]:
@@ -132,7 +136,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
     id : str
         The environment.
     steps : int, optional
-        End after so many steps.
+        End after this many steps.
     seed : int, optional
         Seed of the starts.
     **options
@@ -149,7 +153,7 @@ def play(id: str, *, steps: int | None = None, seed: int | None = None, **option
     returns, total, taken = [], 0.0, 0
 
     def pressed(name: str) -> bool:
-        # Whoever closes the window ends pygame's display, and there are no keys any more.
+        # Closing the window ends pygame's display; after that there are no keys.
         return pygame.display.get_init() and bool(pygame.key.get_pressed()[pygame.key.key_code(name)])
 
     def tell(ending: str, whole: bool) -> None:

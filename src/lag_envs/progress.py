@@ -10,7 +10,7 @@ from importlib import import_module
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on a terminal, tqdm's where it is installed; yields a function that advances it."""
+    """Show a progress bar on a terminal, tqdm's if it is installed; yields a function that advances it."""
     if not sys.stderr.isatty() or not total:
         yield lambda text: None
         return

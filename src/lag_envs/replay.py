@@ -1,17 +1,18 @@
-"""A drive is its keys: links with seed and keys, and the command ``lag-envs replay`` that recomputes them.
+"""Drives as links with seed and keys, and the command ``lag-envs replay``, which recomputes them.
 
 A link ends with ``#drive=`` and seven fields between ``~``::
 
     1 ~ id ~ seed ~ keys ~ return ~ step ~ check
 
-``1`` is the version of the format. The keys are base64url without padding of a sequence of whole numbers of
-seven bits to a byte, the low ones first: for each run of equal keys a number per control, then how often. A
-number of a control in [-1, 1] counts parts of `LEVELS`, positive ones 2n, negative ones -2n - 1; a choice is
-counted alike. The return, in full, is the 16 hexadecimal digits of a double; the step is the digest of the
-script that it was made with (`lag_envs.envs.unfused`), and the check the CRC-32 of all that is before it.
+``1`` is the version of the format. The keys are the unpadded base64url of a sequence of integers, seven bits
+to a byte, low bits first: for each run of equal keys, a number per control, then the length of the run. For a
+control in [-1, 1] the number counts multiples of 1/`LEVELS`, encoded as 2n if positive and as -2n - 1 if
+negative; a discrete action is encoded in the same way. The return, in full, is the 16 hexadecimal digits of a
+double; the step is the digest of the script that made it (`lag_envs.envs.unfused`), and the check is the
+CRC-32 of everything before it.
 
 All numbers are recomputed by that script, whose bits are the same on every machine. So a claimed return is
-true or false; there is no "nearly".
+either true or false, never approximately true.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any, NamedTuple
 from lag_envs.errors import UserError, hint
 
 VERSION = 1
-#: An action in [-1, 1] is a whole number of parts of this size: exact in float32.
+#: An action in [-1, 1] is a multiple of one over this: exact in float32.
 LEVELS = 64
 #: The longest link, and the longest drive that is recomputed.
 LONGEST, MOST_STEPS = 200_000, 100_000
@@ -36,11 +37,11 @@ MARK = "drive="
 
 
 class LinkError(UserError):
-    """A link that is damaged, or none."""
+    """A damaged link, or something that is not a link."""
 
 
 class Drive(NamedTuple):
-    """What a link says.
+    """The content of a link.
 
     Attributes
     ----------
@@ -53,7 +54,7 @@ class Drive(NamedTuple):
     claimed : float
         The return that the link claims.
     step : str
-        Digest of the script that the drive was made with.
+        Digest of the script that made the drive.
     """
 
     id: str
@@ -64,20 +65,20 @@ class Drive(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """What recomputing a drive gave.
+    """The result of recomputing a drive.
 
     Attributes
     ----------
     total : float
         Its return.
     true : bool
-        Whether that is the claimed one, in every bit.
+        Whether it equals the claimed one, in every bit.
     finished : bool
-        Whether the episode ended with the last key; else somebody stopped before.
+        Whether the episode ended with the last key; otherwise the driver stopped earlier.
     terminated : bool
-        Whether it ended before its time.
+        Whether it terminated before the time limit.
     score : float or None
-        On the board's scale, where the environment has one.
+        On the board's scale, if the environment has one.
     """
 
     total: float
@@ -104,12 +105,12 @@ def write_link(drive: Drive, page: str = "") -> str:
 
 
 def read_link(link: str) -> Drive:
-    """Return what a link says.
+    """Return the content of a link.
 
     Raises
     ------
     LinkError
-        Where it is no link of a drive, or damaged; the text says what is wrong.
+        If it is not a link of a drive, or is damaged; the text says what is wrong.
     """
     if len(link) > LONGEST:
         raise LinkError(f"the link has {len(link):,} characters, at most {LONGEST:,} are read")
@@ -146,12 +147,12 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     drive : Drive or str
         The drive, or its link.
     task : Task, optional
-        The task, for an environment that is not one of the package's.
+        The task, for an environment that is not part of the package.
 
     Raises
     ------
     LinkError
-        Where the link is damaged, or holds what nobody can have driven.
+        If the link is damaged, or its drive is impossible.
     """
     from lag_envs.envs.unfused import Unfused
     from lag_envs.mechanics.algebra import FormulaError
@@ -167,7 +168,7 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
     try:
         env = Unfused(task)
     except FormulaError as error:
-        raise LinkError(f"nobody can have driven {drive.id}: {error}") from error
+        raise LinkError(f"this drive of {drive.id} is impossible: {error}") from error
     if env.program.digest != drive.step:
         raise LinkError(
             f"the drive was made with another step ({drive.step}, here {env.program.digest}), by another "
@@ -189,14 +190,14 @@ def replay(drive: Drive | str, task: Any = None) -> Replayed:
 
 
 def action_of(key: Sequence[int], task: Any) -> Any:
-    """Return the action that a step's numbers mean."""
+    """Return the action for a step's numbers."""
     if task.formulas.choices:
         return key[0] if len(task.formulas.choices) == 1 else list(key)
     return [task.formulas.largest * (n / LEVELS) for n in key]
 
 
 def keys_of(drive: Drive, task: Any) -> list[tuple[int, ...]]:
-    """Return a drive's keys, or raise a LinkError where they are none of this task."""
+    """Return a drive's keys, or raise a LinkError if they do not fit the task."""
     formulas = task.formulas
     keys = unpack(drive.keys, formulas.actions)
     choices = formulas.choices or (None,) * formulas.actions
@@ -212,7 +213,7 @@ def keys_of(drive: Drive, task: Any) -> list[tuple[int, ...]]:
 
 
 def pack(keys: Iterable[Sequence[int]]) -> str:
-    """Return the keys of all steps, a number per control for each, as text."""
+    """Return the keys of all steps, each with a number per control, as text."""
     runs: list[list[Any]] = []
     for key in keys:
         if runs and runs[-1][0] == tuple(key):
@@ -230,7 +231,7 @@ def pack(keys: Iterable[Sequence[int]]) -> str:
 
 
 def unpack(text: str, controls: int) -> list[tuple[int, ...]]:
-    """Return the keys that a text means, or raise a LinkError.
+    """Return the keys in a text, or raise a LinkError.
 
     Examples
     --------
@@ -270,12 +271,12 @@ def _short(text: str) -> str:
 
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``replay``."""
-    parser.add_argument("link", metavar="LINK", help="the link, or what follows #; quote it")
+    parser.add_argument("link", metavar="LINK", help="the link, or its part after #; quote it")
     parser.add_argument("--file", metavar="FILE", help="the Python file of your own that has the environment")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Recompute a drive; return 0 where its claim is true, else 1."""
+    """Recompute a drive; return 0 if its claim is true, else 1."""
     drive = read_link(args.link)
     task = None
     if args.file:

@@ -59,15 +59,15 @@ def make_vec_env(env_id: str, num_envs: int, *, stagger: int = 0, **options: Any
 class VecEnv(vec_env.VecEnv):
     """A Gymnasium vector environment as Stable-Baselines3's `VecEnv`.
 
-    What it returns equals `DummyVecEnv` over the single environments, bit for bit, except that the infos of
-    environments whose episode goes on hold only what the environment reports.
+    Its results equal those of `DummyVecEnv` over the single environments, bit for bit, except that the infos
+    of environments whose episode continues hold only what the environment reports.
 
     Parameters
     ----------
     env : VectorEnv
         A vector environment that resets in the same step.
     stagger : int, default 0
-        Number of steps over which the starts of the first episodes are spread, see `lag_envs.envs.stagger`.
+        Number of steps over which the starts of the first episodes are spread; see `lag_envs.envs.stagger`.
 
     Raises
     ------
@@ -87,8 +87,8 @@ class VecEnv(vec_env.VecEnv):
     # --- stepping -------------------------------------------------------------------------------------------
 
     def reset(self) -> NDArray[np.float32]:
-        """Begin an episode in every environment, with the seeds and options that were set."""
-        seeds: Any = self._seeds  # Gymnasium's types know of one seed only
+        """Begin an episode in every environment, with the seeds and options set before."""
+        seeds: Any = self._seeds  # Gymnasium's types allow only one seed
         observations, infos = self.env.reset(seed=seeds, options=self._stacked_options())
         if self._stagger:
             seed = None if self._seeds[0] is None else int(self._seeds[0])
@@ -105,11 +105,11 @@ class VecEnv(vec_env.VecEnv):
     def step_wait(
         self,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all environments; those whose episode ended begin the next one."""
+        """Step all environments; those whose episode has ended begin the next one."""
         observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
         done = terminated | truncated
         ended = np.flatnonzero(done).tolist()
-        # The dicts are new ones, for callers may write to them; that costs some 30 ns each.
+        # New dicts, because callers may write to them; they cost some 30 ns each.
         each = self._split(infos)
         if ended:
             final = infos.get("final_info", {})
@@ -124,34 +124,34 @@ class VecEnv(vec_env.VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture of each environment, where it was made with ``render_mode="rgb_array"``."""
+        """Return a picture of each environment, if made with ``render_mode="rgb_array"``."""
         frames: Any = self.env.render() if self.render_mode is not None else None
         return [None] * self.num_envs if frames is None else list(frames)
 
     # --- attributes of the environments ---------------------------------------------------------------------
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environments; a row for each where the batch keeps an array."""
+        """Return an attribute of the environments; one row for each if the batch has an array."""
         single = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
         return self._share(getattr(self.env, single.get(attr_name, attr_name)), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of all environments: a batch has but one of each."""
+        """Set an attribute of all environments: a batch has only one of each."""
         self._all(indices, "set")
         setattr(self.env.unwrapped, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the batch, for all environments; return what it returned for each."""
+        """Call a method of the batch, for all environments; return the result for each."""
         self._all(indices, "call")
         return self._share(getattr(self.env, method_name)(*method_args, **method_kwargs), None)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
-        """Return False for each: wrappers of single environments cannot be in a batch."""
+        """Return False for each: single environments in a batch cannot be wrapped."""
         return [False for _ in self._get_indices(indices)]
 
-    # --- the rest -------------------------------------------------------------------------------------------
+    # --- internal -------------------------------------------------------------------------------------------
 
     def _stacked_options(self) -> dict[str, Any] | None:
         """Return the options of the environments as arrays of the batch."""
@@ -180,7 +180,7 @@ class VecEnv(vec_env.VecEnv):
 
 
 def _row(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Return what a vector environment's infos say about environment i: where the mask "_name" is set."""
+    """Return the part of a vector environment's infos for environment i: where the mask "_name" is set."""
     return {k: v[i] for k, v in infos.items() if not k.startswith("_") and infos[f"_{k}"][i]}
 
 
@@ -192,7 +192,7 @@ class ScaledReward(vec_env.VecEnvWrapper):
     venv : stable_baselines3.common.vec_env.VecEnv
         The environments.
     factor : float
-        What the rewards are multiplied by.
+        The factor of the rewards.
     """
 
     def __init__(self, venv: vec_env.VecEnv, factor: float) -> None:
@@ -210,7 +210,7 @@ class ScaledReward(vec_env.VecEnvWrapper):
 
 
 class DiscreteActions(vec_env.VecEnvWrapper):
-    """Numbered actions in place of numbers in [-1, 1], as Gymnasium's ``DiscretizeAction`` has them.
+    """Discrete actions in place of numbers in [-1, 1], like Gymnasium's ``DiscretizeAction``.
 
     Parameters
     ----------

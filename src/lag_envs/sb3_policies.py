@@ -1,7 +1,7 @@
 """Policies of Stable-Baselines3's SAC, TD3 and TQC that explore with noise kept for some steps.
 
-Noise that is drawn anew at each step averages out before it has moved anything heavy. Here each environment
-keeps its draw for `noise_steps` steps. Learning itself is the library's own.
+Noise drawn anew at each step averages out before it has moved anything heavy. Here each environment keeps its
+draw for `noise_steps` steps. The learning itself is the library's.
 
 `agents.train` and the RL Zoo take these policies by name, as in ``policy: lag_envs.sb3_policies.SAC``.
 """
@@ -19,22 +19,22 @@ from torch import Tensor, nn
 
 
 class _KeptNoise(BasePolicy):
-    """What the policies have in common; their networks bend by tanh unless another `activation_fn` is given.
+    """The common part of the policies; their networks use tanh unless `activation_fn` is given.
 
     Parameters
     ----------
     *args, **kwargs
-        As of the library's policy.
+        Those of the library's policy.
     noise_steps : int, default 8
         Number of steps for which noise is kept.
     first_layer_scale : float, default 3
-        By what the initial weights of observations are multiplied, in the first layers of actor and critics.
-        Otherwise observations of order one hardly bend a tanh.
+        Factor of the initial weights of observations, in the first layers of actor and critics. Without it,
+        observations of order one hardly leave the linear part of a tanh.
 
     Raises
     ------
     ValueError
-        For a number out of range.
+        For a number that is out of range.
     """
 
     actor: Any
@@ -54,7 +54,7 @@ class _KeptNoise(BasePolicy):
         super().__init__(*args, **{"activation_fn": nn.Tanh, **kwargs})
 
     def _build(self, lr_schedule: Any) -> None:
-        super()._build(lr_schedule)  # type: ignore[misc]  # the library's policies all have it
+        super()._build(lr_schedule)  # type: ignore[misc]  # all of the library's policies have it
         for actor in (self.actor, getattr(self, "actor_target", None)):
             if actor is not None:
                 self._widen(getattr(actor, "latent_pi", actor.mu))
@@ -67,7 +67,7 @@ class _KeptNoise(BasePolicy):
             network[0].weight[:, : self.actor.features_dim] *= self.first_layer_scale
 
     def _kept(self, like: Tensor) -> Tensor:
-        """Return standard normal noise of a tensor's shape, the same for some calls."""
+        """Return standard normal noise of a tensor's shape, kept for several calls."""
         if self._steps % self.noise_steps == 0 or self._noise.shape != like.shape:
             self._noise = torch.randn_like(like)
         self._steps += 1
@@ -75,7 +75,7 @@ class _KeptNoise(BasePolicy):
 
 
 class _Stochastic(_KeptNoise):
-    """A policy whose network tells the noise's spread."""
+    """A policy whose network determines the noise's standard deviation."""
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
         mean, log_std, _ = self.actor.get_action_dist_params(observation)
@@ -96,9 +96,9 @@ class TD3(_KeptNoise, TD3Policy):
     Parameters
     ----------
     *args, **kwargs
-        As of the library's policy, and as of the others here.
+        Those of the library's policy, and of the others here.
     noise : float, default 0.3
-        Standard deviation of the noise, of actions in [-1, 1].
+        Standard deviation of the noise, for actions in [-1, 1].
     """
 
     def __init__(self, *args: Any, noise: float = 0.3, **kwargs: Any) -> None:

@@ -1,6 +1,6 @@
-"""The scale on which agents are compared: 0 for the random policy, 1 for the best policy known.
+"""The scale for comparing agents: 0 for the random policy, 1 for the best policy known.
 
-The numbers belong to a version of an environment: ``-v1`` gets new ones, and these stay as they are.
+The numbers belong to a version of an environment: ``-v1`` would get new ones, and these would stay.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from lag_envs.tasks.measured import measured
 
 
 class Scale(Protocol):
-    """The mean returns that are scores 0 and 1."""
+    """The mean returns with scores 0 and 1."""
 
     @property
     def random(self) -> float:
-        """Of uniformly random actions."""
+        """Mean return of uniformly random actions."""
 
     @property
     def best(self) -> float:
-        """Of the best policy known."""
+        """Mean return of the best policy known."""
 
 
 def normalised(scale: Scale, returns: ArrayLike) -> NDArray[np.float64]:
-    """Return the scores of returns: 0 for the random policy's mean, 1 for that of the best policy known.
+    """Return the scores of returns: 0 for the random policy's mean, 1 for the best known policy's mean.
 
     Examples
     --------
@@ -40,23 +40,22 @@ def normalised(scale: Scale, returns: ArrayLike) -> NDArray[np.float64]:
 class KnownReturns(NamedTuple):
     """Known mean returns of an environment with its default parameters.
 
-    `random` and `best` are the scale. They are set once; later, more precise measurements do not change them.
-    In a clone, ``python -m agents.scale`` measures all of them again; ``lag_envs/tasks/measured.json`` has
-    both.
+    `random` and `best` define the scale. They are set once; later, more precise measurements do not change
+    them. In a clone, ``python -m agents.scale`` measures all of them again; ``lag_envs/tasks/measured.json``
+    has both.
 
     Parameters
     ----------
     random : float
-        Of uniformly random actions.
+        Mean return of uniformly random actions.
     best : float
-        Of the best policy known.
+        Mean return of the best policy known.
     error : float
         Standard error of `best` over its episodes.
     policy : str
         Name of the best policy.
     optimum : float, optional
-        The optimum, in the same episodes as `best`, where it is known. ``docs/agents.md`` has estimates where
-        it is not.
+        The optimum in the same episodes as `best`, if known. Otherwise ``docs/agents.md`` has estimates.
     """
 
     random: float
@@ -67,13 +66,13 @@ class KnownReturns(NamedTuple):
 
 
 def known_returns(env_id: str) -> KnownReturns | None:
-    """Return the known returns of an environment; None if nothing was measured."""
+    """Return the known returns of an environment; None if none were measured."""
     scale = measured(env_id).get("scale")
     return scale and KnownReturns(**scale)
 
 
 def score(env_id: str, mean_return: float) -> float | None:
-    """Return a mean return on the scale from 0, the random policy, to 1, the best policy known.
+    """Return the score of a mean return: 0 for the random policy, 1 for the best policy known.
 
     Parameters
     ----------
@@ -98,9 +97,9 @@ def score(env_id: str, mean_return: float) -> float | None:
 
 
 def share_of_privileged(env_id: str) -> float | None:
-    """Return the best policy's mean return as a share of that of the reference with privileged knowledge.
+    """Return the best policy's mean return as a share of the reference's, which has privileged information.
 
-    None for an environment that is not open (`lag_envs.tasks.record.Open`), or was not measured.
+    None if the environment is not open (`lag_envs.tasks.record.Open`), or was not measured.
 
     Examples
     --------
@@ -114,7 +113,7 @@ def share_of_privileged(env_id: str) -> float | None:
 
 
 def in_words(env_id: str, total: float, whole: bool = True) -> str:
-    """Return what an episode's return says, in words.
+    """Describe an episode's return in words.
 
     Parameters
     ----------
@@ -123,7 +122,7 @@ def in_words(env_id: str, total: float, whole: bool = True) -> str:
     total : float
         The sum of the rewards.
     whole : bool, default True
-        Whether the episode came to its end; else there is no score.
+        Whether the episode ran to its end; otherwise there is no score.
 
     Examples
     --------

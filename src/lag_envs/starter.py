@@ -1,4 +1,4 @@
-"""A scene and a task to start from; the command ``lag-envs new``."""
+"""A template of a scene and a task; the command ``lag-envs new``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def start(path: Path) -> Path:
     Raises
     ------
     UserError
-        Where the file is there already, cannot be written, or its name is none of Python's.
+        If the file exists already or cannot be written, or its name cannot be imported by Python.
     """
     if path.suffix != ".py":
         raise UserError(f"{path}: the file's name must end with .py, as in {path.stem or 'my_scene'}.py")
@@ -36,7 +36,7 @@ def start(path: Path) -> Path:
 
 
 def filled(module: str) -> str:
-    """Return the template for a module's name.
+    """Return the template, filled in for a module's name.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def filled(module: str) -> str:
     """
     name = "".join(part[:1].upper() + part[1:] for part in module.split("_")) or "Own"
     text = TEMPLATE.read_text(encoding="utf-8")
-    # The scene may not have the name of anything else in the file.
+    # The scene must not have the name of anything else in the file.
     scene = f"{name}Scene" if re.search(rf"(import|class).*\b{name}\b", text) else name
     for mark, value in (("SCENE", scene), ("NAME", name), ("MODULE", module), ("FILE", f"{module}.py")):
         text = re.sub(rf"\b{mark}\b", value, text)

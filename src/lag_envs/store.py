@@ -1,4 +1,4 @@
-"""Files that survive a kill at any moment and a full disk: written whole or not at all, or line by line."""
+"""Files that survive a full disk and a kill at any moment: written whole or not at all, or line by line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write(path: Path, data: bytes | str, sync: bool = False) -> None:
 
 
 def to_disk(path: Path) -> None:
-    """See a file, or a folder's names, to the disk."""
+    """Flush a file, or a folder's entries, to the disk."""
     if path.is_dir() and sys.platform == "win32":
         return
     file = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
@@ -37,7 +37,7 @@ def to_disk(path: Path) -> None:
 
 
 def append(path: Path, row: dict[str, Any]) -> None:
-    """Append a row of JSON to a file, on a line of its own even after one that was cut off."""
+    """Append a row of JSON to a file, on a new line even after one that was cut off."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab+") as out:
         if out.tell():
@@ -47,7 +47,7 @@ def append(path: Path, row: dict[str, Any]) -> None:
 
 
 def rows(path: Path) -> Iterator[Any]:
-    """Yield the rows of a file; lines that are cut off or damaged are passed over."""
+    """Yield the rows of a file; lines that are cut off or damaged are skipped."""
     for line in path.read_bytes().splitlines() if path.exists() else []:
         try:
             yield json.loads(line)

@@ -1,4 +1,4 @@
-"""The only printers of tables, in a terminal and in Markdown, so that the core asks for no library for it."""
+"""The only printers of tables, for terminals and in Markdown, so that the core needs no library for them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align the rows' cells; a column of numbers, but for its head, goes to the right.
+    """Align the rows' cells; columns of numbers, apart from their heads, are aligned to the right.
 
     Examples
     --------

@@ -41,16 +41,16 @@ Tensor = torch.Tensor
 
 
 class StepResult(NamedTuple):
-    """What a step leads to.
+    """The result of a step.
 
     Attributes
     ----------
     states : Tensor, shape (..., n_state)
-        The states at its end, of the given states' type.
+        The states after the step, with the type of the given states.
     observations : Tensor, shape (..., n_observations)
-        Their observations, of the actions' type.
+        Their observations, with the type of the actions.
     rewards : Tensor, shape (...)
-        The rewards, of the actions' type.
+        The rewards, with the type of the actions.
     terminated : Tensor of bool, shape (...)
         Whether the episode terminates.
     """
@@ -72,12 +72,12 @@ class Step:
     task : str or Task
         Id of an environment, or ``env.unwrapped.task``.
     **options
-        Parameters of the environment, where an id is given.
+        Parameters of the environment, if an id is given.
 
     Raises
     ------
     ValueError
-        For a task whose actions are choices, and for one with imperfect sensors or actuators.
+        For a task with discrete actions, and for one with imperfect sensors or actuators.
 
     Examples
     --------
@@ -104,7 +104,7 @@ class Step:
         states : Tensor, shape (..., n_state)
             States in the order of ``task.scene.state_names``, float32 or float64.
         actions : Tensor, shape (..., n_actions)
-            Actions; values outside their space are clipped, and then have no gradient.
+            Actions; values outside their space are clipped, and then their gradient is 0.
         targets : Tensor, shape (..., n_targets), optional
             Targets, for a task that has them and does not fix them.
 
@@ -113,7 +113,7 @@ class Step:
         ValueError, TypeError
             For tensors of another shape, type or device, or with numbers that are not finite.
         StepRefused
-            Where a step cannot be taken to full accuracy.
+            If a step cannot be taken to full accuracy.
         """
         n_state, n_actions, n_targets = self._sizes
         _check("states", states, (n_state,))
@@ -132,18 +132,18 @@ class Step:
 
 
 class TorchVectorEnv:
-    """Many environments of one task as tensors, with a `step` that can be differentiated.
+    """Many environments of one task as tensors, with a differentiable `step`.
 
     On the CPU the numbers are those of the native vector environment, bit for bit, and tensors share its
-    memory. Where the actions, or the states that earlier actions led to, require a gradient, `step` is
+    memory. If the actions, or the states that earlier actions led to, require a gradient, `step` is
     recorded: gradients flow from observations and rewards to actions, and along `state` from step to step
-    until `detach` cuts them off. No gradient flows through an episode's end into the next one.
+    until `detach` cuts them off. No gradient flows across an episode's end.
 
-    On an NVIDIA GPU one kernel takes the whole step, states stay there, and there are no gradients. In
+    On an NVIDIA GPU one kernel takes the whole step, states stay on the GPU, and there are no gradients. In
     float64 the bits are those of the unfused step, `lag_envs.envs.unfused.Unfused`. `step` does not wait for
-    the GPU, so it neither raises `StepRefused` nor complains of actions that are not finite: where a step
+    the GPU, so it neither raises `StepRefused` nor rejects actions that are not finite. Instead, if a step
     cannot be taken, the environment keeps its state, its reward is 0, and the episode is truncated;
-    ``infos["refused"]`` tells where. `state` is memory there that the next step writes.
+    ``infos["refused"]`` tells which. There, `state` is memory that the next step overwrites.
 
     Parameters
     ----------
@@ -152,11 +152,11 @@ class TorchVectorEnv:
     num_envs : int
         Number of environments.
     device : str or torch.device
-        Where tensors are: ``"cpu"``, or ``"cuda"`` for an NVIDIA GPU.
+        Device of the tensors: ``"cpu"``, or ``"cuda"`` for an NVIDIA GPU.
     dtype : torch.dtype
         Type of states and rewards: float64, or on a GPU float32.
     **options
-        What ``gym.make_vec`` takes: `autoreset_mode`, parameters of the scene and of the task. They are the
+        Keywords of ``gym.make_vec``: `autoreset_mode`, parameters of the scene and of the task. They are the
         same for all environments.
 
     Attributes
@@ -169,8 +169,8 @@ class TorchVectorEnv:
     Raises
     ------
     ValueError
-        For a device that is not there, a task with imperfect sensors or actuators, and parameters that differ
-        between environments; on the CPU also for a task whose actions are choices, and for float32.
+        For an unavailable device, a task with imperfect sensors or actuators, and parameters that differ
+        between environments; on the CPU also for a task with discrete actions, and for float32.
     """
 
     envs: LagrangianVectorEnv | DeviceEnvs
@@ -215,7 +215,7 @@ class TorchVectorEnv:
 
     @property
     def model(self) -> Model:
-        """The step and its derivatives, compiled when they are needed first."""
+        """The step and its derivatives, compiled on first use."""
         if self._model is None:
             self._model = Model(self.envs.task)
         return self._model
@@ -225,8 +225,8 @@ class TorchVectorEnv:
     ) -> tuple[Tensor, dict[str, Any]]:
         """Start an episode in every environment, or in those of a mask; see `LagrangianVectorEnv.reset`.
 
-        `options` may hold tensors. A state that requires a gradient must be a leaf; then the gradients of
-        what follows reach it, but not through the observations that are returned here.
+        `options` may hold tensors. A state that requires a gradient must be a leaf; then gradients of later
+        results reach it, but not through the observations returned here.
 
         Returns
         -------
@@ -263,7 +263,7 @@ class TorchVectorEnv:
         Parameters
         ----------
         actions : Tensor, shape (num_envs, n_actions)
-            Actions, float32 or float64; finite values outside their space are clipped, and have no gradient.
+            Actions, float32 or float64; finite values outside their space are clipped; their gradient is 0.
 
         Returns
         -------
@@ -274,12 +274,12 @@ class TorchVectorEnv:
         terminations, truncations : Tensor of bool, shape (num_envs,)
             Whether episodes end.
         infos : dict
-            As Gymnasium defines them, in NumPy's arrays.
+            As Gymnasium defines them, as NumPy arrays.
 
         Raises
         ------
         ValueError, TypeError
-            For actions of another shape, type or device, or that are not finite; nothing is stepped then.
+            For actions of another shape, type or device, or that are not finite; then nothing is stepped.
         ResetNeeded, StepRefused
             As `LagrangianVectorEnv.step` does.
         """
@@ -299,7 +299,7 @@ class TorchVectorEnv:
         return *results, self._infos  # type: ignore[return-value]
 
     def detach(self) -> None:
-        """Forget how the states came about: no gradient flows to steps before this call."""
+        """Forget the history of the states: no gradient flows to steps before this call."""
         self.state = self.state.detach()
 
     def close(self) -> None:
@@ -314,7 +314,7 @@ class TorchVectorEnv:
 
 
 class _Step(torch.autograd.Function):
-    """`Step` by rows."""
+    """`Step`, on rows."""
 
     @staticmethod
     def forward(model: Model, states: Tensor, actions: Tensor, targets: Tensor) -> tuple[Tensor, ...]:
@@ -391,7 +391,7 @@ class _EnvStep(torch.autograd.Function):
         envs: Any = env.envs
         ctx.model, ctx.targets = env.model, envs.target
         ctx.set_materialize_grads(False)
-        #: Those that take a step, and those whose episode goes on in the state that it leads to; None: all.
+        #: Environments that take a step, and those whose episode continues in the resulting state; None: all.
         ctx.stepped = ctx.kept = envs._read("n") >= 0.0 if envs._over else None
         observations, rewards, terminated, truncated = map(torch.from_numpy, env._advance(actions))
         if (
@@ -415,7 +415,7 @@ class _EnvStep(torch.autograd.Function):
             np.broadcast_to(0.0, shape) if seed is None else seed.detach().numpy()
             for seed, shape in zip(seeds, shapes, strict=False)
         )
-        if stepped is not None:  # what was restarted had no step
+        if stepped is not None:  # restarted environments had no step
             y, ends = (np.where(stepped[:, None], x, task.centre) for x in (y, ends))
             a = np.where(stepped[:, None], a, np.float32(0.0))
         after = ends
@@ -441,14 +441,14 @@ def _numbers(x: Tensor) -> NDArray[np.float64]:
 
 
 def _rows(model: Model, states: Tensor, actions: Tensor, targets: Tensor) -> tuple[Any, Any, Any]:
-    """Return states, actions and targets as `Model` takes them."""
+    """Return states, actions and targets in the form that `Model` takes."""
     y, a, g = map(_numbers, (states, actions, targets))
     random = model.task.formulas.targets and model.task.fixed_target is None
     return y, a[:, 0] if a.shape[1] == 1 else a, (g[:, 0] if g.shape[1] == 1 else g) if random else None
 
 
 def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> tuple[tuple, tuple]:
-    """Carry out a function of rows on batches of rows."""
+    """Apply a function of rows to batches of rows."""
     model, *tensors = given
     n = info.batch_size
     flat = [
@@ -460,20 +460,20 @@ def _over_batch(function: Callable, info: Any, in_dims: tuple, given: tuple) -> 
 
 
 def _checked_task(task: Any) -> Task:
-    """Return a task whose steps have derivatives, or raise a ValueError."""
+    """Return a task whose steps are differentiable, or raise a ValueError."""
     name = type(task).__name__
     if task.formulas.choices:
-        raise ValueError(f"{name} has a list of actions to choose from, by which no step has derivatives")
+        raise ValueError(f"{name} has a list of actions to choose from, which have no derivatives")
     if task.imperfections:
         raise ValueError(
-            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, through which there "
-            "are no derivatives; leave these keywords out, or take the id without them"
+            f"{name} has imperfect sensors, imperfect actuators or hidden parameters, which have no "
+            "derivatives; leave these keywords out, or take the id without them"
         )
     return task
 
 
 def _check(name: str, x: Any, shape: tuple[int, ...]) -> None:
-    """Raise an error unless x is a tensor of real numbers on the CPU whose shape ends like this one."""
+    """Raise an error unless x is a tensor of real numbers on the CPU whose shape ends in this one."""
     if not isinstance(x, Tensor):
         raise TypeError(f"{name} must be a tensor, got {type(x).__name__}; torch.as_tensor makes one")
     if x.device.type != "cpu":

@@ -15,23 +15,23 @@ from lag_envs.errors import UserError, hint
 from lag_envs.leaderboard.shipped import shipped
 from lag_envs.scores import in_words
 
-#: Endings of the video files that can be written.
+#: Supported extensions of video files.
 VIDEOS = (".mp4", ".gif")
-#: Pictures per second of a GIF at most: browsers show no more.
+#: Maximum pictures per second of a GIF: browsers show no more.
 GIF_RATE = 25.0
-#: Names of the agents that every task has, see `lag_envs.controllers.KNOW_NOTHING`.
+#: Names of the agents that every task has; see `lag_envs.controllers.KNOW_NOTHING`.
 ALL_HAVE = ("zero", "random")
 
 
 class Known(NamedTuple):
-    """An agent that goes by name.
+    """An agent that has a name.
 
     Attributes
     ----------
     name : str
         Its name.
     about : str
-        What it is.
+        A short description.
     """
 
     name: str
@@ -39,13 +39,13 @@ class Known(NamedTuple):
 
 
 def known(task: Any, env_id: str) -> list[Known]:
-    """Return the agents of an environment that go by name, the one that is taken by default first."""
+    """Return the named agents of an environment, the default one first."""
     found = []
     if (own := shipped().get(env_id)) is not None:
         found.append(Known(own.name, f"comes with the package, score {own.score:.3f}"))
     taken = {agent.name for agent in found}
     controllers = [*task.controllers, *ALL_HAVE]
-    if task.reference in controllers:  # by default a quick one
+    if task.reference in controllers:  # a quick one is the default
         controllers.sort(key=lambda name: name != task.reference)
     for name in controllers:
         if name not in taken:
@@ -56,7 +56,7 @@ def known(task: Any, env_id: str) -> list[Known]:
 
 
 def load(env_id: str, task: Any, name: str | None, board: Path | None = None) -> tuple[str, Any]:
-    """Return an agent's name and what acts, with the `predict` of Stable-Baselines3.
+    """Return an agent's name, and an object with the `predict` of Stable-Baselines3.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def load(env_id: str, task: Any, name: str | None, board: Path | None = None) ->
     Raises
     ------
     UserError
-        Where there is no such agent, or it is none for this environment.
+        If there is no such agent, or it does not fit this environment.
     """
     names = {agent.name.lower(): agent.name for agent in known(task, env_id)}
     name = next(iter(names.values())) if name is None else names.get(name.lower(), name)
@@ -155,7 +155,7 @@ def _model(env_id: str, path: Path) -> Any:
 
 
 class Model:
-    """A model of Stable-Baselines3 that is given the environment's own observations, and gives its actions.
+    """A Stable-Baselines3 model, given the environment's own observations and returning its actions.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ class Model:
     normalise : VecNormalize or None
         Its normalisation of observations.
     space : gym.Space
-        The environment's actions; a model that chooses among bins of them is translated.
+        The environment's actions; those of a model that chooses among bins of them are converted.
     """
 
     def __init__(self, model: Any, normalise: Any, space: gym.Space) -> None:
@@ -178,7 +178,7 @@ class Model:
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
-        """Return the action, and what a recurrent model has to remember."""
+        """Return the action, and the memory of a recurrent model."""
         seen = observation if self.normalise is None else self.normalise.normalize_obs(observation)
         action, state = self.model.predict(seen, state, episode_start, deterministic=deterministic)
         if self.centres is not None:
@@ -208,11 +208,11 @@ def watch(
     agent : object
         Anything with the `predict` of Stable-Baselines3.
     seed : int
-        Seed of the first episode; the others' follow it.
+        Seed of the first episode; later episodes use the numbers that follow.
     episodes : int, optional
-        How many; by default one in a video, and in a window until it is closed.
+        Number of episodes; by default one in a video, and in a window until it is closed.
     steps : int, optional
-        End after so many steps.
+        End after this many steps.
     video : Path, optional
         The file to write, ``.mp4`` or ``.gif``.
     **options
@@ -238,7 +238,7 @@ def watch(
 def _episode(
     env: gym.Env, agent: Any, seed: int, left: int | None, record: Any
 ) -> tuple[float, bool | None, int | None]:
-    """Play one episode; return its return, whether it came to its end (None: the window was closed)."""
+    """Play one episode; return its return, and whether it ran to its end (None: the window was closed)."""
     observation, _ = env.reset(seed=seed)
     state, start, total, over = None, np.ones(1, np.bool_), 0.0, False
     record(env)
@@ -254,7 +254,7 @@ def _episode(
 
 @contextmanager
 def recorder(video: Path | None, rate: float) -> Iterator[Any]:
-    """Give what is called after each step; for a window it tells whether that was closed."""
+    """Yield a function to call after each step; for a window it tells whether that was closed."""
     if video is None:
         import pygame
 
@@ -270,7 +270,7 @@ class Video:
     Parameters
     ----------
     path : Path
-        Where to, ``.mp4`` or ``.gif``.
+        The file, ``.mp4`` or ``.gif``.
     rate : float
         Pictures per second.
     """
@@ -284,14 +284,14 @@ class Video:
             )
         self.path, self.rate = path, rate
         self._gif = path.suffix.lower() == ".gif"
-        #: Of pictures that come faster than they can be shown, each `every`-th is kept.
+        #: If pictures come faster than they can be shown, only every `every`-th is kept.
         self._every = max(1, round(rate / (GIF_RATE if self._gif else 60.0)))
         self._count = 0
         self._writer: Any = None
         self._pictures: list[Any] = []
 
     def add(self, picture: NDArray[np.uint8]) -> None:
-        """Take a picture."""
+        """Add a picture."""
         self._count += 1
         if (self._count - 1) % self._every:
             return

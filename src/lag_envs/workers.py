@@ -1,6 +1,6 @@
-"""Functions in other processes, or on the machines of a Ray cluster: whoever dies or hangs costs only itself.
+"""Functions in other processes, or on the machines of a Ray cluster: a crash or hang costs only that work.
 
-Both managers give a function ``submit(function, *args, timeout=None)``, which returns a
+Both context managers yield a function ``submit(function, *args, timeout=None)``, which returns a
 `concurrent.futures.Future`; `outcomes` waits for many.
 """
 
@@ -27,13 +27,13 @@ class SpreadError(Exception):
 
 
 def outcomes(futures: Mapping[Future, Key]) -> Iterator[tuple[Key, Any]]:
-    """Yield what each future returned or raised, as they are finished."""
+    """Yield what each future returned or raised, in the order in which they finish."""
     for future in as_completed(futures):
         yield futures[future], future.exception() or future.result()
 
 
 def died(error: BaseException) -> str:
-    """Return in one line what became of work that raised nothing itself."""
+    """Describe in one line the end of work that raised nothing itself."""
     if (status := getattr(error, "exitcode", None)) is not None:  # Pebble's ProcessExpired
         return f"the process died, exit status {status}"
     return f"{type(error).__name__}: {error}".splitlines()[0]
@@ -41,22 +41,22 @@ def died(error: BaseException) -> str:
 
 @contextmanager
 def processes(count: int, begin: Callable | None = None, *args: Any) -> Iterator[Submit]:
-    """Give processes of one thread each, which end with this one even if it is killed.
+    """Yield a function that submits work to processes of one thread each, which cannot outlive this one.
 
     Parameters
     ----------
     count : int
-        Processes side by side.
+        Number of processes.
     begin : callable, optional
-        Called with `args` in each process before its first work. What is still running when the block is
-        left is killed.
+        Called with `args` in each process before its first work. Work still running when the block is left
+        is killed.
     """
     from pebble import ProcessPool
 
     from lag_envs.host import ONE_THREAD
 
     before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)  # a process inherits it when it starts
+    os.environ.update(ONE_THREAD)  # processes inherit it when they start
     pool = ProcessPool(
         count, context=multiprocessing.get_context("spawn"), initializer=_begin, initargs=(begin, args)
     )
@@ -89,20 +89,20 @@ def _begin(begin: Callable | None, args: Sequence[Any]) -> None:
 
 @contextmanager
 def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
-    """Give the machines of a Ray cluster; what is still running when the block is left is killed.
+    """Yield a function that submits work to a Ray cluster; work still running at the end is killed.
 
     Parameters
     ----------
     address : str
-        "auto" for a running one, "local" for one on this machine.
+        "auto" for a running cluster, "local" for one on this machine.
     modules : sequence of Path
-        Folders of modules that the machines get from here besides this package; what these import has to be
-        installed there.
+        Folders of modules that are sent to the machines, besides this package; the packages that these
+        import have to be installed there.
 
     Raises
     ------
     SpreadError
-        Where Ray is missing, or its cluster.
+        If Ray or its cluster is missing.
     """
     try:
         import ray
@@ -116,7 +116,7 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
             None if address == "local" else address, runtime_env=packages, logging_level=logging.ERROR,
             log_to_driver=False,
         )  # fmt: skip
-    except Exception as error:  # of that very class, where a busy machine's node does not start in time
+    except Exception as error:  # this very class is raised if a busy machine's node does not start in time
         raise SpreadError(f"no Ray cluster at {address!r}: {error}") from error
 
     def submit(function: Callable, *args: Any) -> Future:
@@ -129,7 +129,7 @@ def cluster(address: str, modules: Sequence[Path] = ()) -> Iterator[Submit]:
 
 
 def check_address(address: str) -> None:
-    """Raise SpreadError where nobody listens: Ray itself would try for minutes."""
+    """Raise SpreadError if nothing listens at the address: Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host:
         try:

@@ -1,9 +1,9 @@
 """Run a script of the RL Zoo on these environments (extra ``zoo``).
 
 ``python -m lag_envs.zoo record_video --algo ppo --env PivotedBar-v0 -f logs`` is
-``python -m rl_zoo3.record_video`` with the environments registered. The Zoo's ``train`` and ``enjoy`` see to
-that themselves where they are told ``--gym-packages lag_envs``; its other scripts don't know that option.
-Here all of them take it.
+``python -m rl_zoo3.record_video`` with the environments registered. The Zoo's ``train`` and ``enjoy``
+register them themselves if given ``--gym-packages lag_envs``; its other scripts lack that option. Here all of
+them accept it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Raises
     ------
     UserError
-        Where the Zoo is not installed or has no such script.
+        If the Zoo is not installed or has no such script.
     """
     parser = argparse.ArgumentParser(
         prog="python -m lag_envs.zoo",

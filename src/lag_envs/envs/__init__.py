@@ -1,1 +1,1 @@
-"""Plumbing: Gymnasium's single and vector environments, and the pictures."""
+"""Gymnasium's single and vector environments, and the pictures."""

@@ -1,4 +1,4 @@
-"""Spaces of actions, and actions as compiled code takes them."""
+"""Spaces of actions, and actions in the form that compiled code takes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lag_envs.scenes.checks import is_masked, shown
 from lag_envs.tasks.base import TaskFormulas
 
-#: Types of actions that compiled steps take.
+#: Types of actions that compiled steps take without conversion.
 AS_THEY_ARE = np.dtype(np.float32), np.dtype(np.float64)
 
 
@@ -21,14 +21,14 @@ class Actions:
     Parameters
     ----------
     formulas : TaskFormulas
-        Those of the task.
+        The task's formulas.
 
     Attributes
     ----------
     count : int
         How many numbers an action has.
     values : tuple of int
-        For actions that are chosen from lists the length of each list; empty where they lie in a box.
+        For actions chosen from lists, the length of each list; empty if actions lie in a box.
     """
 
     def __init__(self, formulas: TaskFormulas) -> None:
@@ -54,7 +54,7 @@ class Actions:
         return float(numbers[0]) if self.count == 1 else numbers
 
     def many(self, actions: Any, n: int) -> NDArray[np.floating]:
-        """Return the actions of n environments, one behind the other; or raise a ValueError."""
+        """Return the actions of n environments, one after the other; or raise a ValueError."""
         array = self._array(actions, "actions", (n, *self.shape))
         if self.values:
             self._check_choices(array, "actions")
@@ -86,7 +86,7 @@ class Actions:
 
 
 def single_number(values: NDArray[np.float64]) -> Any:
-    """Return a copy of an array, or its number where it has only one along the last axis."""
+    """Return a copy of an array, or its number if the last axis has only one."""
     if values.shape[-1] != 1:
         return values.copy()
     return float(values[0]) if values.ndim == 1 else values[..., 0].copy()

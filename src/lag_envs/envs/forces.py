@@ -1,7 +1,7 @@
-"""Arrows for what acts: controls, and the forces that a scene names.
+"""Arrows for controls, and for the forces that a scene names.
 
-Either is a generalised force along a coordinate. Where it acts, and which way, tell the poses: it pushes the
-first body that the coordinate moves, the way that the coordinate moves it.
+Each is a generalised force along a coordinate. The poses determine its point of application and direction: it
+pushes the first body that the coordinate moves, in the direction in which the coordinate moves it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from lag_envs.scenes.shapes import Arrow, Frame, Point, Pose, arc
 from lag_envs.tasks.base import Task
 
 #: Length of the arrow of the largest control, or of a force of usual size, as a share of the window; and the
-#: longest arrow, in such lengths.
+#: longest arrow, in these lengths.
 LONG, MOST = 0.22, 1.6
-#: By how much coordinates are moved to see what moves along.
+#: How far coordinates are moved to see which bodies move along.
 STEP = 1e-6
 
 
@@ -32,7 +32,7 @@ class Forces:
     task : Task
         The task.
     picture : Picture
-        Its picture; where that has arrows of its own for the controls, there are none of them here.
+        Its picture; if this has arrows for the controls already, no others are drawn.
     """
 
     def __init__(self, task: Task, picture: Picture) -> None:
@@ -60,7 +60,7 @@ class Forces:
                     yield from ((arrow, False) for arrow in self._arrow(coordinate, share, q))
 
     def _sizes(self) -> dict[str, float]:
-        """Return the usual size of each force: the largest of its unit from the middle of the starts."""
+        """Return each force's usual size: the largest in the same unit, at the middle of the starts."""
         if not self._reactions:
             return {}
         scene, found = self._scene, dict.fromkeys(self._reactions, 0.0)
@@ -79,7 +79,7 @@ class Forces:
         return {name: largest[units.get(coordinate, "")] for name, coordinate in self._reactions.items()}
 
     def _effect(self, name: str, now: Frame, q: Mapping[str, float]) -> dict[str, float]:
-        """Return along which coordinates a control acts when it has its largest size, as shares of that."""
+        """Return the coordinates on which a control acts at full size, each with its share of the force."""
         layout = self._scene._layout
         for moved in layout.prescribed:
             if moved.control == name:
@@ -113,7 +113,7 @@ class Forces:
         return given(1.0) - given(0.0) - (drag[0] - drag[1])
 
     def _arrow(self, coordinate: str, share: float, q: Mapping[str, float]) -> Iterator[Arrow]:
-        """Yield the arrow of a force along a coordinate, if that moves anything to be seen."""
+        """Yield the arrow of a force along a coordinate, if this moves anything visible."""
         share = max(-MOST, min(MOST, share))
         if not math.isfinite(share) or abs(share) < 0.02:
             return

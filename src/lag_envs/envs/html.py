@@ -1,4 +1,4 @@
-"""Environments as a notebook shows them: a picture, spaces, controls and parameters."""
+"""Environments as HTML for notebooks: a picture, spaces, controls and parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lag_envs.tasks.base import Task
 
 
 def described(task: Task, title: str, spaces: dict[str, Any], picture: NDArray[np.uint8] | None) -> str:
-    """Return what a notebook shows of an environment.
+    """Return an environment's HTML for a notebook.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def described(task: Task, title: str, spaces: dict[str, Any], picture: NDArray[n
     spaces : mapping of str to gym.Space
         Its spaces by name.
     picture : ndarray of uint8, shape (height, width, 3), or None
-        What is to be seen of it.
+        Its picture.
     """
     about = (inspect.getdoc(type(task)) or "").partition("\n")[0]
     image = ""
@@ -59,9 +59,9 @@ def described(task: Task, title: str, spaces: dict[str, Any], picture: NDArray[n
 def still(
     task: Task, state: Any = None, control: Any = 0.0, target: Any = None, *, columns: int = 1
 ) -> NDArray[np.uint8] | None:
-    """Return a picture of a state, by default the middle of the starts; None where nothing is to be seen.
+    """Return a picture of a state, by default the middle of the starts; None if there is nothing to draw.
 
-    With `columns` it is of a size for so many of them side by side.
+    With `columns`, its size allows for this many pictures side by side.
     """
     from lag_envs.envs.rendering import paint, tile_size
     from lag_envs.scenes.shapes import Frame

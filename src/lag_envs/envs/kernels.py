@@ -1,14 +1,14 @@
-"""The whole step of a batch as C++: the text that a GPU's compiler takes, and any other one.
+"""The whole step of a batch as C++, for a GPU's compiler or any other.
 
 The text consists of a task's script (`lag_envs.envs.unfused`), printed in C++, and of two kernels around it.
-``begin`` starts episodes, ``step`` takes a control step: control, guard, motion in certified substeps,
-reward, ending, kick, observation, and the start of the next episode where one is over. Each environment is
-computed by one thread, from its own numbers only. Without a GPU's compiler the kernels are loops over the
+``begin`` starts episodes. ``step`` takes a control step: control, guard, motion in certified substeps,
+reward, ending, kick, observation, and the start of the next episode if one is over. One thread computes each
+environment, from that environment's numbers only. Without a GPU's compiler the kernels are loops over the
 environments.
 
-In double precision, compiled without contraction of products and sums, all bits are those of
-`lag_envs.envs.unfused.Unfused`. In single precision the functions are those of C's library, and the series
-are as long as single precision needs.
+In double precision, compiled without contraction of products and sums, all bits agree with
+`lag_envs.envs.unfused.Unfused`. Single precision uses the functions of C's library, and series that are only
+as long as it needs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lag_envs.stepping import primitives
 from lag_envs.stepping.script import CPP, CPP_SINGLE
 from lag_envs.tasks.base import Task
 
-#: What keeps products and sums apart, where all bits matter: for NVRTC, and for compilers for processors.
+#: Flags that keep products and sums apart, when all bits matter: for NVRTC, and for processors' compilers.
 APART = ("--fmad=false", "-ffp-contract=off")
 
 _HEAD = """\
@@ -58,7 +58,7 @@ INLINE real uniform(word key, word step, word index) {{
 }}
 """
 
-# What both kernels have: `f` are the rows of one environment, of which the first KEPT are kept.
+# Shared by both kernels: `f` holds the rows of one environment; the first KEPT of them are kept.
 _KERNELS = """\
 INLINE void load(real *f, const real *rows, long long i, long long n) {
   for (int j = 0; j < KEPT; ++j) f[j] = rows[j * n + i];
@@ -169,11 +169,11 @@ class Kernels(NamedTuple):
     source : str
         The text, with the functions ``begin`` and ``step``.
     kept : int
-        Numbers that are kept of each environment, one row each.
+        Number of rows kept for each environment.
     targets, controls : slice
         Which of them are targets and controls; states come first.
     constants : tuple of float
-        What the functions take as ``k``.
+        The functions' argument ``k``.
     """
 
     source: str
@@ -189,9 +189,9 @@ def kernels_of(task: Task, single: bool = False) -> Kernels:
     Parameters
     ----------
     task : Task
-        The task; not with imperfections.
+        The task, without imperfections.
     single : bool
-        Whether in single precision.
+        Whether to use single precision.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Lines of Python, of which the compiled functions of an environment are made."""
+"""Lines of Python that make up the compiled functions of an environment."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ def next_episode(key: str, episode: str, episode_key: str) -> list[str]:
 
 
 def load(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
-    """Read rows; `at` says where one lies."""
+    """Read rows; `at` gives the place of a row."""
     return [f"{row} = {at(row)}" for row in rows]
 
 
 def store(at: Callable[[str], str], rows: Sequence[str]) -> list[str]:
-    """Write rows; `at` says where one lies."""
+    """Write rows; `at` gives the place of a row."""
     return [f"{at(row)} = {row}" for row in rows]
 
 
 def block(head: str, body: Sequence[str]) -> list[str]:
-    """Put lines under a head."""
+    """Put lines under a header."""
     return [head, *indent(body)]
 
 
 def indent(lines: Sequence[str], levels: int = 1) -> list[str]:
-    """Move lines to the right."""
+    """Indent lines."""
     return ["    " * levels + line for line in lines]
 
 

@@ -1,4 +1,4 @@
-"""A task's step as a function, for those who plan: any state, any action, no random kick, no time limit."""
+"""A task's step as a function, for planners: any state, any action, no random kick, no time limit."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from lag_envs.tasks.base import Task
 Array = NDArray[np.float64]
 
 
-#: How far states and actions are moved where guard and reward are expanded.
+#: How far states and actions are moved to expand guard and reward.
 REACH = 5e-3
 
 
 class Expansion(NamedTuple):
-    """Derivatives of a step by the m entries of state and action.
+    """Derivatives of a step with respect to the m entries of state and action.
 
     Attributes
     ----------
     slopes : ndarray, shape (n, n_state, m)
-        Of the state at the step's end.
+        Of the state after the step.
     gradient : ndarray, shape (n, m)
         Of the reward.
     curvature : ndarray, shape (n, m, m)
-        Its second derivatives, without the contribution of the motion's second derivatives.
+        Second derivatives of the reward, without the contribution of the motion's second derivatives.
     """
 
     slopes: Array
@@ -41,18 +41,18 @@ class Expansion(NamedTuple):
 
 
 class Gradient(NamedTuple):
-    """A gradient by what a step depends on.
+    """A gradient with respect to the arguments of a step.
 
     Attributes
     ----------
     states : ndarray, shape (n, n_state)
-        By the states before the step.
+        With respect to the states before the step.
     actions : ndarray, shape (n,), or (n, n_actions) where there are several
-        By the actions.
+        With respect to the actions.
     targets : ndarray, shape (n, n_targets)
-        By the targets.
+        With respect to the targets.
     parameters : ndarray, shape (n, n_parameters)
-        By the scene's parameters that were named, row by row.
+        With respect to the named parameters of the scene, row by row.
     """
 
     states: Array
@@ -65,7 +65,7 @@ class Model:
     """One step as a function: control, motion, reward and ending, from the environments' own formulas.
 
     It agrees with the environment's step to rounding, not bit for bit: an environment carries cosθ and sinθ
-    along, the model computes them from θ. It applies no random kicks; `kicked` does.
+    along, the model computes them from θ. It applies no random kicks; use `kicked` for these.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Model:
         Returns
         -------
         states : ndarray, shape (n, n_state)
-            The states at the step's end.
+            The states after the step.
         rewards : ndarray, shape (n,)
             The rewards.
         ended : ndarray of bool, shape (n,)
@@ -119,9 +119,9 @@ class Model:
         Raises
         ------
         ValueError
-            For values that are not finite or of another shape, and for a target that is missing or too much.
+            For values that are not finite or have another shape, and for a missing or superfluous target.
         StepRefused
-            Where a step cannot be taken to full accuracy.
+            If a step cannot be taken to full accuracy.
         """
         states, actions, targets = self._checked(states, actions, targets)
         n = len(states)
@@ -172,27 +172,27 @@ class Model:
         ends: Array | None = None,
         kicks: ArrayLike = 0.0,
     ) -> Gradient:
-        """Return a gradient by a step's results as one by what the step depends on.
+        """Pull a gradient back through a step (vector-Jacobian product).
 
-        This is reverse mode through clipping, guard, motion, reward and observation. docs/derivatives.md says
-        what it means at kinks and ends.
+        This is reverse mode through clipping, guard, motion, reward and observation. docs/derivatives.md
+        explains its meaning at kinks and ends.
 
         Parameters
         ----------
         states, actions, targets : array_like
             As for a step.
         by_states : array_like, shape (n, n_state)
-            The gradient by the states after the step.
+            The gradient with respect to the states after the step.
         by_observations : array_like, shape (n, n_observations)
-            By their observations.
+            The gradient with respect to their observations.
         by_rewards : array_like, shape (n,)
-            By the rewards.
+            The gradient with respect to the rewards.
         parameters : sequence of str
-            Parameters of the scene by which it is wanted.
+            Parameters of the scene with respect to which the gradient is wanted.
         ends : ndarray, shape (n, n_state), optional
-            The states after the step, before kicks, where they are known.
+            The states after the step, before kicks, if known.
         kicks : array_like, shape (n, n_state)
-            What kicks added to them. They are constants.
+            What kicks added to them, as constants.
 
         Returns
         -------
@@ -223,7 +223,7 @@ class Model:
         return Gradient(*slopes)
 
     def reverse(self, parameters: tuple[str, ...] = ()) -> Reverse:
-        """Return the step backwards, with gradients by these parameters too."""
+        """Return the reverse mode of the step, with respect to these parameters too."""
         if parameters not in self._reversed:
             self._reversed[parameters] = Reverse(self.task, parameters)
         return self._reversed[parameters]
@@ -231,9 +231,9 @@ class Model:
     def expand(self, states: ArrayLike, actions: ArrayLike, targets: ArrayLike | None = None) -> Expansion:
         """Expand one step about each state and action: its motion to first order, its reward to second.
 
-        The motion's derivatives are those of the scene's control step. Guard and reward have kinks, of which
-        a planner should see as much as lies within reach: their formulas are expanded by central differences
-        of `REACH`, along the motion so linearised. That actions beyond their space are clipped is left out.
+        The motion's derivatives are those of the scene's control step. Guard and reward have kinks, which a
+        planner should see if they lie within reach: their formulas are expanded by central differences of
+        `REACH`, along the linearised motion. The clipping of actions is ignored.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class Model:
         Returns
         -------
         Expansion
-            The derivatives by the state's entries and the actions.
+            The derivatives with respect to the state's entries and the actions.
 
         Raises
         ------
@@ -253,8 +253,7 @@ class Model:
         formulas, form, k = self.task.formulas, self.task.scene._form, self._constants
         if formulas.choices:
             raise ValueError(
-                f"{type(self.task).__name__} has a list of actions to choose from, by which no step has "
-                "derivatives"
+                f"{type(self.task).__name__} has a list of actions to choose from, which have no derivatives"
             )
         ends, _, _ = self(states, actions, targets)
         states = real_array("states", states)
@@ -298,7 +297,7 @@ class Model:
         states : array_like, shape (n, n_state)
             States at a step's end.
         draws : array_like, shape (task.draws, n)
-            The random numbers in [0, 1) on which the kick depends.
+            The random numbers in [0, 1) of the kick.
         """
         array, form = real_array("states", states), self.task.scene._form
         rows = form.lift(array) if form else tuple(array.T)
@@ -323,7 +322,7 @@ class Model:
 
 
 def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return values of a shape, or one for all; or raise a ValueError."""
+    """Return values of a shape, or one number for all of them; or raise a ValueError."""
     array = real_array(name, values)
     if array.shape not in ((), shape):
         raise ValueError(f"{name} must be one number or have shape {shape}, got {array.shape}")
@@ -331,7 +330,7 @@ def _rows(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _moves(m: int) -> Array:
-    """Return where m variables are moved for differences: not at all, by ± each, by ± each pair."""
+    """Return the displacements of m variables for differences: none, ± each, ± each pair."""
     i, j = np.triu_indices(m, 1)
     single = REACH * np.eye(m)
     pairs = single[i] + single[j]

@@ -1,17 +1,17 @@
 """From a task to compiled functions: one program for the single and for the vector environment.
 
 A program records the formulas of a task and its scene as lines of code and prints them into a few functions.
-All keep one order within a step: control, held step, reward and ending, kick, observation.
+All follow one order within a step: control, held step, reward and ending, kick, observation.
 
-Memory of one environment is a column of numbers, its rows. Kept from step to step: lifted state ``y``, target
-``g`` where there is one, control ``u``, steps taken ``n`` (in a batch, where the episode is over, minus the
-kind of its end: 1 terminated, 2 truncated, 3 both). Needed within a step: lifted state at its end ``z``,
-reward ``r``, kind of end ``over``, whether the step was an ``ordinary`` one (1; 0 special; 2 none but a
-restart), observation ``o``.
+The memory of one environment is a column of numbers, its rows. Rows kept from step to step: lifted state
+``y``, target ``g`` if there is one, control ``u``, steps taken ``n`` (in a batch, once the episode is over,
+minus the kind of its end: 1 terminated, 2 truncated, 3 both). Rows needed within a step: lifted state at its
+end ``z``, reward ``r``, kind of end ``over``, whether the step was ``ordinary`` (1; 0 special; 2 a restart
+instead of a step), observation ``o``.
 
-A batch is cut into blocks of `BLOCK` environments. The rows of a block lie behind one another at distances
-known when compiling, so the compiler sees that they do not overlap and turns the loop over a block into
-vector instructions; with one array per row it gives up on proving that. Rows needed within a step exist once
+A batch is cut into blocks of `BLOCK` environments. The rows of a block lie one after another at distances
+known at compile time, so the compiler sees that they do not overlap and turns the loop over a block into
+vector instructions; with one array per row it fails to prove that. Rows needed only within a step exist once
 for all blocks and so stay in the processor's nearest cache.
 """
 
@@ -28,7 +28,7 @@ from lag_envs.envs.lines import block, draw, function, indent, load, next_episod
 from lag_envs.stepping.compiling import BLOCK
 from lag_envs.stepping.flows import split
 
-DRAWS = 16  #: random numbers set aside for one step; `primitives.uniform` counts on it
+DRAWS = 16  #: random numbers reserved for one step; `primitives.uniform` relies on it
 SLOW = -3  #: status of a step that the fast formula does not cover
 #: The arguments of `step_blocks`.
 STEP_BLOCKS = (
@@ -37,12 +37,12 @@ STEP_BLOCKS = (
 
 
 def constants_of(task: Any) -> dict[str, float]:
-    """Return every number that a task's compiled functions take, by name."""
+    """Return all numbers that a task's compiled functions take, by name."""
     return task.formulas.constants()
 
 
 def program_for(task: Any, absent: frozenset[str], varying: frozenset[str] = frozenset()) -> Program:
-    """Return the program of a task: one for all tasks that differ in `constants_of` only."""
+    """Return the program of a task: the same for all tasks that differ only in `constants_of`."""
     key = (type(task), type(task.scene), task.formulas.key, absent, varying)
     if key not in _programs:
         _programs[key] = Program(task, absent, varying)
@@ -58,16 +58,16 @@ class Program:
     Parameters
     ----------
     task : Task
-        Its class and its scene's class and control decide the code; its numbers do not.
+        Its class, its scene's class and its control decide the code; its numbers do not.
     absent : frozenset of str
-        Constants that are zero in every environment that the program is for: they leave no code behind.
+        Constants that are zero in every environment of the program: they leave no code.
     varying : frozenset of str
         Constants that differ within a batch; they become rows.
     names : sequence of str, optional
         All constants; by default those of the task.
     """
 
-    #: Rows that are kept besides, and those of them and of the constants that are set when an episode begins.
+    #: Further rows that are kept, and those of them and of the constants that are set at an episode's start.
     own: Sequence[str] = ()
     drawn: Sequence[str] = ()
 
@@ -81,7 +81,7 @@ class Program:
         formulas = task.formulas
         names = names or list(formulas.constants())
         self._stepper = formulas.stepper(absent)
-        #: Whether steps are taken by the general series, block by block, and not lane by lane.
+        #: Whether steps use the general series, block by block, instead of a flow, lane by lane.
         self.general = not hasattr(self._stepper, "fast")
         if max(formulas.draws, len(formulas.state) + formulas.targets) > DRAWS:
             raise ValueError(f"a step may use {DRAWS} random numbers at most, got draws={formulas.draws}")
@@ -93,12 +93,12 @@ class Program:
         self._record(formulas, {name: 0.0 if name in absent else f"k_{name}" for name in names})
         lines = " ".join(self._printed)
         used = {"k_limit", "k_dt", *self._stepper.constants, *re.findall(r"\bk_\w+", lines)}
-        #: Names of the constants that are carried: those that are not zero, and that something uses.
+        #: Names of the constants that are carried: those that are used and not zero.
         self.constants = [name for name in names if f"k_{name}" in used]
         self.uniform = [name for name in self.constants if name not in varying]
         self.varying = [name for name in self.constants if name in varying]
-        #: Names of the rows that are kept from step to step, and of those that are needed within one. Those
-        #: of the series come first, one behind the other.
+        #: Names of the rows that are kept from step to step, and of those needed within one. The rows of the
+        #: series come first, one after the other.
         self.kept = [*self.y, *self.g, *self.u, "n", *(f"k_{name}" for name in self.varying), *self.own]
         self.flow = [f"flow_{name}" for name in self._stepper.rows] if self.general else []
         self.held = [f"held{i}" for i in range(len(self.u))]
@@ -153,7 +153,7 @@ class Program:
         self.control = self.clip + lines(control, [*self.a, *self.y, *self.g, *given], self.u)
         step = [*self.u, *self.g, *self.y, *self.z, *given]
         self.fast = [f"dt = {constants['dt']}", *([] if self.general else self._stepper.fast)]
-        #: What closed forms do without.
+        #: Closed forms do not need it.
         self._x = constants["x"] if formulas.bounded else 0.0
         if formulas.bounded:
             self.fast.insert(0, f"x = {self._x}")
@@ -172,7 +172,7 @@ class Program:
 
     @property
     def _printed(self) -> list[str]:
-        """The lines in which constants are used."""
+        """The lines that use constants."""
         parts = (self.control, self.fast, self.outcome, self.last, self.kick, self.observe, self.sample)
         return [line for part in parts for line in part]
 
@@ -183,7 +183,7 @@ class Program:
         """``step_one(f, obs, a, ids)`` to (reward, over), or to (0, SLOW) with only the rows `held` written.
 
         These are the controls of a step that the fast formula does not cover, or that was refused. The action
-        is a number where there is one, else an array.
+        is a number if it has one entry, else an array.
         """
         at = self._at_one
         body = [
@@ -213,7 +213,7 @@ class Program:
 
     @cached_property
     def finish_one(self) -> Callable:
-        """``finish_one(f, obs, ids)``: the rest of a step whose rows ``z`` were filled in by `advance`."""
+        """``finish_one(f, obs, ids)``: the rest of a step after `advance` has filled in the rows ``z``."""
         rows = load(self._at_one, [*self.y, *self.z, *self.g, *self.u, "n"])
         return function("finish_one", "f, obs, ids", [*self._constants_one(), *rows, *self._finish_one()])
 
@@ -243,7 +243,7 @@ class Program:
     def model(self) -> Callable:
         """``model(states, actions, targets, par, ends, rewards, ended)``: a step from each state, no kick.
 
-        Returns 0, or i + 1 where the step of row i was refused.
+        Returns 0, or i + 1 if the step of row i was refused.
         """
         n = self.n_state
         call = ", ".join([*self._rows, *self.y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
@@ -268,17 +268,17 @@ class Program:
 
     @property
     def _rows(self) -> list[str]:
-        """The argument that the series' `advance` has before the others."""
+        """The argument that the series' `advance` takes before the others."""
         return ["rows"] if self.general else []
 
     @property
     def room(self) -> int:
-        """Numbers that `step_one` needs behind the constants."""
+        """Numbers that `step_one` needs after the constants."""
         return self._stepper.scratch if self.general else 0
 
     @property
     def room_of_all(self) -> int:
-        """Numbers that `step_all` needs behind the constants."""
+        """Numbers that `step_all` needs after the constants."""
         return len(self.scratch) * BLOCK
 
     def _at_one(self, row: str) -> str:
@@ -316,12 +316,12 @@ class Program:
 
     @cached_property
     def step_all(self) -> Callable:
-        """A step of all environments, see `sharing.compile_step_all`."""
+        """A step of all environments; see `sharing.compile_step_all`."""
         return sharing.compile_step_all(self.bad_action, self.step_blocks)
 
     @cached_property
     def step_blocks(self) -> Callable:
-        """A step of the environments of the blocks that a thread claims, see `sharing.compile_step_all`."""
+        """A step of the environments in the blocks that a thread claims; see `sharing.compile_step_all`."""
         y, z, varying = self.y, self.z, [f"k_{name}" for name in self.varying]
         lane = "for i in range(size):"
         inputs = load(_at, [*varying, *y, *self.g, "n"])
@@ -330,7 +330,7 @@ class Program:
         controls = [*load(_at, self.a), *self.control]
         if self.general:
             rows = dict(zip(self._stepper.rows, self.flow, strict=True))
-            # The status of a lane that is to be restarted tells that it is not to be stepped.
+            # The status of a lane shows that it is to be restarted, not stepped.
             before = [
                 *inputs, *controls, *self._stepper.prepare, "status = select(n < 0.0, -1.0, 0.0)",
                 *store(_at, self.u), *(f"{_at(rows[name])} = {name}" for name in self._stepper.given),
@@ -347,7 +347,7 @@ class Program:
             call = ", ".join([*y, *self.u, "k_dt", str(self._x), *self._stepper.constants])
             again = [*load(_at, self.u), f"{', '.join(z)}, status = advance({call})"]
             helpers = [self.advance]
-        # Where the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
+        # If the fast formula does not hold, or the last reward is special, the start is kept for `redo`.
         special = " and not over > 0.0" if self.last else ""
         main = [
             *inputs, *move,
@@ -409,7 +409,7 @@ class Program:
                 "if slow > 0:", *indent(block(lane, redo)),
                 "if restarts > 0:", *indent(block(lane, restart)),
                 *block(lane, output),
-                # One loop per entry: one that writes to many arrays would have to check them for overlap.
+                # One loop per entry: a loop that writes to many arrays would have to check them for overlap.
                 *(line for entry in _observations(self.o) for line in block(lane, [entry])),
             ]),
         ]  # fmt: skip
@@ -428,9 +428,9 @@ class Program:
 
     @cached_property
     def bad_action(self) -> Callable:
-        """``bad_action(f, action, count)`` to -(i + 1) where action i is not finite, or 0."""
+        """``bad_action(f, action, count)`` to -(i + 1) if action i is not finite, or 0."""
         n = len(self.a)
-        # An environment that is to be restarted ignores its action, whatever it is.
+        # An environment that is to be restarted ignores its action.
         place = f"(i // {BLOCK}) * {BLOCK * len(self.kept)} + {BLOCK * self.kept.index('n')} + i % {BLOCK}"
         found = (f"if not (abs(action[i * {n} + {j}]) < math.inf) and f[{place}] >= 0.0:" for j in range(n))
         body = [
@@ -444,7 +444,7 @@ class Program:
         return function("bad_action", "f, action, count", [*(body if n else []), "return 0"])
 
     def _action(self, j: int) -> str:
-        """Return where action j of the environment at hand lies in the batch's array."""
+        """Return the place of action j of the current environment in the batch's array."""
         n = len(self.a)
         return "first + i" if n == 1 else f"np.uint64({n}) * (first + i) + np.uint64({j})"
 
@@ -452,7 +452,7 @@ class Program:
     def start_all(self) -> Callable:
         """``start_all(f, ids, par, obs, mask, whole, state_given, target_given, count)``.
 
-        Begins episodes where the mask is set. Writes their observations, and with `whole` everybody's.
+        Begins episodes where the mask is set. Writes their observations, and with `whole` all observations.
         """
         varying = [f"k_{name}" for name in self.varying]
         start = [
@@ -478,20 +478,20 @@ class Program:
         )
 
     def _batch(self, name: str, arguments: str, body: Sequence[str], *helpers: Callable) -> Callable:
-        """Compile a function on a batch: kept rows lie in `f`, the others behind the constants in `par`."""
+        """Compile a function on a batch: kept rows are in `f`, the others after the constants in `par`."""
 
         def place(match: re.Match) -> str:
             if match[1] in self.kept:
                 return f"f[base + np.uint64({self.kept.index(match[1]) * BLOCK}) + i]"
             return f"par[np.uint64({len(self.uniform) + self.scratch.index(match[1]) * BLOCK}) + i]"
 
-        # Indices are unsigned: a signed one might be negative, which by NumPy's rules makes a branch.
+        # Indices are unsigned: a signed one could be negative, and by NumPy's rules that needs a branch.
         lines = [re.sub(r"row_(\w+)\[i\]", place, line) for line in body]
         return function(name, arguments, lines, *helpers)
 
     @property
     def _place(self) -> list[str]:
-        """The lines that say which environments a block has."""
+        """The lines that say which environments a block contains."""
         return [
             f"first = block * np.uint64({BLOCK})",
             f"size = min(np.uint64({BLOCK}), np.uint64(count) - first)",
@@ -499,12 +499,12 @@ class Program:
 
     @property
     def _base(self) -> str:
-        """The line that says where the rows of a block lie."""
+        """The line that says where the rows of a block begin."""
         return f"base = block * np.uint64({BLOCK * len(self.kept)})"
 
 
 def _at(row: str) -> str:
-    """Return a row's number in the environment at hand; `Program._batch` says where it lies."""
+    """Return a row's number in the current environment; `Program._batch` fills in its place."""
     return f"row_{row}[i]"
 
 

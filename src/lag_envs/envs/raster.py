@@ -1,8 +1,8 @@
-"""Anti-aliased polygons in an image of bytes: each pixel takes the share of it that is covered.
+"""Anti-aliased polygons in an image of bytes: each pixel is painted according to its covered share.
 
-An outline's edges leave, in the cells of a row that they cross, how much of each lies to their right; the
-running sum along the row is the coverage, exact up to rounding. (The method is that of FreeType's and
-font-rs's rasterisers.) No library is asked for: what paints is compiled by Numba, as what steps is.
+Each edge of an outline adds, to the cells that it crosses in a row, the area to its right; the running sum
+along the row is the coverage, exact up to rounding. (This is the method of the rasterisers of FreeType and
+font-rs.) No library is needed: painting is compiled by Numba, like stepping.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from numpy.typing import NDArray
 
 from lag_envs.stepping.cache import jit
 
-#: Coverage below this is rounding, and above its rest to 1 is all.
+#: Coverage below this counts as 0, and above 1 minus this as 1.
 EDGE = 1.0 / 512.0
 
 
 def fill(
     image: NDArray[np.uint8], points: Any, ends: Any, frames: Any, poses: Any, colours: Any, room: Any
 ) -> None:
-    """Paint polygons over an image, the later ones over the earlier ones.
+    """Paint polygons over an image, later ones over earlier ones.
 
     Parameters
     ----------
     image : ndarray of uint8, shape (height, width, 3)
-        What is painted on.
+        The image to paint on.
     points : ndarray, shape (n, 2)
         Corners of all polygons, one after the other.
     ends : ndarray of int, shape (polygons,)
-        Where each one's corners end.
+        The end of each polygon's corners.
     frames : ndarray of int, shape (polygons,)
-        The frame in which each one's corners are given.
+        The frame of each polygon's corners.
     poses : ndarray, shape (frames, 6)
         For each frame (a, b, c, d, e, f), with which x = a·x' + b·y' + e and y = c·x' + d·y' + f in pixels.
     colours : ndarray, shape (polygons, 4)
         Red, green, blue from 0 to 255, and opacity from 0 to 1.
     room : ndarray, shape (height, width + 2)
-        Zeros, which it leaves as zeros.
+        Zeros; they are zeros again afterwards.
     """
     _fill(image, points, ends, frames, poses, colours, room)
 
@@ -55,7 +55,7 @@ def _fill(image: Any, points: Any, ends: Any, frames: Any, poses: Any, colours: 
         frame = frames[polygon]
         a, b, c = poses[frame, 0], poses[frame, 1], poses[frame, 2]
         d, e, f = poses[frame, 3], poses[frame, 4], poses[frame, 5]
-        # The rows and columns that are touched.
+        # The rows and columns that the polygon touches.
         left, right, top, bottom = math.inf, -math.inf, math.inf, -math.inf
         for i in range(begin, end):
             x = a * points[i, 0] + b * points[i, 1] + e
@@ -97,7 +97,7 @@ def _fill(image: Any, points: Any, ends: Any, frames: Any, poses: Any, colours: 
                 per = 1.0 / (xb - xa)
                 over = 0.0
                 for column in range(start, stop):
-                    # What of this piece of the edge's strip lies left of the cell's right end, integrated.
+                    # The part of this strip of the edge to the left of the cell's right end, integrated.
                     p, q = max(xa, float(column)), min(xb, column + 1.0)
                     covered = per * ((q - p) * (column + 1.0 - 0.5 * (p + q)) + (p - xa))
                     room[row, column] += share * (covered - over)
@@ -130,7 +130,7 @@ def _fill(image: Any, points: Any, ends: Any, frames: Any, poses: Any, colours: 
 def png(image: NDArray[np.uint8]) -> bytes:
     """Return an image (height, width, 3) as the bytes of a PNG file."""
     height, width = image.shape[:2]
-    # Each row as its difference to the one above, which is mostly nothing.
+    # Each row is stored as its difference from the one above, which is mostly zero.
     rows = np.empty((height, 1 + 3 * width), np.uint8)
     flat = np.ascontiguousarray(image).reshape(height, -1)
     rows[:, 0], rows[0, 1:], rows[1:, 1:] = 2, flat[0], flat[1:] - flat[:-1]

@@ -1,7 +1,7 @@
-"""Pictures: what a scene and its task say is to be seen, painted as the leaderboard's page paints it.
+"""Pictures of scenes and their tasks, painted in the same way as on the leaderboard's page.
 
-Shapes become outlines once, in the frames in which they lie; a moment's picture is then a place for each
-frame and one compiled call. pygame opens windows and writes the read-out, and nothing else.
+Shapes are turned into outlines once, in their frames; a picture is then a pose for each frame and one
+compiled call. pygame only opens windows and writes the read-out.
 
 ``python -m lag_envs.envs.rendering DIRECTORY`` writes a picture of every environment as PNG.
 """
@@ -36,15 +36,15 @@ from lag_envs.tasks.measured import measured
 if TYPE_CHECKING:
     import pygame
 
-#: Width and height of a picture, margin around what is to be seen, and height of the read-out [pixels].
+#: Width and height of a picture, margin around its content, and height of the read-out [pixels].
 WIDTH, HEIGHT, MARGIN, STRIP = 600, 400, 8, 48
 #: Least width of a column of the read-out [pixels].
 COLUMN = 90
 #: Side of a magnifier, as a share of the picture's shorter side, and its distance from the corner [pixels].
 GLASS, GLASS_ROOM = 0.36, 12
-#: A window shows at most so many pictures per second.
+#: A window shows at most this many pictures per second.
 RATE = 60.0
-#: A line of more dashes than this is drawn without gaps.
+#: A line with more dashes than this is drawn without gaps.
 DASHES = 2_000
 
 PAPER, STRIP_PAPER, INK = "#ffffff", "#f2f2f2", "#303030"
@@ -59,7 +59,7 @@ class Style(NamedTuple):
     dash: tuple[float, float] | None = None
 
 
-#: As the page's style sheet and painter have them, in light. The colours that carry meaning are Okabe and
+#: As in the page's style sheet and painter, in the light theme. The colours that carry meaning are Okabe and
 #: Ito's, which colour-blind people can tell apart.
 STYLES: dict[Role, Style] = {
     "body": Style("#56b4e9", "#0b5f9c", 1.5),
@@ -96,16 +96,17 @@ def _rgb(colour: str) -> tuple[float, float, float]:
 
 
 class Look(NamedTuple):
-    """What is to be seen besides shapes.
+    """What pictures show besides shapes.
 
     Attributes
     ----------
     arrows : bool
-        Arrows for controls that the scene shows none of, and for the forces that the scene names.
+        Whether to draw arrows for controls without arrows of their own, and for the forces that the scene
+        names.
     trail : float [s]
-        For how long the way of the bodies is to be seen.
+        How long the bodies' trails are.
     readout : bool
-        Whether time, return, score, controls and state stand below.
+        Whether time, return, score, controls and state are written below.
     """
 
     arrows: bool = False
@@ -119,25 +120,25 @@ class Viewer:
     Parameters
     ----------
     task : Task
-        Says, with its scene, what is to be seen.
+        The task; it decides, with its scene, what is shown.
     mode : {"human", "rgb_array"}
         Whether `draw` shows the picture in a window, in real time, or returns it.
     look : Look, optional
-        What else is to be seen.
+        What else is shown.
     size : (int, int)
         Width and height of the picture [pixels].
 
     Notes
     -----
-    A process has one window; several viewers share it side by side. When its user closes it, the
-    environments go on unseen until they are closed and rendered again.
+    A process has one window; several viewers share it side by side. If its user closes it, the environments
+    continue without a picture until they are closed and rendered again.
 
     Raises
     ------
     DependencyNotInstalled
-        Where pygame is missing, for a window or the read-out.
+        If pygame is missing, for a window or the read-out.
     Error
-        From `draw`, where there is no display for the window.
+        From `draw`, if there is no display for the window.
     """
 
     def __init__(
@@ -161,12 +162,12 @@ class Viewer:
             _desk.add(self)
 
     def use(self, task: Task) -> None:
-        """Show another task from now on: one of the same class with other parameters."""
+        """Show another task from now on, of the same class with other parameters."""
         self._task, self._picture = task, Picture(task)
         self._pen = Pen(self._picture, self._size, STRIP if self._look.readout else 0)
         self._forces = Forces(task, self._picture) if self._look.arrows else None
         self._scale = _scale(task) if self._look.readout else None
-        #: Points of each body whose way is shown; `_trail` has where they were.
+        #: Points of the bodies that leave a trail; `_trail` has their earlier places.
         self._tips = tips(self._picture) if self._look.trail else {}
 
     def draw(
@@ -193,12 +194,12 @@ class Viewer:
         total : float
             Sum of its rewards so far.
         episode : int
-            A number that another episode has not.
+            A number that is different for each episode.
 
         Returns
         -------
         ndarray of uint8, shape (height, width, 3), or None
-            The picture; None where it is shown in a window.
+            The picture; None if it is shown in a window.
         """
         if self._human and self not in _desk:
             return None
@@ -224,7 +225,7 @@ class Viewer:
         return None
 
     def close(self) -> None:
-        """Take the picture off the window; the last one closes it."""
+        """Remove the picture from the window; the last viewer closes it."""
         _desk.remove(self)
 
     @property
@@ -267,7 +268,7 @@ class Viewer:
         ]
 
     def _turn(self, state: list[float]) -> None:
-        """Integrate what turns but is not in the state; exact if its rate is linear and each step drawn."""
+        """Integrate angles that the state leaves out; exact if rates are linear and every step is drawn."""
         rate = np.array(turning(self._task.scene, state))
         if self._before is not None and self._before[0] != state:
             self._turned += 0.5 * self._task.dt * (self._before[1] + rate)
@@ -276,28 +277,28 @@ class Viewer:
     # --- real time ------------------------------------------------------------------------------------------
 
     def _is_due(self) -> bool:
-        """Tell whether to show this step: of those that follow each other faster than a window can, some."""
+        """Tell whether to show this step: if steps are faster than the window, only some are shown."""
         now = time.perf_counter()
         self._due += self._task.dt
         if not now - 0.25 < self._due:
-            self._due = now  # the first, or whoever steps was busy: what is lost is not caught up with
+            self._due = now  # at the start, and after a delay, which is not made up for
         return self._due - self._shown > 1.0 / RATE - 1e-4
 
     def _wait(self) -> None:
-        """Wait until a control interval has gone by since the step before."""
+        """Wait until one control interval after the previous step."""
         self._shown = self._due
         time.sleep(max(0.0, self._due - time.perf_counter()))
 
 
 def _scale(task: Task) -> tuple[float, float] | None:
-    """Return the returns that are scores 0 and 1; None where the task is another than theirs."""
+    """Return the returns with scores 0 and 1; None if the task's parameters are not the standard ones."""
     known, usual = measured(task.id).get("scale"), type(task)()
     same = (task.scene, task.dt, task.duration) == (usual.scene, usual.dt, usual.duration)
     return (known["random"], known["best"]) if known and same else None
 
 
 def tips(picture: Picture) -> dict[int, Point]:
-    """Return for each frame with a body the middle of what of it is farthest away from the frame's origin."""
+    """Return for each frame with a body the middle of its points farthest from the frame's origin."""
     found = {}
     for frame in dict.fromkeys(frame for frame, _ in picture.shapes):
         points: list[Point] = []
@@ -312,13 +313,13 @@ def tips(picture: Picture) -> dict[int, Point]:
 
 
 def _seen(pose: Pose, point: Point) -> Point:
-    """Return where a point of a frame is."""
+    """Return the place of a frame's point in the plane."""
     c, n, way = math.cos(pose.angle), math.sin(pose.angle), -1.0 if pose.part < 0.0 else 1.0
     return pose.x + c * point[0] - way * n * point[1], pose.y + n * point[0] + way * c * point[1]
 
 
 def paint(task: Task, now: Frame, size: tuple[int, int] = (WIDTH, HEIGHT)) -> NDArray[np.uint8]:
-    """Return a picture of a moment, of some width and height."""
+    """Return a picture of a moment, of some size."""
     shown = Picture(task)
     poses = shown.poses(now)
     image = np.full((size[1], size[0], 3), 255, np.uint8)
@@ -327,19 +328,19 @@ def paint(task: Task, now: Frame, size: tuple[int, int] = (WIDTH, HEIGHT)) -> ND
 
 
 def columns_of(tiles: int) -> int:
-    """Return how many pictures stand side by side, of so many in a grid."""
+    """Return the number of columns in a grid of this many pictures."""
     return math.ceil(math.sqrt(tiles))
 
 
 def tile_size(tiles: int) -> tuple[int, int]:
-    """Return the size of each picture of a grid: all of it is as wide as two pictures at most."""
-    # Even, as video files ask for.
+    """Return the size of each picture of a grid, which is at most as wide as two pictures."""
+    # Even numbers, which video files require.
     width, height = (max(30, size // columns_of(tiles)) * 2 for size in (WIDTH, HEIGHT))
     return min(WIDTH, width), min(HEIGHT, height)
 
 
 def tiled(pictures: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
-    """Return pictures of one size as one, row by row, with a line between them."""
+    """Return pictures of one size as a single one, row by row, with lines between them."""
     height, width = pictures[0].shape[:2]
     rows = math.ceil(len(pictures) / columns)
     image = np.full((rows * height, columns * width, 3), 255, np.uint8)
@@ -371,18 +372,18 @@ class Outline(NamedTuple):
 
 
 class Pen:
-    """Paints the shapes of a picture, of whose window an image shows as much as it can.
+    """Paints the shapes of a picture; the image shows as much of the picture's window as it can.
 
     Parameters
     ----------
     picture : Picture
-        The shapes; what it looks at moves, but keeps its size.
+        The shapes; its view may move but keeps its size.
     size : (int, int)
         Width and height of the image [pixels].
     strip : int
-        Height of what is left free below [pixels].
+        Height of the free strip below [pixels].
     glass : float, optional
-        In place of the picture's window a square with sides of so many metres, without a margin.
+        Show a square with sides of this length [m], without a margin, in place of the picture's window.
     """
 
     def __init__(
@@ -396,7 +397,7 @@ class Pen:
         self._middle = 0.5 * width, 0.5 * (height - strip)
         self._shapes = [x for x in picture.shapes if not isinstance(x[1], s.Magnifier)]
         self._lenses = [x for x in picture.shapes if isinstance(x[1], s.Magnifier)] if glass is None else []
-        #: Those of rulers, whose ticks are where one looks, are made anew for each picture.
+        #: Rulers' outlines depend on the view and are made anew for each picture.
         self._outlines = [self._outline(shape) for _, shape in self._shapes]
         self._room = np.zeros((height, width + 2))
         self._plane = len(picture.frames)
@@ -405,7 +406,7 @@ class Pen:
     def paint(
         self, image: NDArray[np.uint8], poses: Sequence[Pose], view: Window, more: Sequence[Extra] = ()
     ) -> None:
-        """Paint the shapes, and then what lies in the plane, over an image."""
+        """Paint the shapes, and then the extras in the plane, over an image."""
         places = self._places(poses, view)
         found, frames = [], []
         for (frame, shape), outline in zip(self._shapes, self._outlines, strict=True):
@@ -426,7 +427,7 @@ class Pen:
             self._magnify(image, lens, _seen(poses[frame], lens.centre), poses, places)
 
     def _places(self, poses: Sequence[Pose], view: Window) -> NDArray[np.float64]:
-        """Return how each frame, and last the plane, comes to lie on the image."""
+        """Return the maps of each frame, and last of the plane, to the image."""
         places = np.empty((len(poses) + 1, 6))
         scale, (across, down) = self.scale, self._middle
         x0, y0 = 0.5 * (view.left + view.right), 0.5 * (view.bottom + view.top)
@@ -484,7 +485,7 @@ class Pen:
         poses: Sequence[Pose],
         places: NDArray[np.float64],
     ) -> None:
-        """Show a part of the picture once more, in the upper right corner."""
+        """Show a part of the picture magnified, in the upper right corner."""
         size = round(GLASS * min(self._box))
         if size < 8:
             return
@@ -503,7 +504,7 @@ class Pen:
         self._fill(image, self._glass.rims, [0, 1], at)
 
     def _ground(self, lens: s.Magnifier, size: int) -> Glass:
-        """Return what a magnifier needs each time."""
+        """Return the parts of a magnifier that stay the same."""
         mask, rim = np.zeros((size, size, 3), np.uint8), np.array(_rim((0.5, 0.5), 0.5, 1.0 / size))
         at, white = np.array([[size, 0.0, 0.0, size, 0.0, 0.0]]), np.array([[255.0, 255.0, 255.0, 1.0]])
         none, room = np.zeros(1, np.int64), np.zeros((size, size + 2))
@@ -517,7 +518,7 @@ class Pen:
 
 
 class Glass(NamedTuple):
-    """A magnifier: its pen, how much of each pixel it covers, and the rims of it and of what it shows."""
+    """A magnifier: its pen, its coverage of each pixel, its own rim, and the rim of the magnified part."""
 
     lens: s.Magnifier
     pen: Pen
@@ -526,7 +527,7 @@ class Glass(NamedTuple):
 
 
 def _joined(polygons: Polygons) -> Outline:
-    """Return polygons as `raster.fill` takes them."""
+    """Return polygons in the form that `raster.fill` takes."""
     ends = np.array([*accumulate(len(points) for points, _ in polygons)], np.int64)
     flat = [point for points, _ in polygons for point in points]
     colours = [(*_rgb(colour), 1.0) for _, colour in polygons]
@@ -574,13 +575,13 @@ def _disc(centre: Point, radius: float, style: Style, unit: float) -> Polygons:
 
 
 def _rim(centre: Point, radius: float, unit: float) -> list[Point]:
-    """Return points of a circle, clockwise, as many as its size asks for; the last is the first."""
+    """Return points of a circle, clockwise, as many as its size needs; the last equals the first."""
     n = min(max(12, math.ceil(7.0 * math.sqrt(max(radius, 0.0) / unit))), 300)
     return s.arc(centre, radius, 0.0, -2.0 * math.pi, n)
 
 
 def _arrow(points: list[Point], style: Style, unit: float) -> Polygons:
-    """Return an arrow as long as its points say; a short one is thinner."""
+    """Return an arrow with the length of its points; a short one is thinner."""
     length, width = sum(math.dist(a, b) for a, b in pairwise(points)), unit * style.width
     if length < 1.5 * unit:
         return []
@@ -605,11 +606,11 @@ def _between(a: Point, b: Point, share: float) -> Point:
 
 
 def _aside(points: list[Point], closed: bool = False) -> list[Point]:
-    """Return for each point of a line the way to another line that runs beside it at a distance of 1."""
+    """Return for each point of a line its offset to a parallel line at a distance of 1."""
     first, last = (points[-1], points[0]) if closed else (points[0], points[-1])
     ways = []
     for (ax, ay), (bx, by) in pairwise(_normal(a, b) for a, b in pairwise([first, *points, last])):
-        # Where two pieces meet, the sum of their normals points to the corner; at an end one of them is zero.
+        # At a corner, the sum of both pieces' normals points to the corner; at an end one of them is zero.
         stretch = 1.0 / max(1.0 + ax * bx + ay * by, 0.3)
         ways.append((stretch * (ax + bx), stretch * (ay + by)))
     return ways
@@ -649,7 +650,7 @@ class _Desk:
     """The window of the process, which the viewers share."""
 
     def __init__(self) -> None:
-        # Weak, so that an environment that was dropped without being closed leaves no place behind.
+        # Weak, so that an environment that was dropped without being closed does not keep its place.
         self._viewers: weakref.WeakKeyDictionary[Viewer, None] = weakref.WeakKeyDictionary()
         self._screen: pygame.Surface | None = None
         self._places = 0
@@ -659,17 +660,17 @@ class _Desk:
 
     def add(self, viewer: Viewer) -> None:
         """Make room for a viewer."""
-        # What is registered first is called last: when the viewer is no longer among these.
+        # Finalizers registered first run last: by then the viewer is no longer among these.
         weakref.finalize(viewer, self._tidy)
         self._viewers[viewer] = None
 
     def remove(self, viewer: Viewer) -> None:
-        """Take a viewer's picture away; the last one closes the window."""
+        """Remove a viewer's picture; the last viewer closes the window."""
         self._viewers.pop(viewer, None)
         self._tidy()
 
     def _tidy(self) -> None:
-        """Close the window where nobody shows anything any more, as at the end of the program."""
+        """Close the window if no viewer is left, as at the end of the program."""
         if self._screen is not None and not self._viewers:
             self._close()
 
@@ -677,7 +678,7 @@ class _Desk:
         """Show a viewer's picture, and close the window if its user asks for it."""
         pygame, places = _pygame(), list(self._viewers)
         columns, (width, height) = math.ceil(math.sqrt(len(places))), viewer.size
-        # There is no surface either where another part of the program has closed all windows.
+        # There is also no surface if another part of the program has closed all windows.
         if self._screen is None or self._places != len(places) or pygame.display.get_surface() is None:
             rows = math.ceil(len(places) / columns)
             self._screen, self._places = _open_window(columns * width, rows * height), len(places)
@@ -686,7 +687,7 @@ class _Desk:
         self._screen.blit(surface, (column * width, row * height))
         pygame.display.flip()
         pygame.event.pump()
-        # Only this event is taken, so that a program can read keys.
+        # Only this event is taken from the queue, so that a program can read keys.
         if pygame.event.get(pygame.QUIT):
             self._viewers.clear()
             self._close()
@@ -724,13 +725,13 @@ def _text(text: str, size: int, colour: str) -> pygame.Surface:
     try:
         return _font(size).render(text, True, colour)
     except _pygame().error:
-        # Another program part has called pygame.quit(), after which fonts are void.
+        # Another part of the program has called pygame.quit(), which makes fonts invalid.
         _font.cache_clear()
         return _font(size).render(text, True, colour)
 
 
 def write_readout(image: NDArray[np.uint8], rows: Sequence[Sequence[Reading]], scale: float) -> None:
-    """Write rows of readings below a picture, in columns that do not move with the length of the numbers.
+    """Write rows of readings below a picture, in columns that do not shift with the length of the numbers.
 
     Parameters
     ----------
@@ -739,7 +740,7 @@ def write_readout(image: NDArray[np.uint8], rows: Sequence[Sequence[Reading]], s
     rows : sequence of sequence of Reading
         Two rows.
     scale : float
-        Pixels of a metre, of which a part is drawn.
+        Pixels per metre, of which a part is drawn.
     """
     pygame, (height, width) = _pygame(), image.shape[:2]
     surface = pygame.image.frombuffer(image, (width, height), "RGB")
@@ -750,7 +751,7 @@ def write_readout(image: NDArray[np.uint8], rows: Sequence[Sequence[Reading]], s
         for reading in row:
             colour = STYLES[reading.role].edge if reading.role != "frame" else INK
             value, unit = _text(_number(reading.value), 17, colour), _text(reading.unit, 17, colour)
-            # The column's width follows from what does not change.
+            # The column's width depends only on what stays the same.
             right = x + max(_name_width(reading.name) + 54, 62)
             if right + 4 + unit.get_width() > end:
                 break
@@ -794,7 +795,7 @@ def _number(value: float) -> str:
 
 
 def _draw_scale(surface: pygame.Surface, scale: float, longest: int) -> None:
-    """Draw a length and say how long it is."""
+    """Draw a scale bar with its length."""
     length = s.round_length(longest / scale)
     label = _text(f"{length:g} m", 16, INK)
     right, y = surface.get_width() - 12, surface.get_height() - 8
@@ -815,9 +816,9 @@ def write_pictures(directory: str | Path, seconds: float = 0.4, seed: int = 9) -
     Parameters
     ----------
     directory : str or Path
-        Where to; made if it does not exist.
+        Where to write; created if it does not exist.
     seconds : float, default 0.4
-        How long the control swings to and fro before [s]; an episode that ends earlier is shown as it ended.
+        How long the control swings back and forth first [s]; an episode that ends earlier shows its end.
     seed : int, default 9
         Seed of the start.
 

@@ -1,8 +1,8 @@
-"""A task's step backwards: from gradients by its results to gradients by what it depends on.
+"""Reverse mode through a task's step: from gradients of its results to gradients of its arguments.
 
 A step is control, motion, reward and observation. Each part's derivatives are recorded from its formulas
-(`lag_envs.stepping.adjoint`). Where the motion has a flow of its own, the whole is one record. Otherwise,
-and where a step of the flow is no ordinary one, there are three parts: the formulas after the motion,
+(`lag_envs.stepping.adjoint`). If the motion has a flow of its own, the whole step is one record. Otherwise,
+and for steps of the flow that are not ordinary, there are three parts: the formulas after the motion,
 `Scene.vjp`, and the formulas before it.
 """
 
@@ -25,19 +25,19 @@ from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
 
-#: Rows that go through the parts of a step together: few enough that what is between them stays in a cache.
+#: Rows that go through the parts of a step together: few enough that intermediate results stay in a cache.
 ROWS = 4096
 
 
 class Reverse:
-    """What a task computes before and after the motion, and its derivatives, for many rows.
+    """A task's formulas before and after the motion, and their derivatives, for many rows.
 
     Parameters
     ----------
     task : Task
         The task.
     parameters : tuple of str
-        Names of the scene's parameters by which derivatives are wanted.
+        Names of the scene's parameters with respect to which derivatives are wanted.
 
     Raises
     ------
@@ -50,8 +50,7 @@ class Reverse:
         self._task, self._parameters = task, parameters
         if formulas.choices:
             raise ValueError(
-                f"{type(task).__name__} has a list of actions to choose from, by which no step has "
-                "derivatives"
+                f"{type(task).__name__} has a list of actions to choose from, which have no derivatives"
             )
         constants = constants_of(task)
         self._constants = [f"k_{name}" for name in constants]
@@ -81,16 +80,16 @@ class Reverse:
         by_observations: Array,
         by_rewards: Array,
     ) -> list[Array]:
-        """Return a gradient by states, actions, targets and parameters from one by a step's results.
+        """Pull a gradient of a step's results back to states, actions, targets and parameters.
 
         Parameters
         ----------
         states, actions, targets : ndarray, shape (n, ...)
-            Where steps begin, all with two axes. What is given here is not checked.
+            The arguments of the steps, all with two axes; they are not checked.
         ends, after : ndarray, shape (n, n_state)
-            The states after the motion, and after the kick too; the same array where there was none.
+            The states after the motion, and after the kick too; the same array if there was no kick.
         by_states, by_observations, by_rewards : ndarray, shape (n, n_state), (n, n_observations), (n,)
-            The gradient by `after`, by its observations, and by the rewards.
+            The gradient with respect to `after`, its observations, and the rewards.
         """
         given = states, actions, targets, ends, after, by_states, by_observations, by_rewards[:, None]
         kicked = after is not ends
@@ -114,7 +113,7 @@ class Reverse:
     def _in_parts(
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
-        """Do what `pull` does, the motion by itself, into `out`; `rows` are what errors call the rows."""
+        """Do the same as `pull`, into `out`, with the motion as a separate part; errors name the rows by `rows`."""
         (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
         own_y, own_z, *own = self._after(kicked)(self._numbers, y, u, g, z, *rest)
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)
@@ -126,7 +125,7 @@ class Reverse:
     # --- formulas ------------------------------------------------------------------------------------------
 
     def _lanes(self, name: str, formula: Callable, *arrays: str) -> Lanes:
-        """Return a formula, compiled when it is asked for first; `arrays` are what it takes."""
+        """Return a formula, compiled on first use; `arrays` are its arguments."""
 
         def of_numbers(xp: Differentiable, numbers: dict[str, Any]) -> list[list]:
             given = {array: [numbers[name] for name in self._names[array]] for array in arrays}
@@ -172,7 +171,7 @@ class Reverse:
     def _after_of(
         self, kicked: bool, xp: Any, k: Any, y: list, u: list, g: list, z: list, e: list, **seeds: list
     ) -> list[list]:
-        """Record the way back to the motion's end, and past it: cotangents of y, z, u, g and parameters."""
+        """Record the way back to the motion's end and past it: cotangents of y, z, u, g and parameters."""
         e = e if kicked else z
         outputs = [self._reward_of(xp, k, y, u, g, z), *self._observe_of(xp, k, e, g)[0], *e]
         by = [y, z, u, g, self._parameters_of(k), e if kicked else []]
@@ -182,7 +181,7 @@ class Reverse:
         return [own_y, _sums(own_z, own_e) if kicked else own_z, *rest]
 
     def _before_of(self, xp: Any, k: Any, y: list, a: list, g: list, **found: list) -> list[list]:
-        """Record the way back from controls, and all sums: cotangents of y, a, g and parameters."""
+        """Record the way back from the controls, and all sums: cotangents of y, a, g and parameters."""
         by_y, by_u, by_p = split(found["moved"], len(y), len(found["own_u"]))
         by = [y, a, g, self._parameters_of(k)]
         bars = _sums(found["own_u"], by_u)
@@ -192,7 +191,7 @@ class Reverse:
         return [by_y, last_a, _sums(found["own_g"], last_g), by_p]
 
     def _whole_of(self, kicked: bool, xp: Any, k: Any, y: list, a: list, g: list, **rest: list) -> list[list]:
-        """Record the way back through all: cotangents of y, a, g, no parameters; 1 for ordinary steps."""
+        """Record the way back through the whole step: cotangents of y, a, g, no parameters; 1 if ordinary."""
         stepper: Any = self._task.scene._code(self._task.dt)
         (u,) = self._control_of(xp, k, y, a, g)
         own_y, own_z, own_u, own_g, _ = self._after_of(kicked, xp, k, y=y, u=u, g=g, **rest)

@@ -1,12 +1,12 @@
 """A step of a batch, shared among threads.
 
-Whoever leads a step opens a turn, by its number. The leader and helpers claim blocks of environments, each
-from another place on, so that a block mostly stays in the cache of one core. An environment's bits do not
-depend on who steps it, or when. The leader waits only for blocks that were claimed: a helper that comes late,
-or never, costs nothing but its help, and one that comes when the turn is over finds every block claimed. So
-nothing hangs, or goes wrong, by a thread that is gone after a fork.
+The thread that leads a step opens a turn, identified by its number. The leader and helpers claim blocks of
+environments, each starting from its own place, so that a block mostly stays in the cache of one core. An
+environment's bits do not depend on who steps it, or when. The leader waits only for claimed blocks: a helper
+that comes late, or never, costs only its help, and one that comes after the turn finds every block claimed.
+So nothing hangs or goes wrong if a thread is missing after a fork.
 
-Threads are Python's, for compiled code does not hold the interpreter's lock. They are started when first
+Python threads suffice, since compiled code does not hold the interpreter's lock. They are started when first
 needed, and ended before a process forks.
 """
 
@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from lag_envs.host import usable_cores
 from lag_envs.stepping.compiling import BLOCK, compile_python
 
-#: Environments for each thread, by default: fewer are stepped before another thread is awake.
+#: Environments per thread, by default: fewer would be stepped before another thread is awake.
 SHARE = 4096
-#: How often a thread looks for what another is about to do, some 50 µs, before it sleeps.
+#: How often a thread checks whether another is ready, about 50 µs in total, before it sleeps.
 PATIENCE = 200_000
-#: Numbers that threads share: the turn, blocks that are not done, episodes that are over, the environment
-#: that was refused, where the five arrays of a step lie, bytes of an action's number. Behind them, for each
-#: block, the turn in which it was claimed last; and for each share whether a helper has it.
+#: Numbers that threads share: the turn, unfinished blocks, ended episodes, the refused environment, addresses
+#: of the five arrays of a step, bytes per number of an action. After them come, for each block, the turn in
+#: which it was last claimed, and for each share whether a helper has it.
 WORDS = 10
 
 
@@ -41,7 +41,7 @@ def words(blocks: int) -> int:
 
 
 def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
-    """Note, in a copy of a batch's keys, that no helper has a share of the copy."""
+    """Mark, in a copy of a batch's keys, that no helper has a share of the copy."""
     ids[3 * count + WORDS + -(-count // BLOCK) :] = 0
 
 
@@ -49,14 +49,14 @@ def forget_helpers(ids: NDArray[np.uint64], count: int) -> None:
 
 
 def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, turn, share, shares):  # type: ignore[no-untyped-def]
-    """Take part in a turn, see `compile_step_all`."""
+    """Take part in a turn; see `compile_step_all`."""
     at, now = np.uint64(3 * count), np.uint64(turn)
     blocks = np.uint64((count + BLOCK - 1) // BLOCK)
     if share > 0:
         mine = at + np.uint64(WORDS) + blocks + np.uint64(share)
         if not atomic_replace(ids, mine, np.uint64(0), np.uint64(1)):
-            return 0, 0  # another helper still waits for the next turn, with this `par`
-        # Waking costs much of a turn, so a helper takes part in those that soon follow too.
+            return 0, 0  # another helper is still waiting for the next turn, with this `par`
+        # Waking costs much of a turn, so a helper also takes part in turns that follow soon.
         while opened(ids, at, now):
             now = atomic_load(ids, at)
             if ids[at + np.uint64(9)] != np.uint64(action.itemsize):
@@ -98,10 +98,10 @@ def _step_all(f, ids, par, action, obs, reward, terminated, truncated, count, tu
 
 
 def _next_block(ids, at, turn, blocks, tried, share, shares):  # type: ignore[no-untyped-def]
-    """Claim a block; return it, or `blocks` where none is left, and how many have been tried.
+    """Claim a block; return it, or `blocks` if none is left, and how many have been tried.
 
-    Shares lie behind one another. Their threads come from both ends of each pair of them and meet within; who
-    is done there goes on to the next pair.
+    Shares lie next to one another. The two threads of each pair of shares start at its opposite ends and meet
+    in the middle; then they go on to the next pair.
     """
     first = share * blocks // shares
     last = (share + np.uint64(1)) * blocks // shares - np.uint64(1)
@@ -117,7 +117,7 @@ def _next_block(ids, at, turn, blocks, tried, share, shares):  # type: ignore[no
 
 
 def _hand_in(ids, at, taken, over, refused):  # type: ignore[no-untyped-def]
-    """Add what became of the blocks that were claimed, and then that they are done."""
+    """Add the results of the claimed blocks, and after that mark them as done."""
     if taken > np.uint64(0):
         atomic_add(ids, at + np.uint64(2), over)
         atomic_max(ids, at + np.uint64(3), refused)
@@ -125,7 +125,7 @@ def _hand_in(ids, at, taken, over, refused):  # type: ignore[no-untyped-def]
 
 
 def _opened(ids, at, turn):  # type: ignore[no-untyped-def]
-    """Tell whether a turn is open, or over; wait a little while it is not."""
+    """Tell whether a turn is open, or over; wait for it a little while."""
     for _ in range(PATIENCE):
         if atomic_load(ids, at) >= turn:
             return True
@@ -133,7 +133,7 @@ def _opened(ids, at, turn):  # type: ignore[no-untyped-def]
 
 
 def _done(ids, at):  # type: ignore[no-untyped-def]
-    """Tell whether all blocks of the last turn are done; wait a little while they are not."""
+    """Tell whether all blocks of the last turn are done; wait for them a little while."""
     for _ in range(PATIENCE):
         if atomic_load(ids, at + np.uint64(1)) == np.uint64(0):
             return True
@@ -146,7 +146,7 @@ def _compiled(function: Callable, *helpers: Callable) -> Callable:
 
 
 def claiming() -> list[Callable]:
-    """Return `next_block` and `hand_in`, which the loop over blocks calls."""
+    """Return `next_block` and `hand_in`, which the loop over blocks uses."""
     return [_compiled(_next_block), _compiled(_hand_in)]
 
 
@@ -156,11 +156,11 @@ def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
     Steps every environment; one whose episode was over is restarted instead. `ended` and `cut` are the arrays
     of terminations and truncations. `turn` is the number of the step, from 1.
 
-    Who has `share` 0 leads, and gets (status, over). The status is 0; or i + 1 where environment i was
-    refused and kept its state; or -(i + 1), before anything was stepped, where action i is not finite.
-    ``over`` counts the environments whose episode is over now; it is -1 where helpers are still at it, and
-    the same call is to be made again. Helpers make that call with another number below `shares`, and the
-    `par` that belongs to it; they go on with the steps that soon follow. What they get says nothing.
+    The thread with `share` 0 leads, and gets (status, over). The status is 0; or i + 1 if environment i was
+    refused and kept its state; or -(i + 1) if action i is not finite, in which case nothing was stepped.
+    ``over`` counts the environments whose episode has just ended; it is -1 if helpers are not done yet, and
+    then the same call has to be made again. Helpers make this call with another number below `shares` and the
+    `par` that belongs to it; they continue with steps that follow soon. Their results mean nothing.
 
     Parameters
     ----------
@@ -178,10 +178,10 @@ def compile_step_all(bad_action: Callable, step_blocks: Callable) -> Callable:
 
 
 def default_threads(count: int) -> int:
-    """Return how many threads step a batch of so many environments where nobody says.
+    """Return the default number of threads for a batch of this size.
 
-    One for each `SHARE` environments and for each core that this process may use, but not more than
-    ``OMP_NUM_THREADS``, which Ray and others set for their workers. One in a process of `multiprocessing`'s.
+    One for each `SHARE` environments and for each core that this process may use, but no more than
+    ``OMP_NUM_THREADS``, which Ray and others set for their workers. In a process of `multiprocessing`, one.
     """
     if count < 2 * SHARE or multiprocessing.parent_process() is not None:
         return 1
@@ -190,11 +190,11 @@ def default_threads(count: int) -> int:
 
 
 def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
-    """Let `step_all` be called with each of these arguments by a helper that has nothing else to do.
+    """Offer calls of `step_all`, one for each of these tuples of arguments, to idle helpers.
 
-    Offers of others that nobody took are withdrawn; one's own from before are as good as new. `kind` is the
-    type of actions: the first step with one compiles, and there is no help in it, as a thread might still be
-    at that when the process ends.
+    Earlier offers for other arguments are withdrawn; those for the same arguments remain valid. `kind` is the
+    type of actions. The first step with a new type compiles, and gets no help, because a thread might still
+    be compiling when the process ends.
     """
     global _offered
     if (step_all, kind) not in _compiled_for:
@@ -206,7 +206,7 @@ def offer(step_all: Callable, calls: Sequence[tuple], kind: np.dtype) -> None:
     with contextlib.suppress(queue.Empty):
         while _offers.get_nowait() is not None:
             pass
-        _offers.put(None)  # it was meant for a helper
+        _offers.put(None)  # this dismissal was meant for a helper
     for i in range(len(_helpers), len(calls)):
         _helpers.append(threading.Thread(target=_help, name=f"lag_envs helper {i + 1}", daemon=True))
         _helpers[i].start()

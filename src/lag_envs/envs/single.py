@@ -39,22 +39,22 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     task : str
         The task, as "module:Class". The ids fix it.
     render_mode : {"human", "rgb_array"}, optional
-        What `render` does: show the scene in a window, or return a picture.
+        Whether `render` shows the scene in a window or returns a picture.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     show_arrows : bool, default False
-        Whether pictures have arrows for controls that the scene shows none of, and for the forces that it
-        names.
+        Whether pictures have arrows for controls without arrows of their own, and for the forces that the
+        scene names.
     show_trail : float, default 0.0 [s]
-        For how long pictures show the way of the bodies.
+        How long the bodies' trails in pictures are.
     show_readout : bool, default False
-        Whether time, return, score, controls and state stand below a picture.
+        Whether time, return, score, controls and state are written below a picture.
     **options
         Parameters of the scene and of the task: ``mass``, ``damping``, ``dt``, ``duration``, ``target``, ...;
         and hidden parameters, imperfect sensors and actuators: ``randomize``, ``observation_noise``,
         ``observation_delay`` [s], ``observation_every``, ``action_noise``, ``action_delay`` [s], ``slew``,
-        ``lag`` [s], ``push``. All are off by default. Delays are exact: a step is divided where the command
-        in force changes. See docs/usage.md.
+        ``lag`` [s], ``push``. All are off by default. Delays are exact: a step is divided where a new command
+        takes effect. See docs/usage.md.
 
     Notes
     -----
@@ -69,7 +69,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     >>> observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     """
 
-    # Gymnasium's own attribute; an environment replaces it and never changes it.
+    # Gymnasium's own attribute; instances replace it and never modify it.
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}  # noqa: RUF012
 
     def __init__(
@@ -85,7 +85,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         check_render_mode(render_mode)
         check_flag("diagnostics", diagnostics)
         self._look = check_look(show_arrows, show_trail, show_readout)
-        #: Whether anything is to be done after each step.
+        #: Whether there is something to draw or count after each step.
         self._seen = render_mode == "human" or bool(show_readout)
         self.task: Task = load_task(task)(**options)
         self.scene = self.task.scene
@@ -125,9 +125,9 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Parameters
         ----------
         seed : int, optional
-            Seeds starts, targets and kicks of this and of the following episodes; at least 0.
+            Seed of the starts, targets and kicks of this and the following episodes; at least 0.
         options : dict, optional
-            ``"state"``: the start, in the scene's order and units; ``"target"``, where the task has one.
+            ``"state"``: the start, in the scene's order and units; ``"target"``, if the task has one.
 
         Returns
         -------
@@ -139,8 +139,8 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         Raises
         ------
         ValueError, TypeError
-            For unknown options, a state or target with which the task cannot start, and a seed that is none.
-            The episode in progress, if there is one, is left as it is.
+            For unknown options, a state or target from which the task cannot start, and an invalid seed. An
+            episode in progress is left unchanged.
         """
         seed = None if seed is None else check_seed("seed", seed)
         state, target = start_options(options)
@@ -187,7 +187,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         ResetNeeded
             Before the first reset, and after termination.
         StepRefused
-            Where the step cannot be taken to full accuracy. In each case the environment stays as it was.
+            If the step cannot be taken to full accuracy. After any of these errors nothing has changed.
         """
         if self._plain and type(action) is np.ndarray and action.shape == (1,) and action.dtype.char in "fd":
             a = action.item()
@@ -247,7 +247,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._viewer = None
 
     def get_state(self) -> snapshots.Snapshot:
-        """Return all that decides how this episode and those after it go on, for `set_state`.
+        """Return everything that decides how this and later episodes continue, for `set_state`.
 
         Raises
         ------
@@ -263,17 +263,17 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         )
 
     def set_state(self, snapshot: snapshots.Snapshot) -> None:
-        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+        """Restore the state in which `get_state` was called; what follows has the same bits.
 
         Parameters
         ----------
         snapshot : Snapshot
-            Of this environment, or of one that was made alike, perhaps in another process.
+            A snapshot of this environment, or of one made alike, perhaps in another process.
 
         Raises
         ------
         TypeError, ValueError
-            For what is no snapshot, or one of another environment; nothing is changed then.
+            For something that is not a snapshot, or one of another environment; then nothing is changed.
         """
         snapshots.check(snapshot, self._about, self._program.kept)
         for name, values in snapshot.rows.items():
@@ -284,10 +284,10 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What a snapshot must agree in."""
+        """The properties that a snapshot must share."""
         return snapshots.about([self.task], num_envs=None)
 
-    # --- what can be looked at -----------------------------------------------------------------------------
+    # --- for inspection ------------------------------------------------------------------------------------
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -296,24 +296,24 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @property
     def target(self) -> Any:
-        """The episode's target; an array where there are several, None for a task without one."""
+        """The episode's target; an array if there are several, None for a task without one."""
         return single_number(self._read(self._program.g)) if self._program.g else None
 
     @property
     def control(self) -> Any:
-        """The control applied last, in SI units; an array where there are several; 0 after a reset."""
+        """The control applied last, in SI units; an array if there are several; 0 after a reset."""
         return single_number(self._read(self._program.u))
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The parameters that were drawn for this episode, by name; empty where none are."""
+        """The parameters drawn for this episode, by name; empty if none are drawn."""
         found = self.task.imperfections
         drawn = [d.name for d in found.drawn] if found and self._started else []
         return dict(zip(drawn, self._read([f"p_{name}" for name in drawn]).tolist(), strict=True))
 
     @property
     def drawn_task(self) -> Task:
-        """The task as it is in this episode: with the parameters that were drawn, perfect otherwise."""
+        """The task of this episode: with the drawn parameters, and without imperfections."""
         parameters = self.parameters
         if not parameters:
             return self.task
@@ -334,11 +334,11 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._spec = None if value is None else true_spec(value, self.task.limit)
 
     _spec: EnvSpec | None = None
-    #: Sum of the episode's rewards, where that is to be seen.
+    #: Sum of the episode's rewards, if pictures show it.
     _total = 0.0
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the picture as it is now, spaces, controls, parameters."""
+        """Return the HTML of a notebook: the current picture, spaces, controls, parameters."""
         from lag_envs.envs.html import described, still
 
         now = (self.state, self.control, self.target) if self._started else ()
@@ -346,7 +346,7 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         spaces = {"observation": self.observation_space, "action": self.action_space}
         return described(self.task, title, spaces, still(self.task, *now))
 
-    # --- the rest ------------------------------------------------------------------------------------------
+    # --- internal ------------------------------------------------------------------------------------------
 
     def _slow_step(self, observation: NDArray[np.float32]) -> tuple[float, int]:
         """Take a step that needs more than the fast formula; nothing is changed if it is refused."""
@@ -390,26 +390,26 @@ class LagrangianEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def true_spec(spec: EnvSpec, limit: float) -> EnvSpec:
-    """Return a copy of a spec that names the steps of an episode and can be written as JSON.
+    """Return a copy of a spec with the number of steps of an episode, in a form that can be written as JSON.
 
-    Gymnasium leaves the steps out where the environment itself ends an episode. From a spec that names them
-    it adds a `TimeLimit` of as many steps, which then agrees with the environment's own.
+    Gymnasium omits the number if the environment itself ends an episode. From a spec that contains it,
+    Gymnasium adds a `TimeLimit` of as many steps, which then agrees with the environment's own.
 
     Parameters
     ----------
     spec : EnvSpec
-        What Gymnasium noted of how the environment was made.
+        Gymnasium's spec of how the environment was made.
     limit : float
-        Steps of an episode; infinity for one without an end.
+        Steps of an episode; infinity for an endless one.
     """
     steps = int(limit) if math.isfinite(limit) else None
-    # `make_vec` passes the steps on as a keyword, which the spec need not say twice.
+    # `make_vec` passes the number of steps on as a keyword, which the spec need not repeat.
     kwargs = {name: plain(value) for name, value in spec.kwargs.items() if name != "max_episode_steps"}
     return dataclasses.replace(spec, max_episode_steps=steps, kwargs=kwargs)
 
 
 def plain(value: Any) -> Any:
-    """Return arrays and NumPy's numbers as lists and numbers, an enum as its value, others as they are."""
+    """Return arrays and NumPy numbers as lists and numbers, an enum as its value, others unchanged."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -420,12 +420,12 @@ def plain(value: Any) -> Any:
 
 
 def absent(constants: list[dict[str, float]]) -> frozenset[str]:
-    """Return the names of the constants that are zero in all environments: these cost nothing."""
+    """Return the names of the constants that are zero in all environments: they cost nothing."""
     return frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
 
 
 def observation_space(tasks: list[Task]) -> gym.spaces.Box[np.float32]:
-    """Return a space that holds the observations of all the tasks."""
+    """Return a space that contains the observations of all the tasks."""
     boxes = [seen_box(task) for task in {id(task): task for task in tasks}.values()]
     low = np.min([low for low, _ in boxes], axis=0).astype(np.float32)
     high = np.max([high for _, high in boxes], axis=0).astype(np.float32)
@@ -439,7 +439,7 @@ def check_render_mode(mode: str | None) -> None:
 
 
 def check_look(arrows: Any, trail: Any, readout: Any) -> tuple[bool, float, bool]:
-    """Return what pictures show besides shapes, see `rendering.Look`, or raise a ValueError."""
+    """Return the checked options of `rendering.Look`, or raise a ValueError."""
     check_flag("show_arrows", arrows)
     check_flag("show_readout", readout)
     seconds = check_number("show_trail", trail, "s")
@@ -449,13 +449,13 @@ def check_look(arrows: Any, trail: Any, readout: Any) -> tuple[bool, float, bool
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Raise ValueError for what is neither true nor false: any string would count as true."""
+    """Raise ValueError for anything but a bool: any string would count as true."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
 
 
 def check_seed(name: str, seed: Any) -> int:
-    """Return a seed as int; TypeError where it is no whole number, ValueError where it is below 0."""
+    """Return a seed as int; TypeError if it is not an integer, ValueError if it is negative."""
     if isinstance(seed, bool | np.timedelta64) or not isinstance(seed, int | np.integer):
         raise TypeError(f"{name} must be an int or None, got {shown(seed)}")
     if seed < 0:
@@ -464,12 +464,12 @@ def check_seed(name: str, seed: Any) -> int:
 
 
 def key_of(seed: int) -> int:
-    """Return the key of 64 bits that a seed stands for: itself, or a digest of one that has more bits."""
+    """Return the 64-bit key for a seed: the seed itself, or a digest if it has more bits."""
     return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
 
 
 def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("state", "target")) -> list[Any]:
-    """Return the values of the known options of `reset`, None where one is missing."""
+    """Return the values of the known options of `reset`, None for missing ones."""
     if options is None:
         options = {}
     if not isinstance(options, Mapping):
@@ -481,7 +481,7 @@ def start_options(options: dict[str, Any] | None, known: tuple[str, ...] = ("sta
 
 
 def diagnostics(scene: Any, state: NDArray[np.float64], control: Any) -> dict[str, Any]:
-    """Return what `info` reports when asked: forces and energies, and the control that was applied."""
+    """Return the diagnostics in `info`: forces and energies, and the applied control."""
     return {
         "control": control,
         **scene.forces(state, control),

@@ -1,4 +1,4 @@
-"""Snapshots of environments: all that decides how an episode, and those after it, go on."""
+"""Snapshots of environments: everything that decides how this and all later episodes continue."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from lag_envs.tasks.imperfections import Imperfections
 class Snapshot:
     """The state of an environment or of a batch, as plain data that can be pickled.
 
-    Made by `get_state` of an environment, for its `set_state` or that of one made alike, in this process or
-    another: it then continues with the same bits.
+    Made by `get_state` of an environment, for `set_state` of the same environment or one made alike, in this
+    process or another: it then continues with the same bits.
 
     Attributes
     ----------
     about : mapping
-        What it is a snapshot of: task, parameters, options.
+        The environment of the snapshot: task, parameters, options.
     rows : mapping of str to ndarray, shape (num_envs,)
-        The numbers that a step starts from: state, target, controls, clock, commands and observations under
-        way, drawn parameters.
+        The numbers from which a step starts: state, target, controls, clock, pending commands and
+        observations, drawn parameters.
     ids : ndarray of uint64, shape (3, num_envs)
         Keys of the seeds, numbers of the episodes, keys of the episodes.
     steps, totals : ndarray, shape (num_envs,)
-        Steps and sums of rewards, where the environment counts them for pictures.
+        Steps and sums of rewards, if the environment counts them for pictures.
     ready : bool
-        Whether a single environment may be stepped: not after a termination.
+        Whether a single environment may be stepped: false after a termination.
     """
 
     about: Mapping[str, Any]
@@ -45,7 +45,7 @@ class Snapshot:
 
 
 def about(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
-    """Return what a snapshot must agree in, by name, in the order in which differences are told."""
+    """Return the properties that a snapshot must share, by name, in the order in which errors name them."""
     first, kind = tasks[0], type(tasks[0])
     found: dict[str, Any] = {"task": f"{kind.__module__}:{kind.__qualname__}", **options}
     fields = [f.name for f in dataclasses.fields(first.scene)]
@@ -60,7 +60,7 @@ def about(tasks: Sequence[Task], **options: Any) -> dict[str, Any]:
 
 
 def check(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) -> None:
-    """Raise an error for a snapshot that is none, or one of another environment."""
+    """Raise an error for something that is not a snapshot, or a snapshot of another environment."""
     if not isinstance(snapshot, Snapshot):
         raise TypeError(f"set_state takes what get_state returned, got {shown(snapshot)}")
     for name in dict.fromkeys([*here, *snapshot.about]):
@@ -75,5 +75,5 @@ def check(snapshot: Any, here: Mapping[str, Any], rows: Sequence[str]) -> None:
 
 
 def _common(values: list[Any]) -> Any:
-    """Return the value that all share, or else all of them."""
+    """Return the value that all share, or else all values."""
     return values[0] if all(value == values[0] for value in values) else tuple(values)

@@ -1,4 +1,4 @@
-"""First episodes that end one after the other."""
+"""Staggered episodes: environments whose episodes end at different times."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from gymnasium.vector import VectorEnv
 
 
 def stagger(envs: VectorEnv, steps: int, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-    """Restart environments one after the other, so that their episodes end one after the other from then on.
+    """Restart environments one after the other, so that from then on their episodes end one after the other.
 
-    Otherwise, if episodes are equally long, a learner's roll-out sees only one phase of them.
+    Otherwise, if all episodes have the same length, a learner's roll-out sees only one phase of them.
 
     Parameters
     ----------
     envs : VectorEnv
-        Environments that have been reset, and that take a ``"reset_mask"``.
+        Environments that have been reset, and that support ``"reset_mask"``.
     steps : int
-        Steps over which the restarts are spread; the length of an episode is a good choice. That many steps
-        with random actions are taken.
+        Steps over which the restarts are spread; the length of an episode is a good choice. The function
+        takes this many steps with random actions.
     seed : int, optional
         Seed of the actions.
 

@@ -1,31 +1,31 @@
 """The environment's step without fused operations: the same bits on any machine, in three languages.
 
 The formulas of task and scene and the general series are recorded as for the compiled step and printed as a
-script (`lag_envs.stepping.script`). All scenes are stepped by the general series here, those with an exact
-flow of their own too: its code has one form, loops included, whereas the flows call fused operations and the
-C library.
+script (`lag_envs.stepping.script`). All scenes are stepped by the general series here, even those with an
+exact flow of their own: the code of the series has one form, including its loops, whereas the flows call
+fused operations and the C library.
 
-A script has these functions. All work on arrays of numbers: ``k``, the constants; ``f``, the rows of one
+A script has the functions below. All work on arrays of numbers: ``k``, the constants; ``f``, the rows of one
 environment; ``a``, the action; ``d``, random numbers in [0, 1); ``p``, poses.
 
 =================  ==========================================================================================
-``derive(k)``      fills in the constants that follow from the first ones, where one of these was changed
-``start(f, d, k)`` fills in where an episode starts, from one draw for each entry of state and target
-``lift(f, k)``     fills in what the formulas need besides the state: call it where the state was set by hand
+``derive(k)``      computes the constants that follow from the given ones, after one of these was changed
+``start(f, d, k)`` sets an episode's start, from one draw for each entry of state and target
+``lift(f, k)``     computes what the formulas need besides the state: call it after setting the state by hand
 ``move(f, a, k)``  takes a step: control, motion, reward, ending
-``kick(f, d, k)``  the random disturbance after it
-``observe(f, k)``  fills in the observation
-``poses(f, p, k)`` fills in where the picture's frames are, x, y, angle and part of each
+``kick(f, d, k)``  applies the random disturbance after the step
+``observe(f, k)``  computes the observation
+``poses(f, p, k)`` computes the poses of the picture's frames: x, y, angle and part of each
 =================  ==========================================================================================
 
-Where parameters are hidden or sensors noisy there are two more (`UnfusedImperfectProgram`):
+With hidden parameters or noisy sensors there are two more (`UnfusedImperfectProgram`):
 
 =================  ==========================================================================================
-``draw(k, d)``     fills in the drawn parameters of an episode, to be followed by ``derive``
-``sense(f, d, k)`` makes the observation what is shown
+``draw(k, d)``     sets the drawn parameters of an episode; call ``derive`` next
+``sense(f, d, k)`` turns the true observation into the one that the sensors show
 =================  ==========================================================================================
 
-Actions that come into force later wait with the caller.
+The caller keeps actions that take effect later.
 """
 
 from __future__ import annotations
@@ -58,18 +58,18 @@ from lag_envs.stepping.tracing import Number
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.imperfections import Imperfections, normals, seen_box
 
-#: What a substep's truncation may be in single precision, relative to the velocities: half a unit in the last
-#: place.
+#: Largest truncation error of a substep in single precision, relative to the velocities: half a unit in the
+#: last place.
 SINGLE_TOLERANCE = 2.0**-25
 
 
 class Rows(NamedTuple):
-    """Where the numbers of an environment lie in ``f``.
+    """The places of an environment's numbers in ``f``.
 
     Attributes
     ----------
     y : slice
-        The state, and cosine and sine of its angle where the scene has a normal form.
+        The state, and cosine and sine of its angle if the scene has a normal form.
     g, u, o : slice
         Targets, controls, observation.
     turned : slice
@@ -94,34 +94,34 @@ class UnfusedProgram:
     Parameters
     ----------
     task : Task
-        The task; not with imperfections, for which there is `UnfusedImperfectProgram`.
+        The task, without imperfections; for these there is `UnfusedImperfectProgram`.
     single : bool
-        Whether the numbers are of single precision, to which shorter series are certified.
+        Whether to use single precision, for which shorter series suffice.
 
     Attributes
     ----------
     rows : Rows
-        Where the numbers lie.
+        The places of the numbers.
     given : dict of str to float
-        The first constants, in order, which the script takes as they are. One, ``strength``, is 1 in the
-        environment: what actions in [-1, 1] are multiplied by.
+        The constants that the script is given, in order; they come first. One of them, ``strength``,
+        multiplies actions in [-1, 1]; it is 1 in the environment.
     derived : dict of str to float
-        Those behind them, which follow: each rounded once.
+        The constants after those, which are computed from them; each is rounded once.
     frames : list of str
-        The picture's frames; empty where there is no picture.
+        The picture's frames; empty if there is no picture.
     """
 
     #: The script's functions.
     names: tuple[str, ...] = ("derive", "start", "lift", "move", "kick", "observe", "poses")
-    #: How many parameters are drawn, how many draws noise takes in a step, and by how many steps an action
-    #: comes into force later.
+    #: The number of drawn parameters, the number of draws for noise in a step, and the number of steps after
+    #: which an action takes effect.
     drawn, noise, delay = 0, 0, 0
 
     def __init__(self, task: Task, single: bool = False) -> None:
         if task.imperfections:
             raise FormulaError(
-                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which no "
-                "script has; switch them off with None, as in observation_noise=None"
+                f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, which "
+                "scripts lack; switch them off with None, as in observation_noise=None"
             )
         self.task, formulas, scene = task, task.formulas, task.scene
         self._formulas, self._form, self._stepper = formulas, scene._form, scene._stepper
@@ -130,7 +130,7 @@ class UnfusedProgram:
         self.given = {name: value for name, value in own.items() if name not in scenes and name != "x"}
         self.given["strength"] = 1.0
         fields = {f.name: f.metadata["made"] for f in dataclasses.fields(scene) if "unit" in f.metadata}
-        #: Parameters that follow from others, and how.
+        #: Parameters that are computed from others, and how.
         self.made = {
             name: fields[name]
             for name in scene._numbers()
@@ -138,7 +138,7 @@ class UnfusedProgram:
         }
         expressions = self._stepper.expressions()
         self._motion = {f"motion_{name}": e for name, e in expressions.items()}
-        # Functions of parameters too have the same bits everywhere.
+        # Functions of parameters must have the same bits everywhere, too.
         parameters, functions = {n: getattr(scene, n) for n in scene._numbers()}, ElementaryTrace()
         motion = self._stepper.constants(parameters, functions)
         gone = frozenset(name for name, value in motion.items() if value == 0.0)
@@ -146,7 +146,7 @@ class UnfusedProgram:
         self.derived |= {f"motion_{name}": value for name, value in motion.items()}
         numbers = self.given | self.derived
         self._place = {name: f"k[{i}]" for i, name in enumerate(numbers)}
-        #: Constants for formulas; what is zero leaves no code.
+        #: Constants for formulas; zeros leave no code.
         self._k = {name: 0.0 if numbers[name] == 0.0 else place for name, place in self._place.items()}
         self._record = self._stepper.record(gone, fused=False)
         order = vars(scene).get(ORDER) or usual_order(task.dt)
@@ -175,7 +175,7 @@ class UnfusedProgram:
 
     @cached_property
     def functions(self) -> dict[str, Any]:
-        """The functions of the script in Python; they keep nothing."""
+        """The functions of the script in Python; they have no state of their own."""
         return run_python(self.python)
 
     @cached_property
@@ -185,7 +185,7 @@ class UnfusedProgram:
 
     @cached_property
     def digest(self) -> str:
-        """All that decides the bits of an episode, in short."""
+        """A digest of everything that decides the bits of an episode."""
         numbers = repr(self.constants)
         late = self.delay or ""
         text = f"{self.python.partition('def poses(')[0]}{numbers}{late}"
@@ -193,7 +193,7 @@ class UnfusedProgram:
 
     @cached_property
     def script(self) -> Script:
-        """The functions of the module's docstring."""
+        """The functions listed at the top of this module."""
         return self.written(*self.names)
 
     def written(self, *names: str) -> Script:
@@ -239,7 +239,7 @@ class UnfusedProgram:
         return [*y, *t.formula(lambda xp, x: [xp.cos(x), xp.sin(x)], {"x": y[angle]})]
 
     def _run(self, t: Script, formula: Callable, *given: Sequence) -> list[Any]:
-        """Write a formula of lists of numbers and of the constants."""
+        """Write a formula whose arguments are lists of numbers and the constants."""
         sizes = [len(values) for values in given]
         inputs = {f"i{n}": value for n, value in enumerate(value for values in given for value in values)}
 
@@ -282,7 +282,7 @@ class UnfusedProgram:
             self._write(t, list(self._place).index(name), [result], "k")
 
     def _moved_starts(self) -> list[str]:
-        """Return the constants of the start that follow from parameters, as far as arithmetic tells."""
+        """Return the start's constants that follow from parameters, if plain arithmetic computes them."""
         names = list(self.task.scene._numbers())
         try:
             found = self._formulas.starts_of(dict(zip(names, ElementaryTrace().inputs(*names), strict=True)))
@@ -342,7 +342,7 @@ class UnfusedProgram:
         self._write(t, rows.refused, [t.select(refused, 1.0, 0.0)])
 
     def _advance(self, t: Script, y: Sequence, u: Sequence) -> tuple[list, str]:
-        """Write the motion; return the state at the step's end, and whether the step was refused."""
+        """Write the motion; return the state after the step, and whether the step was refused."""
         stepper, record, n, dt = self._stepper, self._record, self._record.size, self._k["dt"]
         wanted = [name for name in record.given if name.startswith(("control_", "start_"))]
         moving = [f"{letter}{i}" for letter in "qv" for i in range(n)]
@@ -388,13 +388,13 @@ class UnfusedProgram:
             of = self.task
             if own:
                 of = self._formulas._self(k)
-                of.formulas = self._formulas  # not those of recorded numbers
+                of.formulas = self._formulas  # not the formulas of recorded numbers
             found = picture.poses_of(of, Frame(y, u, of.share(list(u)), list(g), turned), xp)
             return [x for pose in found.values() for x in pose]
 
         given = [self._read(t, part) for part in (slice(0, n), rows.g, rows.u, rows.turned)]
-        # Where something else than arithmetic is done with the parameters, they stay as they are; where it is
-        # done with the state, there is no picture.
+        # If the poses do more than arithmetic with the parameters, these stay fixed; if with the state, there
+        # is no picture.
         for own in (True, False):
             try:
                 self._write(t, 0, self._run(t, partial(poses, own), *given), "p")
@@ -405,17 +405,17 @@ class UnfusedProgram:
 
 
 class UnfusedImperfectProgram(UnfusedProgram):
-    """The step of a task with hidden parameters, noisy sensors or late actions, as a script.
+    """The step of a task with hidden parameters, noisy sensors or delayed actions, as a script.
 
     Parameters
     ----------
     task : Task
-        The task. What else is imperfect no script has.
+        The task. Scripts support no other imperfections.
 
     Raises
     ------
     FormulaError
-        For other imperfections, or a delay that is not the same number of whole steps each time.
+        For other imperfections, or a delay that is not a fixed number of whole steps.
     """
 
     names = ("derive", "draw", "start", "lift", "move", "kick", "observe", "sense", "poses")
@@ -429,8 +429,8 @@ class UnfusedImperfectProgram(UnfusedProgram):
         if found != known or least % 1.0:
             raise FormulaError(
                 f"{type(task).__name__} has hidden parameters or imperfect sensors or actuators, of which "
-                "scripts have randomize, observation_noise, and action_delay in whole steps only; switch the "
-                "others off with None, as in lag=None"
+                "scripts support only randomize, observation_noise, and action_delay in whole steps; switch "
+                "the others off with None, as in lag=None"
             )
         super().__init__(task.drawn.inner if task.drawn else task.varied())
         self._options, self._box = found, seen_box(task)
@@ -470,7 +470,7 @@ class UnfusedImperfectProgram(UnfusedProgram):
 
 
 class _Numbers:
-    """A scene some of whose parameters are recorded numbers, for what follows from them."""
+    """A scene with some recorded parameters, to compute those that follow from them."""
 
     def __init__(self, scene: Any, numbers: dict[str, Any]) -> None:
         self._scene, self._recorded = scene, numbers
@@ -487,7 +487,7 @@ class Unfused:
     task : Task
         The task, ``env.unwrapped.task``.
     program : UnfusedProgram, optional
-        Its program, where there is one already.
+        The task's program, if there is one already.
 
     Attributes
     ----------
@@ -518,7 +518,7 @@ class Unfused:
         self.steps = 0
 
     def reset(self, seed: int) -> list[float]:
-        """Begin the episode that a fresh environment begins with this seed; return the observation."""
+        """Begin the episode that a new environment would begin with this seed; return the observation."""
         from lag_envs.stepping.primitives import episode_key
 
         self._key = episode_key(np.uint64(key_of(seed)), np.uint64(1))
@@ -534,12 +534,12 @@ class Unfused:
         return self.observe()
 
     def set_parameter(self, name: str, value: float) -> None:
-        """Change a parameter of the scene, and what follows from it."""
+        """Change a parameter of the scene, and everything computed from it."""
         self.constants[list(self.program.given).index(f"self_{name}")] = float(value)
         self._functions["derive"](self.constants)
 
     def _draws(self, count: int, purpose: str = "") -> list[float]:
-        """Return draws of this step, of the episode's own or of a purpose's."""
+        """Return this step's draws, from the episode's own key or that of a purpose."""
         from lag_envs.stepping.primitives import episode_key, uniform
 
         key, step = np.uint64(self._key), np.uint64(self.steps)
@@ -553,7 +553,7 @@ class Unfused:
         Parameters
         ----------
         action : array_like
-            As the environment takes it.
+            The action, as for the environment.
 
         Returns
         -------
@@ -567,7 +567,7 @@ class Unfused:
         Raises
         ------
         StepRefused
-            Where the step cannot be taken to full accuracy; nothing is changed then.
+            If the step cannot be taken to full accuracy; then nothing is changed.
         """
         found = self._actions.one(action)
         before = list(self.numbers)
@@ -617,7 +617,7 @@ class Unfused:
         return self.numbers[self.program.rows.u]
 
     def poses(self) -> list[list[float]]:
-        """Return x, y, angle and part of each of the picture's frames; nothing where there is no picture."""
+        """Return x, y, angle and part of each of the picture's frames; empty if there is no picture."""
         found = [0.0] * (4 * len(self.program.frames))
         self._functions["poses"](self.numbers, found, self.constants)
         return [found[i : i + 4] for i in range(0, len(found), 4)]

@@ -60,21 +60,21 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     autoreset_mode : {"NextStep", "SameStep", "Disabled"} or AutoresetMode
         What happens when an episode is over; see `gymnasium.vector.AutoresetMode`.
     render_mode : {"rgb_array"}, optional
-        `render` then returns a picture of each environment, which Gymnasium's wrappers ask for; or with
-        `show_tiles` one of them all.
+        `render` then returns a picture of each environment, as Gymnasium's wrappers expect; with
+        `show_tiles`, a single picture of them all.
     diagnostics : bool, default False
         Whether `info` reports forces, needed friction and energy after each step.
     num_threads : int, optional
         Number of threads that step the batch; by default one for each 4,096 environments and each core, and
-        one in worker processes, see `sharing.default_threads`. The bits do not depend on it.
+        one in worker processes; see `sharing.default_threads`. The bits do not depend on it.
     show_arrows, show_trail, show_readout
-        What pictures show besides, see `LagrangianEnv`.
+        Additional content of pictures; see `LagrangianEnv`.
     show_tiles : int, optional
-        Show the first so many environments at most, side by side in one picture.
+        Show at most this many environments, side by side in one picture.
     **options
         Parameters of the scene and of the task. `num_envs` values give each environment its own. Hidden
-        parameters, imperfect sensors and actuators as in `LagrangianEnv`: the same for all, with draws of its
-        own for each environment.
+        parameters, imperfect sensors and actuators as in `LagrangianEnv`: the same for all, but each
+        environment has its own draws.
 
     Notes
     -----
@@ -92,7 +92,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     #: Drawn parameters that viewers show, by environment.
     _viewed: dict[int, dict[str, float]]
-    _viewers: tuple[Any, ...] = ()  # there even where __init__ fails and Gymnasium closes what it made
+    _viewers: tuple[Any, ...] = ()  # defined even if __init__ fails and Gymnasium closes the environment
 
     def __init__(
         self,
@@ -121,7 +121,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         )
         self.render_mode = render_mode
         self.diagnostics = diagnostics
-        #: TorchRL asks for it under this name, as Gymnasium's own vector environments have it.
+        #: TorchRL expects this name, which Gymnasium's own vector environments use.
         self.autoreset_mode = check_mode(autoreset_mode)
         self._tasks = make_tasks(load_task(task), self.num_envs, options)
         self.task = self._tasks[0]
@@ -148,21 +148,21 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._compile()
         program = self._program
         uniform = [self._constants[0][name] for name in program.uniform]
-        #: The constants, then room for what a step needs; for each thread.
+        #: For each thread the constants, followed by working memory for a step.
         self._pars = [on_a_line(np.array(uniform + [0.0] * program.room_of_all), len(uniform))]
         blocks = -(-self.num_envs // BLOCK)
         self._memory = on_a_line(np.zeros(blocks * len(program.kept) * BLOCK))
-        #: Keys of the seeds, numbers of the episodes, keys of the episodes, and what threads share.
+        #: Keys of the seeds, numbers of the episodes, keys of the episodes, and numbers that threads share.
         self._ids = np.zeros(3 * self.num_envs + sharing.words(blocks), dtype=np.uint64)
-        #: Number of the step, counted over all episodes, and how many threads find something to do in one.
+        #: Number of the step, counted over all episodes, and how many threads it can keep busy.
         self._turn, self._most_threads = 0, min(blocks, self._num_threads or self.num_envs // sharing.SHARE)
         self._lanes = np.arange(self.num_envs)
-        for name in program.varying:  # those that are drawn are written when an episode begins
+        for name in program.varying:  # drawn ones are written when an episode begins
             values = [constants[name] for constants in self._constants]
             self._write(f"k_{name}", self._lanes, np.array(values))
         self._started = False
         self._over = 0
-        #: Steps and sums of rewards of the episodes, where they are to be seen.
+        #: Steps and sums of rewards of the episodes, if pictures show them.
         self._steps, self._totals = np.zeros(self.num_envs, np.int64), np.zeros(self.num_envs)
         self._seen = render_mode is not None and bool(show_readout or show_trail)
 
@@ -170,7 +170,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         self._program = program_of(self.task, self._constants)
         self._row = {name: j for j, name in enumerate(self._program.kept)}
         self._viewers = ()
-        #: What helpers are asked to call, by their number and the type of actions.
+        #: Arguments of the calls that helpers are offered, by their number and the type of actions.
         self._calls: dict[tuple[int, np.dtype], list[tuple]] = {}
 
     # --- Gymnasium's interface -----------------------------------------------------------------------------
@@ -183,23 +183,23 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         Parameters
         ----------
         seed : int or sequence of int, optional
-            A seed s seeds environment i with s + i; a list, tuple, range or array seeds each with its own,
-            None leaves it alone.
+            A seed s seeds environment i with s + i; a list, tuple, range or array gives each its own seed,
+            None keeps the present one.
         options : dict, optional
             ``"state"`` (num_envs, n_state), ``"target"`` (num_envs,), ``"reset_mask"`` (num_envs,) of bool.
-            Rows that the mask leaves out are ignored.
+            Rows not selected by the mask are ignored.
 
         Returns
         -------
         observations : ndarray of float32, shape (num_envs, n_observation)
-            The observations; those of environments that the mask leaves out are their last ones.
+            The observations; for environments not selected by the mask, their latest ones.
         infos : dict
             Empty, or the diagnostics.
 
         Raises
         ------
         ValueError, TypeError
-            For unknown options, and arrays of the wrong shape, type or content; nothing is reset then.
+            For unknown options, and arrays of the wrong shape, type or content; then nothing is reset.
         """
         seeds = seeds_of(seed, self.num_envs)
         state, target, mask = start_options(options, ("state", "target", "reset_mask"))
@@ -257,12 +257,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         Raises
         ------
         ValueError
-            For actions that are not finite, not real or not of that shape; nothing is stepped then.
+            For actions that are not finite, not real or not of that shape; then nothing is stepped.
         ResetNeeded
-            Before the first reset; with autoreset disabled also while an episode is over.
+            Before the first reset; with autoreset disabled also if an episode is over.
         StepRefused
-            Where an environment's step cannot be taken to full accuracy. That environment keeps its state,
-            the others have been stepped.
+            If an environment's step cannot be taken to full accuracy. That environment keeps its state; the
+            others have been stepped.
         """
         actions = self._actions.many(actions, self.num_envs)
         if not self._started:
@@ -274,7 +274,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                 "reset them with options['reset_mask']"
             )
         n, program = self.num_envs, self._program
-        # One row per entry is quicker to fill; the transpose is what the caller sees.
+        # One row per entry is faster to fill; the caller gets the transpose.
         observations = np.empty((len(program.o), n), FLOAT32)
         rewards, terminations, truncations = np.empty(n), np.empty(n, BOOL), np.empty(n, BOOL)
         turn = self._turn = self._turn + 1
@@ -282,7 +282,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         shares = self._get_help(*rest) if self._most_threads > 1 else 1
         call = (self._memory, self._ids, self._pars[0], *rest, 0, shares)
         status, over = program.step_all(*call)
-        while over < 0:  # a helper had to let another program have its core
+        while over < 0:  # another program took a helper's core for a while
             time.sleep(1e-5)
             status, over = program.step_all(*call)
         if status < 0:
@@ -325,13 +325,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return tiled(pictures, columns_of(self._tiles))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Let go of the pictures."""
+        """Release the pictures."""
         for viewer in self._viewers:
             viewer.close()
         self._viewers = ()
 
     def get_state(self) -> snapshots.Snapshot:
-        """Return all that decides how these episodes and those after them go on, for `set_state`.
+        """Return everything that decides how these and later episodes continue, for `set_state`.
 
         Raises
         ------
@@ -345,22 +345,22 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return snapshots.Snapshot(self._about, rows, ids, steps, totals)
 
     def set_state(self, snapshot: snapshots.Snapshot, mask: NDArray[np.bool_] | None = None) -> None:
-        """Go back, or over, to where `get_state` was called; what follows has the same bits.
+        """Restore the state in which `get_state` was called; what follows has the same bits.
 
         Parameters
         ----------
         snapshot : Snapshot
-            Of this batch, or of one that was made alike, perhaps in another process.
+            A snapshot of this batch, or of one made alike, perhaps in another process.
         mask : ndarray of bool, shape (num_envs,), optional
-            The environments to set; by default all. The others stay as they are.
+            The environments to set; by default all. The others stay unchanged.
 
         Raises
         ------
         TypeError, ValueError
-            For what is no snapshot, or one of another batch, and for a mask that is none; nothing is changed
-            then.
+            For something that is not a snapshot or not a mask, or a snapshot of another batch; then nothing
+            is changed.
         ResetNeeded
-            Before the first reset, where the mask leaves some out.
+            Before the first reset, if the mask does not select all environments.
         """
         snapshots.check(snapshot, self._about, self._program.kept)
         mask = self._check_mask(mask, "mask")
@@ -376,12 +376,12 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def _about(self) -> dict[str, Any]:
-        """What a snapshot must agree in."""
+        """The properties that a snapshot must share."""
         options = {"num_envs": self.num_envs, "autoreset_mode": self.autoreset_mode.value}
         limit = self._constants[0]["limit"]
         return snapshots.about(self._tasks, **options, max_episode_steps=limit, order=self.order)
 
-    # --- what can be looked at -----------------------------------------------------------------------------
+    # --- for inspection ------------------------------------------------------------------------------------
 
     @property
     def state(self) -> NDArray[np.float64]:
@@ -394,13 +394,13 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def target(self) -> NDArray[np.float64] | None:
-        """The targets, shape (num_envs,), or (num_envs, n) where there are several; None without one."""
+        """The targets, shape (num_envs,), or (num_envs, n) if there are several; None without one."""
         names = self._program.g
         return single_number(np.stack([self._read(name) for name in names], axis=1)) if names else None
 
     @property
     def control(self) -> NDArray[np.float64]:
-        """The controls applied last [SI], shape (num_envs,), or (num_envs, n) where there are several.
+        """The controls applied last [SI], shape (num_envs,), or (num_envs, n) if there are several.
 
         They are 0 after a reset.
         """
@@ -410,7 +410,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def parameters(self) -> dict[str, NDArray[np.float64]]:
-        """The parameters that were drawn for these episodes, shape (num_envs,) each; empty where none are."""
+        """The parameters drawn for these episodes, shape (num_envs,) each; empty if none are drawn."""
         found = self.task.imperfections
         drawn = [d.name for d in found.drawn] if found and self._started else []
         return {name: self._read(f"p_{name}") for name in drawn}
@@ -422,9 +422,9 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def order(self) -> int | None:
-        """Order of the series by which steps are taken; None where a closed form takes them.
+        """Order of the series by which steps are taken; None for a closed form.
 
-        Another order takes another time; each step is certified to the same tolerance with any.
+        The order changes only the speed: each step is certified to the same tolerance with any order.
         """
         return None if self.scene._form else int(self._pars[0][self._program.uniform.index("x")])
 
@@ -435,7 +435,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How the environments were made; its step limit is the one that they enforce."""
+        """How the environments were made; its step limit is the one that they enforce themselves."""
         return self._spec
 
     @spec.setter
@@ -445,7 +445,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
     _spec: EnvSpec | None = None
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the pictures as they are now, spaces, controls, parameters."""
+        """Return the HTML of a notebook: the current pictures, spaces, controls, parameters."""
         from lag_envs.envs.html import described, still
         from lag_envs.envs.rendering import columns_of, tiled
 
@@ -461,7 +461,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         grid = tiled(pictures, columns) if pictures else None
         return described(self.task, title, spaces, grid)
 
-    # --- the rest ------------------------------------------------------------------------------------------
+    # --- internal ------------------------------------------------------------------------------------------
 
     def _make_viewers(self) -> tuple[Any, ...]:
         from lag_envs.envs.rendering import HEIGHT, WIDTH, Viewer, tile_size
@@ -473,7 +473,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         )
 
     def _use_drawn(self) -> None:
-        """Let the viewers show the parameters that were drawn."""
+        """Let the viewers show the drawn parameters."""
         drawn = self.parameters
         if drawn:
             for i, viewer in enumerate(self._viewers):
@@ -483,7 +483,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
                     viewer.use(self._tasks[i].varied(**values))
 
     def _count(self, rewards: NDArray[np.float64]) -> None:
-        """Note how far the episodes have come."""
+        """Count steps and rewards of the episodes."""
         begun = self._read("n") == 0.0
         self._steps = np.where(begun, 0, self._steps + 1)
         self._totals = np.where(begun, 0.0, self._totals + rewards)
@@ -514,7 +514,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         )
 
     def _get_help(self, actions: NDArray, *rest: Any) -> int:
-        """Ask other threads to take part in a step; return how many may, this one included."""
+        """Ask other threads to take part in a step; return how many may take part, including this one."""
         shares, kind = min(self.num_threads, self._most_threads), actions.dtype
         if (calls := self._calls.get((shares, kind))) is None:
             while len(self._pars) < shares:
@@ -588,7 +588,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
         return array
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out compiled functions, pictures, and what helpers know."""
+        """Leave out compiled functions, pictures, and the helpers' data."""
         without = ("_program", "_viewers", "_viewed", "_row", "_calls")
         return {k: v for k, v in self.__dict__.items() if k not in without}
 
@@ -600,7 +600,7 @@ class LagrangianVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], An
 
 
 def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float64]:
-    """Return a copy in which number `first` begins a line of the cache: vectors then lie on one line each."""
+    """Return a copy in which number `first` begins a cache line, so that each vector lies on one line."""
     room = np.empty(len(numbers) + 8)
     start = (-(room.ctypes.data // 8) - first) % 8
     copy = room[start : start + len(numbers)]
@@ -609,7 +609,7 @@ def on_a_line(numbers: NDArray[np.float64], first: int = 0) -> NDArray[np.float6
 
 
 def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> Any:
-    """Call a function; where it raises a ValueError, say that it did for environment i."""
+    """Call a function; if it raises a ValueError, add that this was for environment i."""
     try:
         return function(*arguments, **keywords)
     except ValueError as error:
@@ -617,7 +617,7 @@ def named(i: int, function: Callable, /, *arguments: Any, **keywords: Any) -> An
 
 
 def seeds_of(seed: Any, n: int) -> list[tuple[int, int]]:
-    """Return (environment, seed) for each of n that is to be seeded, or raise an error."""
+    """Return (environment, seed) for each of n environments to be seeded, or raise an error."""
     if seed is None:
         return []
     if isinstance(seed, list | tuple | range) or (type(seed) is np.ndarray and seed.ndim == 1):
@@ -641,7 +641,7 @@ def check_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def check_count(name: str, value: Any) -> int:
-    """Return a whole number of at least 1 as int, or raise a ValueError."""
+    """Return an integer of at least 1 as int, or raise a ValueError."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
     if not whole or not 1 <= value < 2**63:
         raise ValueError(f"{name} must be a whole number of at least 1 and below 2**63, got {shown(value)}")
@@ -649,7 +649,7 @@ def check_count(name: str, value: Any) -> int:
 
 
 def make_tasks(kind: type[Task], n: int, options: dict[str, Any]) -> list[Task]:
-    """Return one task per environment; all are the same object where no option varies."""
+    """Return one task per environment, all the same object if no option varies."""
     many = {
         name: values
         for name, values in options.items()

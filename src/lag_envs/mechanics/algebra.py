@@ -1,14 +1,14 @@
 """Exact algebra on recorded formulas: sums of products of symbols and of functions of such sums.
 
 Energies are run once on `Expr` objects. An `Expr` is kept expanded, as a map from monomials to rational
-coefficients, so that equal terms meet and what cancels leaves nothing behind: the whole derivation of an
-equation of motion is sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
-an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Two rules are
-added to those of sums and products: √x² = x, and cos² + sin² = 1, which is applied where two terms agree in
-all else (`collect`).
+coefficients, so that equal terms are merged and terms that cancel leave nothing behind: deriving an equation
+of motion consists of sums, products and derivatives of such maps. A monomial is a product of powers of atoms;
+an atom is a symbol (a coordinate, a velocity, a parameter, ...) or a function of an `Expr`. Besides the rules
+of sums and products there are two more: √x² = x, and cos² + sin² = 1, which is applied to terms that agree in
+everything else (`collect`).
 
-Everything is ordered by the text of what it is, never by when it was made: the same formulas give the same
-code and the same bits in every process.
+Everything is ordered by its text, never by when it was made: the same formulas give the same code and the
+same bits in every process.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from typing import Any, ClassVar, NoReturn
 
 Monomial = tuple[tuple["Atom", int], ...]
 
-#: A product of two sums that would have more terms than this is kept as a product.
+#: A product of two sums that would have more terms than this stays a product.
 LARGEST_PRODUCT = 4096
 
 
 class FormulaError(TypeError, ValueError):
-    """A formula does what recorded numbers cannot follow, or a name is wrong."""
+    """A formula does something that recorded numbers cannot follow, or a name is wrong."""
 
 
 class Atom:
@@ -52,7 +52,7 @@ class Atom:
         name : str
             The symbol's or the function's name; the function ``"sum"`` is its argument itself.
         argument : Expr, optional
-            What the function is taken of.
+            The function's argument.
         """
         text = f"{kind} {name}" if argument is None else f"{name}({argument.text})"
         found = cls._all.get(text)
@@ -100,7 +100,7 @@ class Expr:
         exact = value if isinstance(value, int | Fraction) else _exact(float(value))
         return Expr({(): exact} if exact else {})
 
-    # --- what it is -----------------------------------------------------------------------------------------
+    # --- queries --------------------------------------------------------------------------------------------
 
     @property
     def text(self) -> str:
@@ -114,7 +114,7 @@ class Expr:
         return self._text
 
     def sorted_terms(self) -> list[tuple[Monomial, int | Fraction]]:
-        """Return the terms, in an order that does not depend on how they came about."""
+        """Return the terms, in an order that does not depend on how they were made."""
         return sorted(self.terms.items(), key=lambda term: [(a.text, n) for a, n in term[0]])
 
     def __repr__(self) -> str:
@@ -129,7 +129,7 @@ class Expr:
 
     @property
     def number(self) -> float | None:
-        """The expression as a number, or None where it has symbols."""
+        """The expression as a number, or None if it has symbols."""
         if not self.terms:
             return 0.0
         if len(self.terms) == 1 and () in self.terms:
@@ -240,7 +240,7 @@ class Expr:
             return Expr({(): exact}) * Expr({tuple((a, -n) for a, n in monomial): 1})
         return Expr({((Atom("function", "sum", self), -1),): 1})
 
-    # --- what is refused ------------------------------------------------------------------------------------
+    # --- refused operations ---------------------------------------------------------------------------------
 
     def _refuse(self, what: str, remedy: str) -> NoReturn:
         raise FormulaError(f"{what} of a recorded number; {remedy}")
@@ -311,7 +311,7 @@ def _scalar(value: Any) -> float:
 
 
 def _product(first: Monomial, second: Monomial) -> tuple[Monomial, Expr | None]:
-    """Return the product of two monomials, and what squares of roots and of sums add to it as a factor."""
+    """Return the product of two monomials, and a further factor from squares of roots and sums, or None."""
     if not first:
         return second, None
     if not second:
@@ -359,7 +359,7 @@ def function(name: str, argument: Any) -> Expr:
 
 
 def _check_root(argument: Expr) -> None:
-    """Refuse √x² of what moves: it is |x|, and not smooth."""
+    """Refuse √x² of a moving quantity: it is |x|, and not smooth."""
     root = _root(argument)
     moving = root is not None and any(s.kind != "parameter" for s in root.symbols())
     if not moving and len(argument.terms) == 1:  # a square times something
@@ -373,7 +373,7 @@ def _check_root(argument: Expr) -> None:
 
 
 def _root(square: Expr) -> Expr | None:
-    """Return an expression whose square is given, or None where none is seen."""
+    """Return an expression with this square, or None if none is recognised."""
     parts: dict[Monomial, Fraction] = {}
     for monomial, c in square.sorted_terms():
         whole = Fraction(c)
@@ -452,7 +452,7 @@ class Functions:
 
 
 def _slope(atom: Atom) -> Expr:
-    """Return the derivative of a function by its argument."""
+    """Return the derivative of a function with respect to its argument."""
     x = atom.argument
     assert x is not None
     if atom.function == "sin":
@@ -473,7 +473,7 @@ def _slope(atom: Atom) -> Expr:
 
 
 def derivative(expr: Expr, symbol: Atom) -> Expr:
-    """Return the partial derivative of an expression by a symbol."""
+    """Return the partial derivative of an expression with respect to a symbol."""
     chain: dict[Atom, Expr] = {}
     total = Expr({})
     for monomial, c in expr.terms.items():
@@ -516,10 +516,10 @@ def substitute(expr: Expr, values: Mapping[Atom, Expr]) -> Expr:
 
 
 def collect(expr: Expr) -> Expr:
-    """Apply cos² + sin² = 1, and the rules for cosine and sine of a sum, wherever terms meet.
+    """Apply cos² + sin² = 1, and the addition formulas of cosine and sine, to terms that match.
 
-    Two terms meet where they agree in all but a pair of factors and have coefficients of one size. So
-    energies that are written in Cartesian velocities become as short as those that are written in angles.
+    Two terms match if they agree in all but a pair of factors and their coefficients have the same size. So
+    energies written in Cartesian velocities become as short as those written in angles.
     """
     terms = dict(expr.terms)
     while True:
@@ -536,7 +536,7 @@ def collect(expr: Expr) -> Expr:
 
 
 def _meeting(terms: Mapping[Monomial, int | Fraction]) -> list[dict[Monomial, int | Fraction]] | None:
-    """Return changes of terms that one rule asks for, or None where none applies."""
+    """Return the changes of terms that one rule makes, or None if none applies."""
     for monomial in sorted(terms, key=lambda m: [(a.text, n) for a, n in m]):
         c = terms[monomial]
         waves = [(a, n) for a, n in monomial if a.function in ("sin", "cos")]
@@ -591,10 +591,10 @@ def evaluate(exprs: Iterable[Expr], values: Mapping[Atom, Any], xp: Any) -> list
     Parameters
     ----------
     exprs : iterable of Expr
-        What to evaluate.
+        The expressions.
     values : mapping from Atom to number
-        A number for every symbol: floats, arrays, mpmath's or SymPy's. What fractions make of a term is added
-        up exactly and rounded once, so that (R - r)² keeps its digits although it is expanded.
+        A number for every symbol: floats, arrays, mpmath's or SymPy's. Fractions are combined exactly and
+        rounded once, so that (R - r)² keeps its digits although it is expanded.
     xp : namespace
         Functions for these numbers, named as in NumPy or as here (``arctan`` or ``atan``).
     """

@@ -34,7 +34,7 @@ def acceleration(name: str) -> Atom:
 
 @dataclasses.dataclass(frozen=True)
 class Energies:
-    """What a scene's formulas returned when they were run on recorded numbers.
+    """The results of a scene's formulas on recorded numbers.
 
     ``applied`` holds the generalised forces by coordinate.
     """
@@ -60,7 +60,7 @@ class Equations:
     linear : tuple of Expr
         b_i, the part of T that is linear in the velocities.
     force : tuple of Expr
-        For each coordinate, everything of its equation but Σ_j G_ij a_j, on the right-hand side.
+        For each coordinate, all of its equation except Σ_j G_ij a_j, moved to the right-hand side.
     energies : Energies
         The formulas.
     """
@@ -94,7 +94,7 @@ def derive(free: Sequence[str], prescribed: Sequence[str], energies: Energies) -
     Raises
     ------
     FormulaError
-        Where the kinetic energy is no polynomial of degree two in the velocities, or lacks a coordinate.
+        If the kinetic energy is not a polynomial of degree two in the velocities, or lacks a coordinate.
     """
     names = (*free, *prescribed)
     kinetic = collect(energies.kinetic)

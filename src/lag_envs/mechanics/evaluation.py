@@ -1,6 +1,6 @@
 """Numbers of a derived motion: accelerations, forces, powers and derivatives, for one state or many.
 
-The same lines run on arrays and on `Dual` numbers, which carry derivatives along.
+The same code runs on arrays and on `Dual` numbers, which carry derivatives along.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Numeric:
-    """The namespace ``xp`` of a formula on arrays: the functions that a recorded formula has."""
+    """The namespace ``xp`` of a formula on arrays: the functions that recorded formulas have."""
 
     pi = math.pi
     sin, cos, tan, exp, log, sqrt, tanh = np.sin, np.cos, np.tan, np.exp, np.log, np.sqrt, np.tanh
@@ -31,7 +31,7 @@ class Numeric:
 
 
 class Exact:
-    """Functions of rational numbers; sums and products of them are exact, so that nothing cancels."""
+    """Functions of rational numbers; sums and products are exact, so cancellation loses nothing."""
 
     Rational, mpf, pi = Fraction, None, Fraction(math.pi)
 
@@ -44,7 +44,7 @@ class Exact:
 
 
 def exactly(parameters: Mapping[str, float]) -> dict[Atom, Any]:
-    """Return the parameters' values by symbol, as fractions: `evaluate` rounds what they make once."""
+    """Return the parameters' values by symbol, as fractions: `evaluate` rounds results once."""
     return {
         parameter(name): Fraction(value) if math.isfinite(value) else np.float64(value)
         for name, value in parameters.items()
@@ -64,7 +64,7 @@ def _on_lanes(f: Any) -> Any:
 
 
 class Lanes:
-    """An array that a formula takes for one number, even where it puts its numbers into arrays of its own."""
+    """An array that a formula takes for a single number, even if it builds arrays of its numbers."""
 
     __slots__ = ("value",)
     __array_ufunc__ = None  # NumPy's numbers leave arithmetic to this class
@@ -196,16 +196,16 @@ class Point:
         controls: Sequence,
         xp: Any,
     ) -> None:
-        """Work out velocities and accelerations.
+        """Compute velocities and accelerations.
 
         Parameters
         ----------
         mechanics : Mechanics
             The derived motion.
         parameters : mapping from Atom to float
-            Their values.
+            The parameters' values.
         state, controls : sequence of numbers
-            Entry by entry; arrays that broadcast, or `Dual` numbers.
+            By entry: numbers, arrays that broadcast, or `Dual` numbers.
         xp : namespace
             Functions for these numbers.
         """
@@ -248,11 +248,11 @@ class Point:
         return total
 
     def solve(self, right: Sequence) -> list:
-        """Return M⁻¹ times a column; where M is singular, that state alone gets no number."""
+        """Return M⁻¹ times a column; a state with a singular M gets no finite number, all others do."""
         n = len(right)
         return eliminated([self.mass[n * i : n * (i + 1)] for i in range(n)], right)
 
-    # --- what follows --------------------------------------------------------------------------------------
+    # --- results -------------------------------------------------------------------------------------------
 
     def rates(self) -> list:
         """Return the time derivatives of the state's entries."""
@@ -292,7 +292,7 @@ class Point:
         return forces
 
     def power(self) -> dict[str, Any]:
-        """Return the powers of drive and applied forces and that lost to drag [W]."""
+        """Return the powers of drive and applied forces, and the power lost to drag [W]."""
         layout = self.mechanics.layout
         carried = [
             p.name for p in layout.at("acceleration", "rate") if f"{p.name}_dot" not in layout.left_out
@@ -301,7 +301,7 @@ class Point:
         speeds = [self.values[velocity(name)] for name in moving]
         drive = sum(f * self.values[velocity(m)] for m, f in zip(carried, self.force(carried), strict=True))
         for m in (p.name for p in layout.at("acceleration") if p.name not in carried):
-            # In the frame of a coordinate whose rate is left out, its acceleration acts as a field.
+            # If a coordinate's rate is left out, its acceleration acts as a field in the coordinate's frame.
             full = self.mechanics.full
             row = full.coordinates.index(m)
             fields = self.of([full.entry(full.coordinates.index(name), row) for name in moving])
@@ -316,5 +316,5 @@ class Point:
         }
 
     def weight(self, name: str) -> Any:
-        """Return the size of the potential's force on a coordinate, whatever the angles."""
+        """Return the largest size of the potential's force on a coordinate over all angles."""
         return sum(abs(x) for x in self.of(self.mechanics.weight(name)))

@@ -1,7 +1,7 @@
-"""What a scene declares: coordinates, controls and state, with every name and unit checked or derived.
+"""A scene's declarations: coordinates, controls and state, with every name and unit checked or derived.
 
-No unit is ever read: what a control does follows from its name, ``s_ddot``, ``s_dot`` or ``s`` of a
-prescribed coordinate ``s``, and the unit of a rate is the coordinate's with ``/s`` behind it.
+Units are never interpreted. The name of a control decides what it does: ``s_ddot``, ``s_dot`` or ``s`` moves
+a prescribed coordinate ``s``. The unit of a rate is that of the coordinate with ``/s`` appended.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 from lag_envs.mechanics.algebra import FormulaError
 
-#: What a control sets of a prescribed coordinate; ``"rest"`` where none sets anything.
+#: What a control sets of a prescribed coordinate; ``"rest"`` if no control does.
 Level = Literal["acceleration", "rate", "place", "rest"]
 
 _ENDINGS: tuple[tuple[str, Level], ...] = (("_ddot", "acceleration"), ("_dot", "rate"), ("", "place"))
@@ -48,15 +48,15 @@ class Layout:
     free : tuple of str
         Free coordinates.
     prescribed : tuple of Prescribed
-        The others.
+        Prescribed coordinates.
     controls, control_units : tuple of str
         Controls of the mode.
     absent : tuple of str
         Controls of other modes, which read 0.
     state : tuple of Entry
-        The state.
+        Entries of the state.
     left_out : tuple of str
-        What the state leaves out.
+        Entries that the state leaves out.
     reactions : tuple of (str, str)
         Names of forces, with the prescribed coordinate that each moves or holds.
     ratios : tuple of (str, str, str)
@@ -74,7 +74,7 @@ class Layout:
     ratios: tuple[tuple[str, str, str], ...]
 
     def at(self, *levels: Level) -> tuple[Prescribed, ...]:
-        """Return the prescribed coordinates of these levels."""
+        """Return the prescribed coordinates with these levels."""
         return tuple(p for p in self.prescribed if p.level in levels)
 
     @property
@@ -129,16 +129,16 @@ def make_layout(
     reactions: Any,
     ratios: Any,
 ) -> Layout:
-    """Return the layout that follows from a class's declarations, or raise a FormulaError.
+    """Return the layout from a class's declarations, or raise a FormulaError.
 
     Parameters
     ----------
     of : str
-        Name of the class, for errors.
+        Name of the class, for error messages.
     coordinates, prescribed, controls, state, left_out, reactions, ratios : object
-        As declared; `controls` those of the mode.
+        As declared; `controls` are those of the mode.
     absent : sequence of str
-        Names of the controls that other modes have.
+        Names of the controls of other modes.
     """
     free = units(f"{of}.coordinates", coordinates)
     moved = units(f"{of}.prescribed", prescribed)

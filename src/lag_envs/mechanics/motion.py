@@ -1,7 +1,7 @@
-"""The motion of a scene as expressions: what a stepper steps, and what forces and powers follow from.
+"""The motion of a scene as expressions: the basis of steps, forces and powers.
 
-A resting coordinate, a held place and a held rate are put in before anything is derived or after it,
-whichever leaves less: what rests leaves no code.
+Resting coordinates, held places and held rates are put in either before or after the derivation, whichever
+gives the shorter result: resting coordinates leave no code.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from lag_envs.mechanics.recording import Record, control, parameter
 class Mechanics:
     """The equations of motion of a scene, for its mode and its structural fields.
 
-    The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. Symbols in these are places and
-    velocities of the free coordinates, places and velocities of prescribed ones whose acceleration is
-    controlled, places of those whose rate is, controls, and parameters. A held acceleration,
-    rate or place stands as the control that sets it.
+    The free coordinates move by ``Σ_j mass[i, j] a_j = force[i]``. The symbols in these are places and
+    velocities of the free coordinates, places and velocities of prescribed coordinates with controlled
+    acceleration, places of those with controlled rate, controls, and parameters. A held acceleration, rate
+    or place appears as the control that sets it.
 
     Attributes
     ----------
@@ -35,15 +35,15 @@ class Mechanics:
     record : Record
         The formulas, with parameters that are 0 put in.
     mass : dict
-        Entries of the mass matrix of the free coordinates, (i, j) with i <= j; what vanishes is left out.
+        Entries of the mass matrix of the free coordinates, (i, j) with i <= j, without zeros.
     force : tuple of Expr
         Right-hand sides, one for each free coordinate.
     coupling : dict
-        For a prescribed coordinate m whose rate is held, entries G_im of the mass matrix by (i, name of m):
-        the state carries w = v + M⁻¹ Σ_m G_im ṡ_m.
+        For a prescribed coordinate m with held rate, entries G_im of the mass matrix by (i, name of m): the
+        state holds w = v + M⁻¹ Σ_m G_im ṡ_m.
     zeros : tuple of str
-        Parameters that are 0 and stand in a denominator or a function: they were put in before anything was
-        derived. Others that are 0 leave out their terms when code is made.
+        Parameters that are 0 and occur in a denominator or a function: they are put in before the derivation.
+        The terms of other parameters that are 0 are left out when code is made.
     """
 
     layout: Layout
@@ -74,7 +74,7 @@ class Mechanics:
 
     @cached_property
     def text(self) -> str:
-        """All that decides how a step goes, as text; scenes with the same text may share code."""
+        """Everything that decides a step, as text; scenes with the same text may share code."""
         mass = [f"{i} {j} {self.mass[i, j].text}" for i, j in sorted(self.mass)]
         coupling = [f"{i} {m} {self.coupling[i, m].text}" for i, m in sorted(self.coupling)]
         layout = (self.layout.free, self.layout.prescribed, self.layout.controls, self.layout.state)
@@ -110,7 +110,7 @@ class Mechanics:
 
     @cached_property
     def gyroscopic(self) -> tuple[Expr, Expr] | None:
-        """T₁ and T₀, the parts of T of first and of no degree in the velocities, or None."""
+        """T₁ and T₀, the parts of T of degree one and zero in the velocities, or None."""
         parts: list[dict] = [{}, {}]
         for monomial, c in collect(self.record.energies.kinetic).terms.items():
             degree = sum(n for atom, n in monomial if atom.kind == "velocity")
@@ -121,7 +121,7 @@ class Mechanics:
         return (first, rest) if any(parts) else None
 
     def weight(self, name: str) -> list[Expr]:
-        """Return the terms of ∂V/∂q of a coordinate with sines and cosines left out, which are 1 at most."""
+        """Return the terms of ∂V/∂q of a coordinate without sines and cosines, which are 1 at most."""
         slope = substitute(
             derivative(self.record.energies.potential, place(name)), _held(self.layout, self.record)
         )
@@ -132,7 +132,7 @@ class Mechanics:
 
     @cached_property
     def full(self) -> Equations:
-        """Lagrange's equations of all coordinates, with what rests put in after they were derived.
+        """Lagrange's equations of all coordinates, with resting ones put in after the derivation.
 
         The accelerations of the prescribed coordinates are not put in: see `Equations`. The force that moves
         or holds coordinate m is ``Σ_j entry(m, j) a_j - force[m]``.
@@ -159,7 +159,7 @@ class Mechanics:
 
 
 def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
-    """Return what is known of places and velocities of the prescribed coordinates while controls are held."""
+    """Return the known places and velocities of the prescribed coordinates under held controls."""
     values: dict[Atom, Expr] = {}
     for name, level, by in layout.prescribed:
         if level == "rest":
@@ -174,23 +174,23 @@ def _held(layout: Layout, record: Record) -> dict[Atom, Expr]:
 
 
 def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection[str] = ()) -> Mechanics:
-    """Derive the equations of motion from what a scene's formulas gave.
+    """Derive the equations of motion from the results of a scene's formulas.
 
     Parameters
     ----------
     scene : Scene
-        The scene; its class's name is used in errors, and which of its parameters are 0.
+        The scene: its class's name for error messages, and its parameters that are 0.
     layout : Layout
         Its names.
     found : Record
         Its formulas.
     varying : collection of str
-        Parameters that are not put in although they are 0.
+        Parameters that are not put in even if they are 0.
 
     Raises
     ------
     FormulaError
-        Where they are not what an energy may be, or need a coordinate that the state leaves out.
+        If they are not valid energies, or need a coordinate that the state leaves out.
     """
     of = type(scene).__name__
     zero = {
@@ -230,7 +230,7 @@ def derive_motion(scene: Any, layout: Layout, found: Record, varying: Collection
 
 
 def _is_hard(expr: Expr, name: str) -> bool:
-    """Tell whether a parameter stands in a denominator or in a function."""
+    """Tell whether a parameter occurs in a denominator or in a function."""
     return any(
         n < 0 and atom.name == name if atom.argument is None else parameter(name) in atom.argument.symbols()
         for monomial in expr.terms

@@ -1,8 +1,8 @@
-"""Run a scene's formulas on recorded numbers, and refuse at the door what these cannot follow.
+"""Run a scene's formulas on recorded numbers, and refuse early what these cannot follow.
 
-A formula runs on a twin of the scene: an object of the same class whose parameters are symbols, so that the
-methods and properties that a formula calls see symbols too. Structural fields stay what they are, and may
-branch and count.
+A formula runs on a twin of the scene: an object of the same class whose parameters are symbols, so that
+methods and properties that a formula calls see symbols too. Structural fields keep their values; formulas may
+branch on them and use them as counts.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = {
     "poses": ("q", "xp"),
 }
 
-#: Entry of a twin's ``__dict__`` by which it is known.
+#: The entry that marks a twin's ``__dict__``.
 TWIN = "_twin"
 
 
@@ -51,11 +51,11 @@ class Values:
         Parameters
         ----------
         what : str
-            What they are, for errors.
+            A word for the numbers, for error messages.
         items : mapping
             The numbers, in order.
         hidden : mapping, optional
-            More numbers that are found by name only.
+            Further numbers, accessible by name only.
         """
         object.__setattr__(self, "_what", what)
         object.__setattr__(self, "_items", dict(items))
@@ -126,14 +126,14 @@ def symbolic_twin(scene: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """What a scene's formulas gave for symbols.
+    """The results of a scene's formulas on symbols.
 
     Attributes
     ----------
     energies : Energies
         Kinetic and potential energy, dissipation and applied forces.
     rests : mapping from str to Expr
-        Where each prescribed coordinate rests.
+        Resting places of prescribed coordinates.
     poses : mapping from str to (Expr, Expr, Expr)
         Place [m] and angle [rad] of each body.
     """
@@ -152,7 +152,7 @@ class Record:
 
 @contextlib.contextmanager
 def formula(scene: Any, name: str) -> Iterator[None]:
-    """Let errors within name the class and the formula."""
+    """Add class and formula to the message of errors raised within."""
     where = f"{type(scene).__name__}.{name}"
     try:
         yield
@@ -168,7 +168,7 @@ def formula(scene: Any, name: str) -> Iterator[None]:
 
 
 def check_signature(scene: Any, name: str) -> None:
-    """Raise a FormulaError where a formula does not take the arguments that it is called with."""
+    """Raise a FormulaError if a formula does not take the expected arguments."""
     of = type(scene).__name__
     method, arguments = getattr(scene, name, None), ARGUMENTS[name]
     wanted = f"{name}(self, {', '.join(arguments)})"
@@ -191,7 +191,7 @@ def check_signature(scene: Any, name: str) -> None:
 
 
 def single(value: Any, what: str = "") -> Expr:
-    """Return what a formula gave as an expression, or raise a FormulaError."""
+    """Return a formula's result as an expression, or raise a FormulaError."""
     if value is None:
         raise FormulaError(f"{what}returns None; end it with a return of a number")
     if getattr(value, "ndim", 0) or isinstance(value, tuple | list | set | dict):
@@ -210,7 +210,7 @@ def record(scene: Any, layout: Layout) -> Record:
     Raises
     ------
     FormulaError
-        Naming class and formula, where one does what a recorded number cannot follow.
+        Naming class and formula, if one does something that recorded numbers cannot follow.
     """
     names = layout.names
     copy = symbolic_twin(scene)
@@ -247,7 +247,7 @@ def record(scene: Any, layout: Layout) -> Record:
 
 
 def check_again(scene: Any, layout: Layout, found: Record) -> None:
-    """Raise a FormulaError where a formula gives something else when it is run again."""
+    """Raise a FormulaError if a formula gives another result when it is run again."""
     again = record(scene, layout).exprs()
     if not all(a.same(b) for a, b in zip(found.exprs(), again, strict=True)):
         raise FormulaError(
@@ -293,7 +293,7 @@ def _check_controls(scene: Any, layout: Layout, found: Record) -> None:
 
 
 def restrict(found: Record, values: Mapping[Atom, Expr], scene: Any, why: str) -> Record:
-    """Return a record with symbols replaced; errors name the formula and why they were replaced."""
+    """Return a record with symbols replaced; errors name the formula and the reason for replacing."""
 
     def of(name: str, expr: Expr) -> Expr:
         try:

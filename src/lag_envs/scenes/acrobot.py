@@ -1,4 +1,4 @@
-r"""Two links that hang from a pivot, with a torque at the elbow, at the shoulder, or at both.
+r"""Two links hanging from a pivot, with a torque at the elbow, at the shoulder, or at both.
 
 ::
 
@@ -13,8 +13,8 @@ With l₁ from shoulder to elbow, centres of mass at c₁ and c₂ along the lin
     T = (m₁ c₁² + I₁ + m₂ l₁²) theta_1'²/2 + (m₂ c₂² + I₂) w²/2 + m₂ l₁ c₂ theta_1' w cos(theta_2)
     V = -(m₁ c₁ + m₂ l₁) g cos(theta_1) - m₂ c₂ g cos(theta_1 + theta_2)
 
-Friction in each joint is b v + f atan(100 v): viscous, and a rounded step that stands for dry friction.
-Motors with rotors of inertia J behind gears of ratio n, the elbow's being carried by the first link, add
+Friction in each joint is b v + f atan(100 v): viscous friction, plus a rounded step for dry friction. Motors
+with rotors of inertia J behind gears of ratio n, the elbow's motor being carried by the first link, add
 J (n theta_1')²/2 + J (n theta_2' - theta_1')²/2 to T.
 """
 
@@ -37,30 +37,30 @@ class Acrobot(Scene):
     mass_1, mass_2 : float [kg]
         Masses m of the links.
     length_1, length_2 : float [m]
-        Lengths l of the links; the second's is only drawn.
+        Lengths l of the links; the second link's is only drawn.
     com_distance_1, com_distance_2 : float [m], optional
         Distances c from a link's upper joint to its centre of mass; by default half its length.
     inertia_1, inertia_2 : float [kg m²], optional
         Moments of inertia I about the centres of mass; by default those of uniform bars, ml²/12.
     damping, damping_2 : float [N m s]
-        Coefficients b of the viscous friction in shoulder and elbow; the second is by default the first.
+        Coefficients b of the viscous friction in shoulder and elbow; the second defaults to the first.
     dry_friction, dry_friction_2 : float [N m]
-        Coefficients f of the friction f atan(100 v) in shoulder and elbow, which reaches fπ/2; the second is
-        by default the first.
+        Coefficients f of the friction f atan(100 v) in shoulder and elbow, which reaches fπ/2; the second
+        defaults to the first.
     rotor_inertia : float [kg m²]
         Inertia J of each motor's rotor.
     gear_ratio : float
-        Ratio n by which the rotors turn faster than the joints.
+        Ratio n of the rotors' speed to the joints'.
     gravity : float [m/s²]
         Field g, downward.
     control : {"elbow", "shoulder", "both"}
-        Where a torque acts.
+        Where torques act.
 
     Notes
     -----
     State (theta_1, theta_1_dot, theta_2, theta_2_dot). The controls are the torques `shoulder_torque`, on the
     first link, and `elbow_torque`, on the second with its reaction on the first. The zero of the potential
-    energy lies at the shoulder. With ``inertia_1=inertia_2=1`` and ``gravity=9.8`` it is the model of
+    energy lies at the shoulder. With ``inertia_1=inertia_2=1`` and ``gravity=9.8`` this is the model of
     Gymnasium's `Acrobot-v1`, as in Sutton and Barto's book.
     """
 
@@ -120,25 +120,25 @@ class Acrobot(Scene):
         return {"theta_1": u.shoulder_torque, "theta_2": u.elbow_torque}
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of the links."""
+        """Return the poses of the links."""
         elbow = self.length_1 * xp.sin(q.theta_1), -self.length_1 * xp.cos(q.theta_1)
         return {"first": (0.0, 0.0, q.theta_1), "second": (*elbow, q.theta_1 + q.theta_2)}
 
     def bodies(self) -> Bodies:
-        """Return the links as they hang down, and arrows for the torques."""
+        """Return the links hanging down, and arrows for the torques."""
         size = 0.2 * (self.length_1 + self.length_2)
         arrows = {name: torque(size) for name in self.control_names}
         return {"first": link(self.length_1), "second": link(self.length_2), **arrows}
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the arrows are."""
+        """Return the poses of the arrows."""
         places = {"shoulder_torque": "first", "elbow_torque": "second"}
         joints, down = self.poses(now.q, xp), -0.5 * math.pi
         return {name: (*joints[places[name]][:2], down, now.share[name]) for name in self.control_names}
 
 
 def link(length: float) -> list[Shape]:
-    """Return a link that hangs down from its joint [m]."""
+    """Return a link hanging down from its joint [m]."""
     half = 0.05 * length
     outline = [(-half, half), (-half, -length - half), (half, -length - half), (half, half)]
     return [

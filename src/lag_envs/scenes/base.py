@@ -37,18 +37,18 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Where a task notes the order of the series that it chose for its scene.
+#: Where a task stores the order of the series that it chose for its scene.
 ORDER = "_order_of_task"
 
-#: Where a motion is singular, or a number too large, that state's results are not finite, and no others'.
+#: If a motion is singular, or a number too large, only the results of that state are not finite.
 _QUIET = np.errstate(all="ignore")
 
 
 class SceneType(ABCMeta):
-    """The type of scenes: a class is made a frozen dataclass, unless it is one, when it is used first."""
+    """The type of scenes: makes a class a frozen dataclass on first use, unless it is one already."""
 
     def __call__(cls, *args: Any, **keywords: Any) -> Any:
-        """Return a scene whose parameters and formulas have been checked."""
+        """Return a scene with checked parameters and formulas."""
         complete(cls)
         scene = super().__call__(*args, **keywords)
         admit(scene, Scene)
@@ -87,7 +87,7 @@ class Scene(metaclass=SceneType):
 
     Formulas use ``+ - * /``, whole powers and functions of ``xp``: sin, cos, tan, atan, tanh, sqrt, exp, log.
     They are run on recorded numbers, so they cannot branch on them. Fields that are not a `parameter`, such
-    as a number of bars, are structural: formulas may branch on them, and another value compiles again.
+    as a number of bars, are structural: formulas may branch on them, and a new value needs a new compilation.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class Scene(metaclass=SceneType):
     state: ClassVar[Any] = ()
     left_out: ClassVar[Any] = ()
 
-    # --- what a scene defines ------------------------------------------------------------------------------
+    # --- defined by a scene --------------------------------------------------------------------------------
 
     def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
         """Return the kinetic energy T [J]."""
@@ -138,7 +138,7 @@ class Scene(metaclass=SceneType):
         return {}
 
     def rests(self) -> Any:
-        """Return where prescribed coordinates without a control rest; by default at 0."""
+        """Return the resting places of prescribed coordinates without a control; by default 0."""
         return {}
 
     def poses(self, q: Any, xp: Any) -> Any:
@@ -146,11 +146,11 @@ class Scene(metaclass=SceneType):
         return {}
 
     def bodies(self) -> Any:
-        """Return shapes by frame, from back to front: a body's own, an indicator's, or the fixed "ground"."""
+        """Return shapes by frame, from back to front: of a body, an indicator, or the fixed "ground"."""
         return {}
 
     def indicators(self, now: Any, xp: Any) -> Any:
-        """Return where frames are that show more than bodies, such as a control's arrow.
+        """Return poses of frames that show more than bodies, such as a control's arrow.
 
         Parameters
         ----------
@@ -167,11 +167,11 @@ class Scene(metaclass=SceneType):
         return {}
 
     def window(self) -> Window:
-        """Return the part of the plane to look at: around the first body, as far as the others reach."""
+        """Return the visible part of the plane: around the first body, as far as the others reach."""
         return picture.window(self)
 
     def check(self) -> None:
-        """Raise ValueError where parameters, each in its range, do not fit together."""
+        """Raise ValueError if parameters, each in its range, do not fit together."""
 
     # --- how a class is made -------------------------------------------------------------------------------
 
@@ -188,9 +188,9 @@ class Scene(metaclass=SceneType):
 
     @property
     def _structure(self) -> tuple:
-        """All that decides which code steps the scene; scenes that agree in it differ in numbers only."""
+        """Everything that decides the code of a step; scenes that agree in it differ only in numbers."""
         cls, numbers = type(self), self._numbers()
-        # By identity: a formula that calls super() would keep its own class alive.
+        # By identity: keeping a formula that calls super() would keep its own class alive.
         formulas = tuple(id(getattr(cls, name)) for name in ("rests", *recording.ARGUMENTS))
         fields = dataclasses.fields(self)  # type: ignore[arg-type]
         plain = tuple((f.name, getattr(self, f.name)) for f in fields if "unit" not in f.metadata)
@@ -208,14 +208,14 @@ class Scene(metaclass=SceneType):
         others = {n: value for n, value in vars(self).items() if not n.startswith("_") or n == ORDER}
         return _restore, (type(self), others | fields)
 
-    # --- what follows: names -------------------------------------------------------------------------------
+    # --- derived: names ------------------------------------------------------------------------------------
 
     @property
     def _layout(self) -> Layout:
         """Names of coordinates, controls and state."""
         found = vars(self).get("_cached_layout")
         if found is None:
-            # Properties may branch and count on structural fields, not on parameters.
+            # Properties may branch on structural fields and use them as counts, but not parameters.
             copy, declared = recording.symbolic_twin(self), {}
             for name in (*MAPPINGS, *SEQUENCES):
                 with recording.formula(self, name):
@@ -245,7 +245,7 @@ class Scene(metaclass=SceneType):
 
     @property
     def state_units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the state's entries."""
         return tuple(entry.unit for entry in self._layout.state)
 
     @property
@@ -255,10 +255,10 @@ class Scene(metaclass=SceneType):
 
     @property
     def control_units(self) -> tuple[str, ...]:
-        """Their units."""
+        """Units of the controls."""
         return self._layout.control_units
 
-    # --- what follows: numbers -----------------------------------------------------------------------------
+    # --- derived: numbers ----------------------------------------------------------------------------------
 
     def _point(self, state: ArrayLike, control: ArrayLike) -> tuple[Point, tuple[int, ...]]:
         """Return the motion at states under controls, and the shape of its numbers."""
@@ -279,7 +279,7 @@ class Scene(metaclass=SceneType):
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The controls that are held; a single one may stand without its axis.
+            The held controls; a single control may be given without its axis.
         """
         point, shape = self._point(state, control)
         return {name: _shaped(point.acceleration[name], shape) for name in self._layout.free}
@@ -295,15 +295,15 @@ class Scene(metaclass=SceneType):
     def energy(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return kinetic, potential and total energy [J].
 
-        Where the kinetic energy has terms T₁ or T₀ of first or no degree in the velocities, also ``jacobi``,
-        Jacobi's integral T₂ - T₀ + V: that is what `power` changes.
+        If the kinetic energy has terms T₁ or T₀, of degree one or zero in the velocities, there is also
+        ``jacobi``, Jacobi's integral T₂ - T₀ + V, whose rate of change is given by `power`.
 
         Parameters
         ----------
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The controls that are held; they matter where a velocity depends on them.
+            The held controls; they matter if a velocity depends on them.
         """
         point, shape = self._point(state, control)
         names = self._layout.names
@@ -321,16 +321,16 @@ class Scene(metaclass=SceneType):
     def forces(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
         """Return the forces [N] and torques [N m] that move or hold prescribed coordinates, and ratios.
 
-        Those of `reactions` have the names that it gives; what moves another coordinate s is ``drive_s``. A
-        ratio |F|/N is infinite where N is not above 1e-12 of the weight: the contact carries nothing, or
-        pulls.
+        The forces in `reactions` have the names given there; the force on any other coordinate s is
+        ``drive_s``. A ratio |F|/N is infinite if N is not above 1e-12 of the weight: the contact carries no
+        load, or pulls.
 
         Parameters
         ----------
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The controls that are held.
+            The held controls.
         """
         point, shape = self._point(state, control)
         layout = self._layout
@@ -348,24 +348,24 @@ class Scene(metaclass=SceneType):
 
     @_QUIET
     def power(self, state: ArrayLike, control: ArrayLike = 0.0) -> dict[str, Any]:
-        """Return the powers of ``drive`` and ``applied`` forces and that lost to ``drag`` [W].
+        """Return the powers of ``drive`` and ``applied`` forces, and the power lost to ``drag`` [W].
 
-        Energy changes by drive + applied - drag. What drives a coordinate whose rate the state leaves out is
-        the inertial force of its frame.
+        Energy changes by drive + applied - drag. If the state leaves out the rate of a coordinate, its drive
+        is the inertial force of its frame.
         """
         point, shape = self._point(state, control)
         return {name: _shaped(value, shape) for name, value in point.power().items()}
 
     @_QUIET
     def linearise(self, state: ArrayLike, control: ArrayLike = 0.0) -> tuple[Array, Array]:
-        """Return the derivatives of the state's rate of change by state and control, (A, B).
+        """Return the Jacobian matrices of the state's rate of change, (A, B).
 
         Parameters
         ----------
         state : array_like, shape (..., n_state)
             One state or many.
         control : array_like, shape (..., n_controls), optional
-            The controls that are held.
+            The held controls.
 
         Returns
         -------
@@ -384,7 +384,7 @@ class Scene(metaclass=SceneType):
         both = np.stack([np.broadcast_to(slope, (*shape, len(unit))) for slope in slopes], axis=-2)
         return both[..., :n].copy(), both[..., n:].copy()
 
-    # --- what follows: steps -------------------------------------------------------------------------------
+    # --- derived: steps ------------------------------------------------------------------------------------
 
     @property
     def _stepper(self) -> SeriesStepper:
@@ -394,20 +394,20 @@ class Scene(metaclass=SceneType):
 
     @property
     def _lagged(self) -> LaggedStepper:
-        """What steps the equations of motion, closed forms too, where controls are lagged."""
+        """The stepper for lagged controls, also of scenes with a closed form."""
         from lag_envs.stepping.lag import lagged_stepper
 
         return lagged_stepper(self.mechanics)
 
     @property
     def _form(self) -> NormalForm | None:
-        """The equation of motion where it has an exact flow of its own, else None."""
+        """The equation of motion's normal form if it has an exact flow of its own, else None."""
         from lag_envs.stepping.normal_forms import normal_form
 
         return normal_form(self.mechanics)
 
     def _constants(self, lagged: bool = False) -> dict[str, float]:
-        """Return the numbers that a step needs, made from the parameters."""
+        """Return the numbers that a step needs, computed from the parameters."""
         kept = "_cached_lagged_constants" if lagged else "_cached_constants"
         found = vars(self).get(kept)
         if found is None:
@@ -422,19 +422,19 @@ class Scene(metaclass=SceneType):
         return found
 
     def _order(self, dt: float, lagged: bool = False) -> int:
-        """Return the order of the series for a control step; 0 for a closed form, which no lagged one is."""
+        """Return the order of the series for a control step; 0 for a closed form, which is never lagged."""
         if self._form and not lagged:
             return self._form.order(dt)
         return self._series_order(dt)
 
     def _series_order(self, dt: float) -> int:
-        """Return the order by which the general series takes a control step."""
+        """Return the order of the general series for a control step."""
         from lag_envs.stepping.general import usual_order
 
         return vars(self).get(ORDER) or usual_order(dt)
 
     def _limit(self, dt: float, lagged: bool = False) -> float:
-        """Return what a step takes besides dt: the largest x of one series, or the order of the series."""
+        """Return the argument of a step besides dt: the largest x of one series, or the series' order."""
         if self._form and not lagged:
             return self._form.largest_majorant(dt)
         return float(self._order(dt, lagged))
@@ -455,27 +455,27 @@ class Scene(metaclass=SceneType):
         lag: float | Mapping[str, float] | None = None,
         applied: ArrayLike | None = None,
     ) -> Array:
-        """Step the equations of motion with each control held for one step, or lagging behind.
+        """Step the equations of motion, with each control held for one step or lagging behind.
 
         Parameters
         ----------
         state : array_like, shape (n_state,)
-            Start, in the order of `state_names`.
+            The start, in the order of `state_names`.
         controls : array_like, shape (T,) or (T, n_controls); int for a scene without controls
             One set of controls per step, neither clipped nor guarded; or the number of steps.
         dt : float
             Length of a step [s].
         lag : float or mapping from str to float, optional
-            Time constant τ of the actuators [s], or of each by the control's name: the control u that is
-            applied follows the given one, w, by u' = (w - u)/τ. 0 is none, and other times are at least
-            1e-6 dt. Every scene, one with a closed form too, is then stepped by the general series.
+            Time constant τ of the actuators [s], or of each by its control's name: the applied control u
+            follows the given one, w, by u' = (w - u)/τ. 0 means no lag; other values must be at least
+            1e-6 dt. Every scene is then stepped by the general series, even one with a closed form.
         applied : array_like, shape (n_controls,) or (), optional
             Lagged controls at the start; by default they are 0.
 
         Returns
         -------
         ndarray of float64, shape (T + 1, n_state)
-            The states, ``[0]`` being the start.
+            The states; the first is the start.
 
         Raises
         ------
@@ -483,8 +483,8 @@ class Scene(metaclass=SceneType):
             For a state, control, step or lag that is not finite or has the wrong shape, a step not above 0,
             or a lag that is too short or has an unknown name.
         StepRefused
-            Where a step cannot be certified within the cap on substeps, or has no finite result. Its
-            attribute `trajectory` holds the rows before that.
+            If a step cannot be certified within the cap on substeps, or has no finite result. Its attribute
+            `trajectory` holds the rows before that step.
         """
         return steps.simulate(self, state, controls, dt, lag, applied)
 
@@ -497,27 +497,27 @@ class Scene(metaclass=SceneType):
         lag: float | Mapping[str, float] | None = None,
         applied: ArrayLike | None = None,
     ) -> StepBound:
-        """Return how a control step is divided, and what its series leave out at most.
+        """Return how a control step is divided, and bounds on its truncation error.
 
         Parameters
         ----------
         state : array_like, shape (n_state,)
-            Where the step begins.
+            Start of the step.
         control : array_like, shape (n_controls,) or ()
-            The controls that are held.
+            The held controls.
         dt : float
             Length of the step [s].
         lag, applied
-            As for `simulate`; a lagged step is one of the general series.
+            As for `simulate`; a lagged step uses the general series.
 
         Returns
         -------
         StepBound
             Substeps, order, and for each entry of the state a proved bound on the truncation error, summed
-            over the substeps; rounding, and the growth of earlier substeps' errors along the motion, come on
-            top. The bound of a pendulum is proved before the step, for plain substeps; where heavy damping
+            over the substeps. Rounding, and the growth of earlier substeps' errors along the motion, are not
+            included. The bound of a pendulum is proved before the step, for plain substeps; if heavy damping
             makes it follow the slow manifold instead, accuracy is tested, not proved. Linear motion is
-            stepped to rounding: in closed form, or by a series whose rest is below it.
+            stepped to rounding: in closed form, or by a series whose remainder is below rounding.
 
         Raises
         ------
@@ -546,36 +546,36 @@ class Scene(metaclass=SceneType):
         *,
         parameters: Sequence[str] | None = None,
     ) -> tuple[Array, ...]:
-        """Return the derivatives of the state after a control step by the state before it and by controls.
+        """Return the derivatives of the state after a control step with respect to state and controls.
 
-        The derivatives go through the same series and substeps as the step itself.
+        The derivatives use the same series and substeps as the step itself.
 
         Parameters
         ----------
         state : array_like, shape (..., n_state)
-            Where the step begins.
+            Start of the step.
         control : array_like, shape (..., n_controls), or (...) for one control
-            The controls that are held.
+            The held controls.
         dt : float
             Length of the step [s].
         parameters : sequence of str, optional
-            Names of parameters by which derivatives are wanted too. The others are held, those that would
-            follow from it by default too.
+            Names of parameters with respect to which derivatives are wanted too. All others are held, even
+            those whose default would follow them.
 
         Returns
         -------
         A : ndarray, shape (..., n_state, n_state)
-            By the state.
+            With respect to the state before the step.
         B : ndarray, shape (..., n_state, n_controls)
-            By the controls.
+            With respect to the controls.
         P : ndarray, shape (..., n_state, n_parameters)
-            By the parameters, per unit of each; only where they were asked for.
+            With respect to the parameters, per unit of each; only if `parameters` is given.
 
         Raises
         ------
         ValueError, StepRefused
-            As `simulate` does; ValueError also for a parameter that the scene lacks, or by which the motion
-            has no derivative, as it may be where it is 0.
+            As `simulate` does; ValueError also for a parameter that the scene lacks, or that the motion is
+            not differentiable in, as may happen at 0.
 
         Examples
         --------
@@ -595,26 +595,26 @@ class Scene(metaclass=SceneType):
         *,
         parameters: Sequence[str] | None = None,
     ) -> tuple[Array, ...]:
-        """Return a gradient by the state after a control step as gradients by what the step depends on.
+        """Pull a gradient back through a control step (vector-Jacobian product).
 
-        This is reverse mode: row by row the product of `cotangent` with what `jacobian` returns, in less
-        time.
+        This is reverse mode: the product of `cotangent` with each result of `jacobian`, for each row, but
+        faster.
 
         Parameters
         ----------
         state, control, dt, parameters
             As for `jacobian`.
         cotangent : array_like, shape (..., n_state)
-            The gradient of something by the entries of the state after the step.
+            A gradient with respect to the state after the step.
 
         Returns
         -------
         state : ndarray, shape (..., n_state)
-            Its gradient by the state before the step.
+            The gradient with respect to the state before the step.
         control : ndarray, shape (..., n_controls)
-            By the controls.
+            The gradient with respect to the controls.
         parameters : ndarray, shape (..., n_parameters)
-            By the parameters; only where they were asked for.
+            The gradient with respect to the parameters; only if `parameters` is given.
 
         Raises
         ------
@@ -631,7 +631,7 @@ class Scene(metaclass=SceneType):
         return steps.vjp(self, state, control, dt, cotangent, parameters)
 
     def _mechanics_by(self, parameters: tuple[str, ...]) -> Mechanics:
-        """Return the equations of motion with these parameters in them, be they 0."""
+        """Return the equations of motion with these parameters kept in them, even if they are 0."""
         if not set(parameters) & set(self.mechanics.zeros):
             return self.mechanics
         known = vars(self).setdefault("_cached_mechanics_by", {})
@@ -650,25 +650,24 @@ class Scene(metaclass=SceneType):
     ) -> Fit:
         """Fit parameters to recordings of the motion.
 
-        Least squares of what was measured less what is simulated, of all recordings together: the most
-        likely parameters where the noise is normal and independent. The start of each recording is unknown
-        too. The search is by multiple shooting with exact derivatives: it cuts recordings into short pieces,
-        so that it finds its way from parameters that are far off and along chaotic motions, and closes the
-        gaps between them.
+        The fit minimises the squared differences between measurements and simulation, of all recordings
+        together: this gives the most likely parameters if the noise is normal and independent. The start of
+        each recording is unknown too. The search is by multiple shooting with exact derivatives: it cuts
+        recordings into short pieces, so that it converges from poor initial parameters and along chaotic
+        motions, and then closes the gaps between the pieces.
 
         Parameters
         ----------
         recordings : sequence of (states, controls, dt)
-            ``states``, shape (N, n_state), at equal intervals ``dt`` [s]; NaN where nothing was measured, be
-            it a sample or a whole column. Angles that were measured within one turn may jump by 2π.
-            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; a last
-            one for the last sample may be there and is not used. None where all are 0, or there is none.
+            ``states``, shape (N, n_state), at equal intervals ``dt`` [s]; NaN where nothing was measured,
+            for single samples or a whole column. Angles measured within one turn may jump by 2π.
+            ``controls``, shape (N - 1,) or (N - 1, n_controls), each held from one sample to the next; one
+            more for the last sample is allowed and ignored. None if all are 0, or there is none.
         free : sequence of str
-            The parameters to find. The search begins with the scene's values. Others are held, except those
-            with the value that their default makes from others: they go on following.
+            The parameters to find. The search begins with the scene's values. Others are held, except
+            parameters that have the default value computed from others: they keep following those.
         noise : mapping from str to float, optional
-            Standard deviation of the measurements of each state. By default it is estimated, each state's its
-            own.
+            Standard deviation of the measurements of each state. By default it is estimated for each state.
         level : float, default 0.95
             Level of the confidence intervals.
 
@@ -681,23 +680,23 @@ class Scene(metaclass=SceneType):
         Warns
         -----
         FitWarning
-            Where data determine a parameter badly or two hardly apart, where residuals are larger than the
-            noise or not independent. `Fit.warnings` has the texts.
+            If the data determine a parameter poorly or can hardly tell two apart, or if residuals are larger
+            than the noise or not independent. `Fit.warnings` has the texts.
 
         Raises
         ------
         ValueError
-            For data that do not determine the parameters, naming those; for a parameter that the scene lacks;
+            For data that do not determine the parameters, naming these; for a parameter that the scene lacks;
             for recordings of a wrong shape, with too few values, or with controls that are not finite.
         StepRefused
-            Where the motion cannot be simulated with the parameters that the search begins with.
+            If the motion cannot be simulated with the initial parameters.
         """
         from lag_envs.scenes.fitting.fit import fit
 
         return fit(self, recordings, free, noise, level)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: parameters, state, controls, equations."""
+        """Return the HTML of a notebook: parameters, state, controls, equations."""
         from lag_envs.scenes.html import described
 
         return described(self)
@@ -721,26 +720,26 @@ class Scene(metaclass=SceneType):
         applied: Any = None,
         parameters: Any = (),
     ) -> Scene:
-        """Return a scene of SymPy expressions.
+        """Return a scene made from SymPy expressions.
 
         Parameters
         ----------
         name : str
-            Name of its class.
+            Name of the scene's class.
         kinetic, potential, dissipation : SymPy expression
             The energies [J], and Rayleigh's function [W].
         coordinates, prescribed, controls : dict from symbol to str
             Free and prescribed coordinates and controls with their units. The velocity of a function of time
-            is its derivative, ``theta.diff(t)``, that of a plain symbol ``theta`` the symbol ``theta_dot``.
+            is its derivative, ``theta.diff(t)``; that of a plain symbol ``theta`` is ``theta_dot``.
         applied : dict from symbol to expression, optional
             Generalised forces by coordinate.
         parameters : dict from symbol to float
-            The other symbols with their numbers.
+            All other symbols with their numbers.
 
         Returns
         -------
         Scene
-            A scene with these numbers. Called with keywords it gives one with others: ``scene(m=2.0)``.
+            A scene with these numbers. Call it to change some: ``scene(m=2.0)``.
 
         Examples
         --------
@@ -779,7 +778,7 @@ class Scene(metaclass=SceneType):
         state : array_like, shape (n_state,)
             Start.
         control : float or array_like, shape (n_controls,)
-            The controls that are held.
+            The held controls.
         dt : float
             Length of the step [s].
         nodes : int, default 16
@@ -788,19 +787,19 @@ class Scene(metaclass=SceneType):
         Returns
         -------
         dict
-            ``change`` of energy, or of Jacobi's integral where `energy` has it; ``work`` of drive and applied
+            ``change`` of energy, or of Jacobi's integral if `energy` has it; ``work`` of drive and applied
             forces, ``loss`` to drag, and ``residual`` = change - work + loss.
         """
         return steps.energy_balance(self, state, control, dt, nodes)
 
 
 def _shaped(value: Any, shape: tuple[int, ...]) -> Any:
-    """Return a float64 array of a shape, or a number where the shape is empty."""
+    """Return a float64 array of a shape, or a number if the shape is empty."""
     return np.broadcast_to(np.asarray(value, dtype=np.float64), shape).copy()[()]
 
 
 def _restore(cls: type[Scene], state: dict[str, Any]) -> Scene:
-    """Return a scene from a pickle, perhaps the first of its class in this process."""
+    """Return a scene from a pickle; it may be the first of its class in this process."""
     complete(cls)
     scene = object.__new__(cls)
     for name, value in state.items():

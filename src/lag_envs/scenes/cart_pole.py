@@ -74,7 +74,7 @@ class CartPole(Scene):
         return self.pole_mass * self.gravity * self.half_length * xp.cos(q.theta)
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the friction's loss [W]."""
+        """Return half of the power lost to friction [W]."""
         return 0.5 * self.friction * v.x**2
 
     def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
@@ -82,11 +82,11 @@ class CartPole(Scene):
         return {"x": u.force}
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of cart and pole."""
+        """Return the poses of cart and pole."""
         return {"cart": (q.x, 0.0, 0.0), "pole": (q.x, 0.0, -q.theta)}
 
     def bodies(self) -> Bodies:
-        """Return the rail, the cart, the pole upright, and an arrow for the force."""
+        """Return the rail, the cart, the upright pole, and an arrow for the force."""
         size, long = 0.2 * self.half_length, 2.0 * self.half_length
         wide = 0.3 * size
         return {
@@ -102,5 +102,5 @@ class CartPole(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the rail is, which shows no end, and the arrow."""
+        """Return the poses of the rail, which shows no end, and of the arrow."""
         return {"rail": (now.q.x, 0.0), "push": (now.q.x, 0.0, -0.5 * math.pi, now.share.force)}

@@ -1,4 +1,4 @@
-r"""A chain of equal bars that hangs from a support, which moves.
+r"""A chain of equal bars hanging from a moving support.
 
 ::
 
@@ -101,12 +101,12 @@ class Chain(Scene):
         return total
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the joints' loss [W]."""
+        """Return half of the power lost in the joints [W]."""
         bends = [v[0], *(v[i] - v[i - 1] for i in range(1, self.bars))]
         return 0.5 * self.damping * sum(bend**2 for bend in bends)
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of support and bars."""
+        """Return the poses of support and bars."""
         x, y = q.s, q.rise
         poses = {"support": (x, y, 0.0)}
         for i in range(self.bars):
@@ -115,7 +115,7 @@ class Chain(Scene):
         return poses
 
     def bodies(self) -> Bodies:
-        """Return the rail, the support, the bars as they hang down, and an arrow for the acceleration."""
+        """Return the rail, the support, the bars hanging down, and an arrow for the acceleration."""
         wide, high = 0.2 * self.length, 0.08 * self.length
         return {
             "ground": shapes.rail(self.track, self.reach),
@@ -126,7 +126,7 @@ class Chain(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the rail without end and the arrow are."""
+        """Return the poses of the rail without ends and of the arrow."""
         return {"line": (now.q.s, 0.0), "push": (now.q.s, 0.0, -0.5 * math.pi, now.share[0])}
 
     @property

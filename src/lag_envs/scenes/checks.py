@@ -1,4 +1,4 @@
-"""Checks on what is given, and the error for a step that is refused."""
+"""Checks on arguments, and the error for a refused step."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must not
-#: vanish or overflow.
+#: Masses and lengths below this, and any parameter above its inverse, are refused: a product of five must
+#: neither vanish nor overflow.
 SMALLEST = 1e-60
 
 
 class StepRefused(ArithmeticError):
-    """A step that cannot be taken to full accuracy, or that has no finite result.
+    """A step that cannot be taken to full accuracy, or has no finite result.
 
     Attributes
     ----------
     trajectory : array of shape (steps + 1, n_state), or None
-        What `Scene.simulate` had computed before the step.
+        What `Scene.simulate` computed before that step.
     results : tuple, or None
-        What a vector environment's step would have returned for the others.
+        What a vector environment's step would have returned for the other environments.
     """
 
     trajectory: Array | None = None
@@ -34,13 +34,13 @@ class StepRefused(ArithmeticError):
 
 
 def shown(value: Any) -> str:
-    """Return a value as an error shows it, long ones cut short."""
+    """Return a value as text for an error message, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= 200 else f"{text[:150]}... ({len(text)} characters)"
 
 
 def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False) -> float:
-    """Return the value as a finite float, infinity too where it may be `endless`; else raise a ValueError."""
+    """Return the value as a finite float, or infinite if `endless`; else raise a ValueError."""
     if type(value) is np.ndarray and value.ndim == 0:
         value = value[()]
     if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, numbers.Real):
@@ -55,7 +55,7 @@ def check_number(name: str, value: Any, unit: str = "", *, endless: bool = False
 
 
 def real_array(name: str, values: ArrayLike) -> Array:
-    """Return values as a new float64 array, or raise a ValueError that names them."""
+    """Return values as a new float64 array, or raise a ValueError with their name."""
     try:
         array = np.array(values)
     except ValueError as error:  # rows of different lengths
@@ -66,7 +66,7 @@ def real_array(name: str, values: ArrayLike) -> Array:
 
 
 def is_masked(values: Any) -> bool:
-    """Tell whether values are or hold a masked array, whose masked numbers NumPy would take for valid."""
+    """Tell whether values are or hold a masked array; NumPy would take masked numbers for valid ones."""
     if isinstance(values, list | tuple):
         return any(map(is_masked, values))
     return isinstance(values, np.ndarray) and hasattr(values, "mask")
@@ -75,7 +75,7 @@ def is_masked(values: Any) -> bool:
 def check_step(dt: Any) -> float:
     """Return the step as float, or raise a ValueError."""
     dt = check_number("dt", dt, "s")
-    if not dt >= sys.float_info.min:  # what lies between has no inverse
+    if not dt >= sys.float_info.min:  # a subnormal number may have no finite inverse
         raise ValueError(f"dt must be above 0 s, got {dt:g} s")
     return dt
 
@@ -108,7 +108,7 @@ def check_states(scene: Any, states: ArrayLike) -> Array:
 def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
     """Return controls as a float64 array of shape (..., n_controls), or raise a ValueError.
 
-    A single control may stand without its axis; `ndim` is that of the states, by which this is told.
+    A single control may be given without its axis; `ndim`, that of the states, shows whether it was.
     """
     array, names = real_array("the control", control), scene.control_names
     bad = ~np.isfinite(array)
@@ -127,7 +127,7 @@ def check_controls(scene: Any, control: ArrayLike, ndim: int) -> Array:
 
 
 def check_both(scene: Any, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return states and controls with their last axes, and the shape of what follows from both."""
+    """Return states and controls with their last axes, and their common shape without these."""
     states = check_states(scene, state)
     controls = check_controls(scene, control, states.ndim)
     try:
@@ -182,12 +182,12 @@ def check_parameters(scene: Any, parameters: Sequence[str]) -> tuple[str, ...]:
 
 # --- lags ---------------------------------------------------------------------------------------------------
 
-#: A lag is at least this part of the step, or 0: below, a control is where it was sent at once.
+#: A lag is at least this part of the step, or 0: a shorter one would be no different from none.
 SMALLEST_LAG = 1e-6
 
 
 def check_lags(names: tuple[str, ...], lag: Any, dt: float) -> Array:
-    """Return 1/τ of the controls of these names [1/s], 0 where there is no lag; or raise a ValueError.
+    """Return 1/τ for these controls [1/s], 0 for no lag; or raise a ValueError.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def check_lags(names: tuple[str, ...], lag: Any, dt: float) -> Array:
 
 
 def check_applied(names: tuple[str, ...], applied: ArrayLike, decays: Array) -> Array:
-    """Return where controls that lag start, shape (n_controls,), or raise a ValueError."""
+    """Return the starting values of lagged controls, shape (n_controls,), or raise a ValueError."""
     array = real_array("applied", applied)
     if array.ndim == 0 and len(names) == 1:
         array = array[None]

@@ -7,15 +7,16 @@ r"""A cylinder that rolls without slipping inside a hollow cylinder, the shell.
      |      |_a    |     psi     angle of the shell, positive counter-clockwise
       \      \    /      a = R - r, from axis to axis
         ' - -(o)'        gap     distance of the small cylinder from the shell
-                         slip    way of its rim along the shell
+                         slip    displacement of its rim along the shell
 
-Rolling, the cylinder turns at Omega = (R psi' - a theta' + slip')/r::
+If it rolls, the cylinder turns at Omega = (R psi' - a theta' + slip')/r::
 
     T = m ((a - gap)² theta'² + gap'²)/2 + I Omega²/2,   V = -m g (a - gap) cos(theta)
 
-`gap` and `slip` rest at 0; they are there so that the contact's forces follow. A round shell has no
-orientation: a static tilt does nothing, its acceleration drives. Drag acts at the small cylinder's axis, as
-of a medium that turns with the shell. The shell's own inertia is not part of the scene.
+`gap` and `slip` rest at 0; they exist so that the contact's forces can be derived. A round shell has no
+orientation: a static tilt has no effect; its acceleration drives the cylinder. Drag acts at the small
+cylinder's axis, like that of a medium that turns with the shell. The shell's own inertia is not part of the
+scene.
 """
 
 from __future__ import annotations
@@ -55,12 +56,11 @@ class CylinderInCylinder(Scene):
     inertia : float [kg m²], optional
         Moment of inertia I of the small cylinder about its axis; by default solid, mr²/2.
     damping : float [N m s]
-        Coefficient c of the drag -c(θ' - ψ'). It adds to a drag that is the control.
+        Coefficient c of the drag -c(θ' - ψ'). It adds to drag that is the control.
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt"}
-        What the control is: a drag coefficient [N m s] in a fixed shell, or the shell's acceleration ψ''
-        [rad/s²].
+        The control: a drag coefficient [N m s] in a fixed shell, or the shell's acceleration ψ'' [rad/s²].
 
     Notes
     -----
@@ -91,7 +91,7 @@ class CylinderInCylinder(Scene):
 
     @property
     def state(self) -> tuple[str, ...]:
-        """The small cylinder's, then the shell's rate."""
+        """The small cylinder's entries, then the shell's rate."""
         return ("theta", "theta_dot", "psi_dot") if self.control == "tilt" else ()
 
     @property
@@ -101,7 +101,7 @@ class CylinderInCylinder(Scene):
 
     @property
     def reactions(self) -> dict[str, str]:
-        """The contact's forces, and the torque on a shell that turns."""
+        """The contact's forces, and the torque on a turning shell."""
         contact = {"normal": "gap", "friction": "slip"}
         return contact | {"drive_torque": "psi"} if self.control == "tilt" else contact
 
@@ -128,11 +128,11 @@ class CylinderInCylinder(Scene):
         return -self.mass * self.gravity * (self.arm - q.gap) * xp.cos(q.theta)
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the drag's loss [W]."""
+        """Return half of the power lost to drag [W]."""
         return 0.5 * (self.damping + u.drag) * (v.theta - v.psi) * (v.theta - v.psi)
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of shell and cylinder."""
+        """Return the poses of shell and cylinder."""
         spin = (self.shell_radius * q.psi - self.arm * q.theta + q.slip) / self.radius
         return {
             "shell": (0.0, 0.0, q.psi),
@@ -160,7 +160,7 @@ class CylinderInCylinder(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where angle and arrow are: the shell's acceleration beside it, drag at the cylinder."""
+        """Return the poses of angle and arrow: the shell's acceleration beside it, drag at the cylinder."""
         theta, share, quarter = now.q.theta, now.share[0], 0.5 * math.pi
         found = {
             "arm": (0.0, 0.0, theta),

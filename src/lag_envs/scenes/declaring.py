@@ -1,4 +1,4 @@
-"""How a scene's class is made: attributes that cannot be changed, fields, a frozen dataclass."""
+"""How a scene's class is made: read-only attributes, fields, a frozen dataclass."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SEQUENCES = ("state", "left_out")
 DEFINED = (*MAPPINGS, *SEQUENCES, "rests", *recording.ARGUMENTS, "bodies", "indicators", "window", "check")
 
 
-# A class that goes to another process by value before it is used takes its fields along, and in them this
-# mark, which is known by its identity: as a copy it would be taken for a default.
+# If a class is sent to another process by value before its first use, its fields are sent too, and with them
+# this marker. It is recognised by identity: a copy would be taken for a default value.
 copyreg.pickle(type(dataclasses.MISSING), lambda mark: "MISSING")
 
 
 def own_annotations(cls: type) -> dict[str, Any]:
-    """Return the class's own annotations; from Python 3.14 on they may name what is not there yet."""
+    """Return the class's own annotations; from Python 3.14 on they may refer to names not yet defined."""
     if sys.version_info >= (3, 14):
         import annotationlib
 
@@ -37,13 +37,13 @@ def own_annotations(cls: type) -> dict[str, Any]:
 
 
 def _frozen(given: Mapping) -> Mapping:
-    """Return a copy of a mapping, and of those in it, that cannot be changed."""
+    """Return a read-only copy of a mapping and of the mappings in it."""
     items = {key: _frozen(value) if isinstance(value, Mapping) else value for key, value in given.items()}
     return MappingProxyType(items)
 
 
 def complete(cls: type) -> None:
-    """Make the class a frozen dataclass, unless a decorator has."""
+    """Make the class a frozen dataclass, unless a decorator has done so."""
     if cls.__base__ is object:
         raise FormulaError(
             "Scene is the base of scenes; derive a class with coordinates, kinetic and potential"
@@ -53,7 +53,7 @@ def complete(cls: type) -> None:
 
 
 def declare(cls: Any, meta: type[type]) -> None:
-    """Prepare a new class of scenes: its mappings are copied, and what is wrong with its names is noted.
+    """Prepare a new class of scenes: copy its mappings, and note faults in its names.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def declare(cls: Any, meta: type[type]) -> None:
         kind = str(annotations.get(name, "ClassVar")).removeprefix("typing.")
         if kind.startswith("ClassVar"):
             continue
-        # A dataclass would take it for a field; what is wrong is said when the class is used.
+        # A dataclass would take it for a field; the fault is reported when the class is used.
         if isinstance(own.get(name), dataclasses.Field):
             faults.append(f"{name} is part of every scene; give the parameter another name")
             delattr(cls, name)

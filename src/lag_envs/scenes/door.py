@@ -1,4 +1,4 @@
-"""What is checked when a scene's class is used: its names, its formulas, and whether they move."""
+"""Checks made when a scene's class is used: its names, its formulas, and whether the motion is determined."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from lag_envs.scenes.parameters import fill_in
 #: A mass matrix whose smallest eigenvalue is below this, its diagonal scaled to 1, counts as singular.
 SINGULAR = 1e-13
 
-#: What was derived of scenes whose formulas passed the door: by class, and by `Scene._structure`.
+#: Layouts and equations of scenes that passed the checks: by class, and by `Scene._structure`.
 _admitted: weakref.WeakKeyDictionary[type, dict[tuple, tuple[Layout, Mechanics]]] = (
     weakref.WeakKeyDictionary()
 )
 
 
 def is_own(kind: type) -> bool:
-    """Tell whether a class is the package's: then nothing but its structure decides what formulas give.
+    """Tell whether a class is the package's own: then its structure alone decides its formulas' results.
 
-    A formula of somebody else may use what is defined outside, and see it changed.
+    Other people's formulas may use names defined outside, which can change.
     """
     return kind.__module__.startswith("lag_envs.")
 
@@ -71,7 +71,7 @@ def admit(scene: Any, base: type) -> None:
 
 
 def _check_class(cls: type, base: type) -> None:
-    """Raise a FormulaError for what can be seen of a class without running its formulas."""
+    """Raise a FormulaError for faults of a class that show without running its formulas."""
     of = cls.__name__
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         if "drive" in vars(c) and "pack" in vars(c) and "unpack" in vars(c):
@@ -91,13 +91,13 @@ def _check_class(cls: type, base: type) -> None:
 
 
 def _check_names(scene: Any, base: type) -> None:
-    """Raise a FormulaError where a name is taken."""
+    """Raise a FormulaError if a name is taken."""
     cls, of = type(scene), type(scene).__name__
     public = {name for name in dir(base) if not name.startswith("_")}
     for c in cls.__mro__[: cls.__mro__.index(base)]:
         for name in (*own_annotations(c), *vars(c)):
             if name in public and name not in DEFINED:
-                raise FormulaError(f"{of}.{name} hides what every scene has under this name; choose another")
+                raise FormulaError(f"{of}.{name} hides an attribute of every scene; choose another name")
     layout = scene._layout
     derived = [name + ending for name in layout.names for ending in ("", "_dot", "_ddot")]
     taken = {
@@ -120,7 +120,7 @@ def _check_names(scene: Any, base: type) -> None:
 
 
 def _check_bodies(scene: Any) -> None:
-    """Raise a FormulaError where a body has no place, or a force no equation."""
+    """Raise a FormulaError if a body has no pose, or a force no equation."""
     of, found = type(scene).__name__, scene.mechanics
     with recording.formula(scene, "bodies"):
         bodies = scene.bodies()
@@ -138,9 +138,9 @@ def _check_bodies(scene: Any) -> None:
 
 
 def _check_motion(scene: Any, found: Mechanics) -> None:
-    """Raise a FormulaError where the mass matrix cannot be inverted, wherever one looks."""
+    """Raise a FormulaError if the mass matrix is singular wherever it was tried."""
     smallest = _smallest_eigenvalue(scene, found, np.float64, Numeric)
-    if smallest < SINGULAR:  # perhaps since its terms cancel, as where two radii are nearly equal
+    if smallest < SINGULAR:  # perhaps because its terms cancel, as with two nearly equal radii
         smallest = _smallest_eigenvalue(scene, found, Fraction, Exact())
     if smallest < SINGULAR:
         what = "singular" if smallest > -SINGULAR else "not positive"
@@ -151,7 +151,7 @@ def _check_motion(scene: Any, found: Mechanics) -> None:
 
 
 def _smallest_eigenvalue(scene: Any, found: Mechanics, number: Any, xp: Any) -> float:
-    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, where it is largest."""
+    """Return the smallest eigenvalue of the mass matrix, its diagonal scaled to 1, at its largest."""
     n = len(found.free)
     values = {recording.parameter(name): number(getattr(scene, name)) for name in scene._numbers()}
     generator = np.random.default_rng(11)

@@ -1,4 +1,4 @@
-"""Scenes as a notebook shows them: parameters, state, controls and equations."""
+"""Scenes as HTML for notebooks: parameters, state, controls and equations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LONGEST = 150
 
 
 def table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
-    """Return rows of text as a table; what is in a cell is escaped."""
+    """Return rows of text as a table; the text of each cell is escaped."""
     lines = [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"] if head else []
     lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
     return f"<table>{''.join(lines)}</table>"
@@ -31,7 +31,7 @@ def parameters(scene: Any) -> list[tuple[str, str]]:
 
 
 def described(scene: Any) -> str:
-    """Return what a notebook shows of a scene."""
+    """Return a scene's HTML for a notebook."""
     state = ", ".join(
         f"{name} [{unit}]" for name, unit in zip(scene.state_names, scene.state_units, strict=True)
     )
@@ -47,7 +47,7 @@ def described(scene: Any) -> str:
 
 
 def _equations(scene: Any) -> str:
-    """Return Lagrangian and equations of motion, or what is needed to have them."""
+    """Return Lagrangian and equations of motion, or a hint at what they need."""
     if find_spec("sympy") is None:
         return '<p>Its equations need SymPy: <code>pip install "lag-envs[symbolic]"</code></p>'
     import sympy
@@ -76,13 +76,13 @@ def _equations(scene: Any) -> str:
 
 
 def mathml(expression: Any, behind: str = "") -> str:
-    """Return an expression, and text behind it, as MathML, which browsers show; rates have dots."""
+    """Return an expression, and text after it, as MathML, which browsers show; rates have dots."""
     import sympy
     from sympy.core.function import AppliedUndef
     from sympy.printing.mathml import MathMLPresentationPrinter
 
     class Printer(MathMLPresentationPrinter):
-        """Writes names that end with primes with dots above them."""
+        """Writes names that end in primes with dots above them."""
 
         def _print_Symbol(self, symbol: Any, style: str = "plain") -> Any:
             name = symbol.name.rstrip("'")

@@ -6,15 +6,15 @@ r"""A cylinder that rolls without slipping on an incline.
        \ O
         \_____)  phi   tilt; the plane turns about the point x = 0 of its surface
 
-The cylinder's centre is at x along the surface and h = R + lift above it, its rim may slip along::
+The cylinder's centre is at x along the surface and h = R + lift above it; its rim may slip along it::
 
     T = m ((x' + h phi')² + (lift' - x phi')²)/2 + I ((x' + slip')/R + phi')²/2
     V = m g (h cos(phi) - x sin(phi))
 
-`lift` and `slip` rest at 0; they are there so that the contact's forces follow.
+`lift` and `slip` rest at 0; they exist so that the contact's forces can be derived.
 
-While the rate phi' is held, the state carries w = x' + R phi' in place of x': it stays continuous when the
-rate is switched, whereas x' jumps by -R times the switch.
+While the rate phi' is held, the state holds w = x' + R phi' in place of x': w stays continuous when the rate
+is switched, whereas x' jumps by -R times the switch.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ class Incline(Scene):
     inertia : float [kg m²], optional
         Moment of inertia I about the axis; by default that of a solid cylinder, mR²/2.
     damping : float [N s/m]
-        Coefficient c of the drag -cx' at the axis. It adds to a drag that is the control.
+        Coefficient c of the drag -cx' at the axis. It adds to drag that is the control.
     tilt : float [rad], optional
         Fixed tilt φ, at most π/2 to either side, where the plane is vertical; 0.26 by default. Only for the
         control "damping".
     gravity : float [m/s²]
         Field g, downward.
     control : {"damping", "tilt", "tilt_rate"}
-        What the control is: a drag coefficient [N s/m] on the fixed tilt; the tilt φ [rad], quasi-static
-        (each step is one of a fixed plane); or the rate φ' [rad/s] of a moving plane, held over the step.
+        The control: a drag coefficient [N s/m] on the fixed tilt; the tilt φ [rad], quasi-static (in each
+        step the plane is fixed); or the rate φ' [rad/s] of a moving plane, held over the step.
 
     Notes
     -----
     State (x, x_dot); for the control "tilt_rate" (x, w, phi) with w = x' + Rφ'. The zero of the potential
-    energy lies at the height of the point x = 0 of the surface. Friction is positive where it speeds up the
-    turning down the slope and slows the way down.
+    energy lies at the height of the point x = 0 of the surface. Friction is positive if it speeds up the
+    rotation of rolling down and slows the motion down the slope.
 
     Examples
     --------
@@ -88,12 +88,12 @@ class Incline(Scene):
 
     @property
     def state(self) -> tuple[str, ...]:
-        """The cylinder's, then the tilt."""
+        """The cylinder's entries, then the tilt."""
         return ("x", "w", "phi") if self.control == "tilt_rate" else ()
 
     @property
     def reactions(self) -> dict[str, str]:
-        """The contact's forces, and the torque on a plane that turns."""
+        """The contact's forces, and the torque on a turning plane."""
         contact = {"normal": "lift", "friction": "slip"}
         return contact | {"drive_torque": "phi"} if self.control == "tilt_rate" else contact
 
@@ -102,7 +102,7 @@ class Incline(Scene):
         return {"phi": self.tilt} if self.control == "damping" else {}
 
     def check(self) -> None:
-        """Check that the tilt is not given where it is controlled."""
+        """Check that no tilt is given if the tilt is controlled."""
         if self.control != "damping" and self.tilt is not None:
             raise ValueError(
                 f"tilt={self.tilt:g} rad would be ignored: "
@@ -120,16 +120,16 @@ class Incline(Scene):
         return self.mass * self.gravity * ((self.radius + q.lift) * xp.cos(q.phi) - q.x * xp.sin(q.phi))
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the drag's loss [W]."""
+        """Return half of the power lost to drag [W]."""
         return 0.5 * (self.damping + u.drag) * v.x * v.x
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return place and angle of the cylinder; rolling ties its own angle to its place."""
+        """Return the cylinder's pose; rolling determines its angle from its place."""
         turned = -(q.x + q.slip) / self.radius - q.phi
         return {"cylinder": (*self.place(q.x, self.radius + q.lift, q.phi, xp), turned)}
 
     def bodies(self, low: float | None = None, high: float | None = None) -> Bodies:
-        """Return ground from low to high [m], cylinder and tilt, and an arrow for the drag."""
+        """Return the ground from low to high [m], cylinder and tilt, and an arrow for the drag."""
         radius = self.radius
         low, high = (-20.0 * radius, 20.0 * radius) if low is None or high is None else (low, high)
         deep, angle = low - high, self.tilt or 0.0
@@ -146,7 +146,7 @@ class Incline(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where plane, ground and arrow are."""
+        """Return the poses of plane, ground and arrow."""
         x, phi = now.q.x, now.q.phi
         back = xp.where(now.state[1] < 0.0, now.share[0], -now.share[0])
         return {

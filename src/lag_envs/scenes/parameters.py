@@ -1,4 +1,4 @@
-"""How a scene declares its parameters, and the check of each one's range."""
+"""How a scene declares its parameters, and the check of their ranges."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def parameter(
     Parameters
     ----------
     default : float, None, or function of the scene
-        Its value unless another is given. A function takes it from the other parameters:
+        The default value. A function computes it from the other parameters:
         ``lambda bar: bar.mass * bar.com_distance**2 / 3``.
     unit : str
-        Its unit, for tables and errors.
+        Its unit, for tables and error messages.
     above, least, below, most : float, optional
-        The range that it must lie in: above, at least, below, at most.
+        Its range: above, at least, below, at most.
     usable : (float, float)
-        The range in which an environment can be used, whatever its other parameters, see `Task.usable`; a
+        The range in which an environment is usable, whatever its other parameters; see `Task.usable`. The
         scene alone may be stepped beyond it.
     optional : bool
-        Whether None may be given; a default of None says so too.
+        Whether None is allowed; a default of None implies it.
     endless : bool
-        Whether infinity may be given.
+        Whether infinity is allowed.
     """
     made = callable(default)
     return dataclasses.field(
@@ -59,12 +59,12 @@ def parameter(
 
 
 def fill_in(scene: Any) -> None:
-    """Check the parameters of a new scene, each in its range, and make those that follow from others."""
+    """Check that the parameters of a new scene are in range, and compute those that follow from others."""
     fields = {f.name: f for f in dataclasses.fields(scene) if "unit" in f.metadata}
     made = [f for f in fields.values() if f.metadata["made"] and getattr(scene, f.name) is None]
     for field in (*(f for f in fields.values() if f not in made), *made):
         value = getattr(scene, field.name)
-        if field in made:  # where it is out of range, those that it is made from are
+        if field in made:  # if it is out of range, so are the parameters that it is computed from
             value = field.metadata["made"](scene)
             value = None if value is None else check_number(field.name, value)
         elif value is not None or not field.metadata["optional"]:

@@ -66,7 +66,7 @@ class Pendulum(Scene):
         return 0.5 * self.mass * self.gravity * self.length * xp.cos(q.theta)
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of what the hinge loses [W]."""
+        """Return half of the power lost in the hinge [W]."""
         return 0.5 * self.damping * v.theta**2
 
     def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
@@ -74,11 +74,11 @@ class Pendulum(Scene):
         return {"theta": u.torque}
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return the rod's place and angle."""
+        """Return the rod's pose."""
         return {"rod": (0.0, 0.0, q.theta)}
 
     def bodies(self) -> Bodies:
-        """Return the rod as it stands upright, and an arrow for the torque."""
+        """Return the upright rod, and an arrow for the torque."""
         half, long = 0.06 * self.length, self.length
         return {
             "rod": [
@@ -89,5 +89,5 @@ class Pendulum(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the arrow is."""
+        """Return the pose of the arrow."""
         return {"push": (0.0, 0.0, -0.5 * math.pi, now.share.torque)}

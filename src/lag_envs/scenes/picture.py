@@ -1,4 +1,4 @@
-"""The picture of a scene, or of a task on it: shapes in frames, and where the frames are at a moment."""
+"""The picture of a scene, or of a task on it: shapes in frames, and the frames' poses at a moment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lag_envs.scenes.shapes import Frame, Pose, Shape, Window, extent, placed
 if TYPE_CHECKING:
     from lag_envs.scenes.base import Scene
 
-#: The frame of what never moves.
+#: The frame that never moves.
 GROUND = "ground"
 INSTEAD_OF_SHAPES = (
     "a picture is drawn from shapes in frames and from the frames' places; return the shapes by frame from "
@@ -28,12 +28,12 @@ INSTEAD_OF_SHAPES = (
 
 
 class Now(NamedTuple):
-    """What indicators can show, all by name.
+    """The values that indicators can show, all by name.
 
     Attributes
     ----------
     q : Values
-        Places of all coordinates, also of those that the state leaves out.
+        Places of all coordinates, including those that the state leaves out.
     state : Values
         The state.
     share : Values
@@ -55,26 +55,26 @@ class Seen(Numeric):
 
 
 class Picture:
-    """What a painter paints.
+    """The picture that a painter paints.
 
     Parameters
     ----------
     of : Scene or Task
-        Whose picture; a task's is its scene's with what the task adds.
+        The scene or task; a task's picture is its scene's plus its own shapes.
 
     Attributes
     ----------
     frames : list of str
-        The frames, as `poses` has them.
+        The frames, in the order of `poses`.
     shapes : list of (int, Shape)
         Each shape and the number of its frame, from back to front.
     view : Window
-        What `window` moves.
+        The view that `window` moves.
 
     Raises
     ------
     FormulaError
-        Where shapes lie in a frame without a pose.
+        If shapes lie in a frame without a pose.
     """
 
     def __init__(self, of: Any) -> None:
@@ -90,7 +90,7 @@ class Picture:
         self.view = window
 
     def poses(self, now: Frame) -> list[Pose]:
-        """Return where the frames are."""
+        """Return the poses of all frames."""
         return [Pose(*map(float, pose)) for pose in self._poses(now).values()]
 
     def episode(self, states: ArrayLike, controls: ArrayLike, target: Any, dt: float) -> NDArray[np.float64]:
@@ -111,7 +111,7 @@ class Picture:
         n, columns = len(array), list(array.T)
         held = np.zeros((n, len(self._scene.control_names)))
         held[1:] = np.reshape(controls, held[1:].shape)
-        # Exact if the rates are linear between two states, as those of a coordinate that is pushed are.
+        # Exact if the rates are linear between two states, as for a coordinate with held acceleration.
         turned = []
         for rate in turning(self._scene, columns):
             rates = np.broadcast_to(rate, n)
@@ -128,7 +128,7 @@ class Picture:
         return self.view.moved(frame[0], frame[1])
 
     def placed(self, now: Frame) -> list[Shape]:
-        """Return what is to be seen at a moment, from back to front."""
+        """Return the visible shapes at a moment, from back to front."""
         poses = self.poses(now)
         view = self.window(poses)
         return [part for frame, shape in self.shapes for part in placed(shape, poses[frame], view)]
@@ -138,16 +138,16 @@ class Picture:
 
 
 def poses_of(of: Any, now: Frame, xp: Any = None) -> dict[str, Pose]:
-    """Return where the frames of a scene or a task are.
+    """Return the poses of all frames of a scene or a task.
 
     Parameters
     ----------
     of : Scene or Task
-        Whose frames.
+        The scene or task.
     now : Frame
         The moment, or many of them.
     xp : namespace, optional
-        Functions for other numbers than floats and arrays.
+        Functions for numbers other than floats and arrays.
     """
     scene = getattr(of, "scene", of)
     targets = [t.name for t in of.formulas.target_boxes] if of is not scene else []
@@ -164,7 +164,7 @@ def poses_of(of: Any, now: Frame, xp: Any = None) -> dict[str, Pose]:
 
 
 def no_place(of: Any, where: str, frame: str, known: Sequence[str]) -> FormulaError:
-    """Return the error for a frame that nothing places."""
+    """Return the error for a frame without a pose."""
     return FormulaError(
         f"{type(of).__name__}.{where} has {frame!r}, which has no place in poses or indicators "
         f"({', '.join(known)})"
@@ -172,7 +172,7 @@ def no_place(of: Any, where: str, frame: str, known: Sequence[str]) -> FormulaEr
 
 
 def check_shapes(of: Any, frame: str, shapes: Any) -> None:
-    """Raise a FormulaError for what is no list of shapes."""
+    """Raise a FormulaError if something is not a list of shapes."""
     for shape in shapes if isinstance(shapes, Sequence) else [shapes]:
         if not isinstance(shape, Shape) or shape is shapes:
             kinds = ", ".join(kind.__name__ for kind in get_args(Shape))
@@ -208,14 +208,14 @@ def at_rest(scene: Scene) -> Now:
 
 
 def turning(scene: Scene, state: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the rates of the places that the state leaves out, in their order; unknown ones are 0."""
+    """Return the rates of the places that the state leaves out, in order; unknown ones are 0."""
     layout = scene._layout
     rates = {entry.coordinate: state[i] for i, entry in enumerate(layout.state) if entry.kind == "velocity"}
     return tuple(rates.get(name, 0.0) for name in layout.left_out if name in layout.names)
 
 
 def _filled(names: Sequence[str], given: Any) -> dict[str, Any]:
-    """Return numbers by name, 0 where there are none; many moments are given as a list of arrays."""
+    """Return numbers by name, 0 for missing ones; many moments are given as a list of arrays."""
     values = list(given) if isinstance(given, list | tuple) or np.ndim(given) else [given]
     return dict.fromkeys(names, 0.0) | dict(zip(names, values, strict=False))
 
@@ -234,7 +234,7 @@ def places(scene: Scene, now: Frame) -> dict[str, Any]:
 
 
 def window(scene: Scene) -> Window:
-    """Return a window that follows the first body and holds what the others reach."""
+    """Return a window that follows the first body and contains the others' reach."""
     size, first = 1.15 * _reach(scene), next(iter(scene.mechanics.record.poses), "")
     return Window(-size, -size, size, size, first)
 
@@ -243,8 +243,8 @@ def window(scene: Scene) -> Window:
 def _reach(scene: Scene) -> float:
     """Return the largest distance of any body's outline from the first body, over all angles [m].
 
-    A coordinate that the poses have in sines and cosines only is taken for an angle, any other for a length,
-    which is followed for as far as the bodies are large.
+    A coordinate that occurs in the poses only in sines and cosines counts as an angle, any other as a length,
+    which is followed as far as the bodies are large.
     """
     names, record = scene._layout.names, scene.mechanics.record.poses
     sizes = {body: extent(outline) for body, outline in scene.bodies().items() if body in record}
@@ -264,7 +264,7 @@ def _reach(scene: Scene) -> float:
 
 
 def _plain(expr: Expr) -> set[Any]:
-    """Return the places that stand outside sines and cosines."""
+    """Return the places that occur outside sines and cosines."""
     found = set()
     for atom in expr.atoms():
         if atom.kind == "place":

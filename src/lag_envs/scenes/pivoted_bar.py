@@ -92,11 +92,11 @@ class PivotedBar(Scene):
         return self.mass * self.gravity * (q.rise - self.com_distance * xp.cos(q.theta))
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the pivot's loss [W]."""
+        """Return half of the power lost in the pivot [W]."""
         return 0.5 * self.damping * v.theta * v.theta
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of support and bar."""
+        """Return the poses of support and bar."""
         return {"support": (q.s, q.rise, 0.0), "bar": (q.s, q.rise, q.theta)}
 
     def bodies(self) -> Bodies:
@@ -121,7 +121,7 @@ class PivotedBar(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where rail, angle and arrow are."""
+        """Return the poses of rail, angle and arrow."""
         s, down = now.q.s, -0.5 * math.pi
         return {
             "line": (s, 0.0),
@@ -130,7 +130,7 @@ class PivotedBar(Scene):
         }
 
     def outline(self, role: Role = "body") -> Polygon:
-        """Return the bar as it hangs down."""
+        """Return the bar hanging down."""
         half = 0.035 * self.reach
         near, far = 2.0 * self.com_distance - self.reach - half, self.reach
         return Polygon([(-half, -near), (-half, -far), (half, -far), (half, -near)], role)

@@ -2,15 +2,15 @@ r"""Furuta's pendulum: an arm that a motor turns about the vertical, with a pend
 
 ::
 
-         |               phi     angle of the arm, from above positive counter-clockwise
+         |               phi     angle of the arm, positive counter-clockwise seen from above
          |    r    A
         (|)--------o     theta   angle of the pendulum in the vertical plane across the arm;
          |          \            0 hangs straight down, positive towards growing phi
          |           \ L
                       G
 
-With J the arm's inertia about the vertical, m the pendulum's mass and I its inertia about any axis across it
-through its centre of mass G::
+With J the arm's inertia about the vertical, m the pendulum's mass and I its inertia about any axis
+perpendicular to it through its centre of mass G::
 
     T = (J + m r²) phi'²/2 + m r L phi' theta' cos(theta) + (m L² + I)(theta'² + phi'² sin(theta)²)/2
     V = -m g L cos(theta)
@@ -50,7 +50,7 @@ class RotaryPendulum(Scene):
     Notes
     -----
     State (phi, phi_dot, theta, theta_dot). Control: torque [N m]. The zero of the potential energy lies at
-    the hinge. The defaults are of the size of desktop apparatus.
+    the hinge. The default sizes are those of desktop apparatus.
     """
 
     arm_length: float = parameter(0.2, "m", above=0.0)
@@ -78,7 +78,7 @@ class RotaryPendulum(Scene):
         return -self.mass * self.gravity * self.com_distance * xp.cos(q.theta)
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of what the axes lose [W]."""
+        """Return half of the power lost in both axes [W]."""
         return 0.5 * self.arm_damping * v.phi**2 + 0.5 * self.damping * v.theta**2
 
     def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
@@ -90,7 +90,7 @@ class RotaryPendulum(Scene):
         return {"arm": (0.0, 0.0, q.phi), "pendulum": (1.5 * self.arm_length, 0.0, q.theta)}
 
     def bodies(self) -> Bodies:
-        """Return the arm, the pendulum as it hangs down, and an arrow for the torque."""
+        """Return the arm, the pendulum hanging down, and an arrow for the torque."""
         wide = 0.05 * self.arm_length
         r, long = self.arm_length, 2.0 * self.com_distance
         return {
@@ -106,5 +106,5 @@ class RotaryPendulum(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the arrow is."""
+        """Return the pose of the arrow."""
         return {"push": (0.0, 0.0, -0.5 * math.pi, now.share.torque)}

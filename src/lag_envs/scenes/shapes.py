@@ -1,7 +1,7 @@
-"""What is to be seen of a scene and of a task: plain data in metres, x to the right and y up.
+"""What a scene and a task look like: plain data in metres, x to the right and y up.
 
-A shape lies in a frame, and a pose says where the frame is at a moment. That is all that a painter needs: it
-transforms and paints. A shape names its role and not its colour; how a role looks is the painter's business.
+A shape lies in a frame, and a pose says where the frame is at a moment. A painter needs nothing else: it
+transforms and paints. A shape names its role, not its colour; the painter decides how a role looks.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any, Literal, NamedTuple
 
 Point = tuple[float, float]
 
-#: ``body`` moves by the laws of the scene, ``mark`` is painted on it and ``hole`` cut out of it; ``ground``
-#: and ``frame`` carry it; ``guide`` is a line of thought, such as an angle's zero; ``target``, ``limit`` and
-#: ``action`` belong to the task.
+#: A ``body`` moves by the laws of the scene; a ``mark`` is painted on it and a ``hole`` cut out of it;
+#: ``ground`` and ``frame`` support it; a ``guide`` is an imaginary line, such as an angle's zero; ``target``,
+#: ``limit`` and ``action`` belong to the task.
 Role = Literal["body", "mark", "hole", "ground", "frame", "guide", "target", "limit", "action"]
 
 
@@ -42,14 +42,14 @@ class Circle(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """A line through points [m] that ends in a head."""
+    """A line through points [m] with a head at its end."""
 
     points: Sequence[Point]
     role: Role = "action"
 
 
 class Ruler(NamedTuple):
-    """Ticks below the x axis at every multiple of a step, wherever one looks; `size` is their length [m]."""
+    """Ticks below the x axis at every multiple of a step across the view; `size` is their length [m]."""
 
     step: float
     size: float
@@ -57,7 +57,7 @@ class Ruler(NamedTuple):
 
 
 class Magnifier(NamedTuple):
-    """A round part of the picture [m] that is shown once more, magnified."""
+    """A round part of the picture [m] that is shown a second time, magnified."""
 
     centre: Point
     radius: float
@@ -70,17 +70,17 @@ Bodies = dict[str, Sequence[Shape]]
 
 
 class Pose(NamedTuple):
-    """Where a frame is.
+    """The pose of a frame.
 
     Attributes
     ----------
     x, y : float [m]
         Its origin.
     angle : float [rad]
-        How far it is turned counter-clockwise.
+        Its rotation, counter-clockwise.
     part : float
-        The part of its lines and arrows that is painted, from their start. Where it is negative the frame's
-        mirror image is, with -y for y: an arrow along the y axis then points the other way.
+        The visible part of its lines and arrows, measured from their start. A negative part shows the frame's
+        mirror image, with -y for y: an arrow along the y axis then points the other way.
     """
 
     x: float
@@ -90,7 +90,7 @@ class Pose(NamedTuple):
 
 
 class Window(NamedTuple):
-    """The part of the plane that is to be seen [m]; it moves with the origin of a frame, if it names one."""
+    """The visible part of the plane [m]; it moves with the origin of a frame if it names one."""
 
     left: float
     bottom: float
@@ -99,25 +99,25 @@ class Window(NamedTuple):
     frame: str = ""
 
     def moved(self, x: float, y: float) -> Window:
-        """Return the window elsewhere."""
+        """Return the window moved to another place."""
         return Window(self.left + x, self.bottom + y, self.right + x, self.top + y)
 
 
 class Frame(NamedTuple):
-    """What a picture shows; with arrays in place of numbers it is many moments.
+    """The content of a picture; with arrays in place of numbers, of many pictures.
 
     Attributes
     ----------
     state : sequence of float
         The state, in the scene's order.
     control : float or sequence of float
-        The controls that were applied last, in SI units.
+        The controls applied last, in SI units.
     share : float or sequence of float
-        The same as shares of the task's largest controls; the lengths of arrows.
+        The same as shares of the task's largest controls; they are the lengths of arrows.
     target : float, sequence of float or None
         The episode's targets.
     turned : float or sequence of float
-        The places that the state leaves out, see `picture.turning`.
+        The places that the state leaves out; see `picture.turning`.
     """
 
     state: Sequence[Any]
@@ -148,17 +148,17 @@ def arc(centre: Point, radius: float, start: float, end: float, n: int = 0) -> l
 
 
 def torque(radius: float) -> list[Shape]:
-    """Return an arrow around a joint [m], from the x axis on."""
+    """Return an arrow around a joint [m], starting at the x axis."""
     return [Arrow(arc((0.0, 0.0), radius, 0.0, 2.0 * math.pi / 3.0))]
 
 
 def outlines(shapes: Sequence[Shape]) -> list[Shape]:
-    """Return the areas among shapes, as where something should get."""
+    """Return the outlines of shapes with an area, as for a goal."""
     return [shape._replace(role="target") for shape in shapes if isinstance(shape, Polygon)]
 
 
 def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
-    """Return a shape of a frame in the plane, as somebody sees it who looks at a window."""
+    """Return the visible part of a shape, moved from its frame to the plane."""
     x, y, angle, part = pose
     c, s, way = math.cos(angle), math.sin(angle), -1.0 if part < 0.0 else 1.0
 
@@ -178,11 +178,11 @@ def placed(shape: Shape, pose: Pose, view: Window) -> list[Shape]:
 
 
 def ruled(ruler: Ruler, pose: Pose, view: Window) -> list[float]:
-    """Return where along its axis a ruler has ticks [m], as far as somebody sees who looks at a window."""
+    """Return the places of a ruler's visible ticks along its axis [m]."""
     across, up = 0.5 * (view.left + view.right) - pose.x, 0.5 * (view.bottom + view.top) - pose.y
     middle = math.cos(pose.angle) * across + math.sin(pose.angle) * up
     far = 2.0 * max(view.right - view.left, view.top - view.bottom)
-    # Finer than any eye could tell, there are none.
+    # Ticks too fine to see are left out.
     return ticks(middle - far, middle + far, ruler.step) if far < 5_000.0 * ruler.step else []
 
 
@@ -215,7 +215,7 @@ def extent(shapes: Sequence[Shape]) -> float:
 def roller(radius: float, ratio: float) -> list[Shape]:
     """Return a rolling cylinder about the origin [m].
 
-    The ratio I/(m r²) above 1/2 is that of a tube, which is drawn to scale.
+    A ratio I/(m r²) above 1/2 makes it a tube, which is drawn to scale.
     """
     hollow = min(math.sqrt(max(2.0 * ratio - 1.0, 0.0)), 0.95) * radius
     centre, quarter = (0.0, 0.0), 0.5 * math.pi
@@ -225,7 +225,7 @@ def roller(radius: float, ratio: float) -> list[Shape]:
 
 
 def half_turn(radius: float) -> Line:
-    """Return the line along which an angle is shown: from the x axis, all of it half a turn."""
+    """Return the arc that shows an angle: from the x axis, half a turn when complete."""
     return Line(arc((0.0, 0.0), radius, 0.0, math.pi), "guide")
 
 
@@ -235,14 +235,14 @@ def share_of_half_turn(angle: Any, xp: Any) -> Any:
 
 
 def rail(track: float | None, reach: float) -> list[Shape]:
-    """Return what of a rail stays where it is: a track with its ends, or the ticks of one without.
+    """Return the fixed part of a rail: a track with its ends, or the ticks of a track without ends.
 
     Parameters
     ----------
     track : float [m] or None
-        Half length of the track; infinity for one without an end, None for none.
+        Half length of the track; infinity for a track without ends, None for no track.
     reach : float [m]
-        Size of what hangs from the support.
+        Size of the body that hangs from the support.
     """
     if track is None:
         return [Line([(-2.0 * reach, 0.0), (2.0 * reach, 0.0)], "guide")]
@@ -257,23 +257,23 @@ def rail(track: float | None, reach: float) -> list[Shape]:
 
 
 def rail_without_end(track: float | None, reach: float) -> list[Shape]:
-    """Return the part of a track without ends that goes along with the support."""
+    """Return the part of a track without ends that moves with the support."""
     return [Line([(-3.0 * reach, 0.0), (3.0 * reach, 0.0)], "frame")] if track == math.inf else []
 
 
 def window_on_rail(track: float | None, tall: float) -> Window:
-    """Return a window on the whole track and as far around [m], or one that follows the support."""
+    """Return a window on the whole track with a margin [m], or one that follows the support."""
     if track is None or math.isinf(track):
         return Window(-tall, -tall, tall, tall, "support")
     return Window(-track - tall, -tall, track + tall, tall)
 
 
 def ticks(low: float, high: float, step: float) -> list[float]:
-    """Return the multiples of a step that lie between two numbers."""
+    """Return the multiples of a step between two numbers."""
     return [i * step for i in range(math.ceil(low / step - 1e-6), math.floor(high / step + 1e-6) + 1)]
 
 
 def round_length(length: float) -> float:
-    """Return the largest of 1, 2, 5, 10, ... and their parts by ten that is at most the length."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most the length."""
     power = 10.0 ** math.floor(math.log10(length))
     return power * max(step for step in (1.0, 2.0, 5.0) if step == 1.0 or step * power <= 1.000001 * length)

@@ -1,4 +1,4 @@
-"""Control steps of a scene: what its calls `simulate`, `step_bound`, `jacobian` and `energy_balance` do."""
+"""Control steps of a scene: the code of its `simulate`, `step_bound`, `jacobian` and `energy_balance`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def simulate(
 
 
 def _lagging(scene: Scene, lag: Any, applied: Any, dt: float) -> tuple[Array | None, Array]:
-    """Return 1/τ of the controls, or None where none lags, and where they start."""
+    """Return 1/τ of the controls, or None if none lags, and their starting values."""
     names = scene.control_names
     decays = np.zeros(len(names)) if lag is None else check_lags(names, lag, dt)
     reached = np.zeros(len(names)) if applied is None else check_applied(names, applied, decays)
@@ -76,7 +76,7 @@ def _lagging(scene: Scene, lag: Any, applied: Any, dt: float) -> tuple[Array | N
 
 
 def _numbers(scene: Scene, code: Any, lagged: bool) -> list[float]:
-    """Return the constants that the code of a step takes."""
+    """Return the constants that the step's code takes."""
     constants = scene._constants(lagged)
     return [constants[name.removeprefix("k_")] for name in code.constants]
 
@@ -155,14 +155,14 @@ def pulled(
     by: tuple[str, ...],
     rows: Sequence[int] | None = None,
 ) -> Array:
-    """Return what `vjp` does for rows of checked arrays, side by side; `rows` are what errors call them."""
+    """Return `vjp` of rows of checked arrays, side by side; `rows` are their numbers in error messages."""
     found, refused = _derivatives(scene, by).vjp(states, controls, dt, cotangents)
     _check_refused(scene, states, controls, dt, refused, rows)
     return found
 
 
 def _rows(scene: Scene, state: ArrayLike, control: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    """Return states and controls as rows, and the shape of what they were."""
+    """Return states and controls as rows, and the shape that they share."""
     *both, shape = check_both(scene, state, control)
     states, controls = (
         np.array(np.broadcast_to(x, (*shape, x.shape[-1])), order="C").reshape(math.prod(shape), x.shape[-1])
@@ -188,7 +188,7 @@ class _Derivatives(NamedTuple):
 
 
 def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
-    """Return the derivatives of steps by states, controls and parameters."""
+    """Return the derivatives of steps with respect to states, controls and parameters."""
     known = vars(scene).setdefault("_cached_derivatives", {})
     if by in known:
         return known[by]
@@ -213,8 +213,8 @@ def _derivatives(scene: Scene, by: tuple[str, ...]) -> _Derivatives:
     except (ArithmeticError, ValueError) as error:
         given = ", ".join(f"{name}={numbers[name]:g}" for name in by)
         raise ValueError(
-            f"the motion has no derivative by the parameters at {given}: {error}; leave out those that "
-            "are 0 where a formula divides by them"
+            f"the motion has no derivative with respect to the parameters at {given}: {error}; leave out "
+            "those that are 0 and that a formula divides by"
         ) from error
     return known[by]
 
@@ -248,7 +248,7 @@ def refusal(
     where: str,
     lagged: bool = False,
 ) -> StepRefused:
-    """Return the error for a step that was refused."""
+    """Return the error for a refused step."""
     start = ", ".join(f"{n}={v:g}" for n, v in zip(scene.state_names, state, strict=True))
     held = zip(scene.control_names, np.atleast_1d(np.asarray(control, dtype=np.float64)), strict=True)
     why = "it could not be certified within the largest number of substeps"

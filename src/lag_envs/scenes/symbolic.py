@@ -1,6 +1,6 @@
-"""SymPy's side of a scene: Lagrangian and Euler-Lagrange equations of a scene, and a scene of expressions.
+"""A scene in SymPy: its Lagrangian and Euler-Lagrange equations, and scenes made from expressions.
 
-The expressions are made by passing symbols through the very formulas that numbers pass through.
+The expressions are made by passing symbols through the same formulas as numbers.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ def decimal(expression: Any) -> sympy.Expr:
 
 
 def binary(expression: Any) -> sympy.Expr:
-    """Return an expression with the rational numbers that its floats are, to the last bit."""
+    """Return an expression with the exact rational numbers that its floats stand for."""
     expression = sympy.sympify(expression)
     return expression.xreplace({number: sympy.Rational(number) for number in expression.atoms(sympy.Float)})
 
 
 def _functions(of: Callable[[Any], Any], rational: Callable[[Any], sympy.Expr]) -> types.SimpleNamespace:
-    """Return the namespace of a formula on SymPy's expressions; functions are taken of what `of` returns."""
+    """Return the namespace of a formula on SymPy's expressions; `of` is applied to functions' arguments."""
 
     def taken(function: Any) -> Callable[[Any], Any]:
         return lambda x: function(of(x))
@@ -50,8 +50,8 @@ def _functions(of: Callable[[Any], Any], rational: Callable[[Any], sympy.Expr]) 
     )
 
 
-#: The namespace ``xp`` of a formula on SymPy's expressions, which people read; and one where a float is the
-#: number that it is, and no function is taken of one.
+#: Namespaces ``xp`` of a formula on SymPy's expressions: one for people to read, and one in which a float is
+#: its exact value and no function is called on floats.
 Symbolic, Exact = _functions(lambda x: x, decimal), _functions(binary, binary)
 
 
@@ -59,7 +59,7 @@ Symbolic, Exact = _functions(lambda x: x, decimal), _functions(binary, binary)
 
 
 def symbolic(scene: Scene) -> Any:
-    """Return a twin of the scene whose parameters are symbols of their names."""
+    """Return a twin of the scene whose parameters are symbols with their names."""
     ranges = {f.name: f.metadata for f in dataclasses.fields(scene)}  # type: ignore[arg-type]
     symbols = {}
     for name in scene._numbers():
@@ -83,7 +83,7 @@ def motion(scene: Scene) -> tuple[Values, Values, Values]:
 
 
 def _resting(scene: Scene, expression: sympy.Expr, xp: Any) -> sympy.Expr:
-    """Return an expression in which what rests is where it rests."""
+    """Return an expression with resting coordinates at their resting places."""
     values: dict[Any, Any] = {}
     rests = symbolic(scene).rests()
     for p in scene._layout.at("rest"):
@@ -103,16 +103,16 @@ def lagrangian(scene: Scene, xp: Any = Symbolic) -> sympy.Expr:
 
 
 def euler_lagrange(scene: Scene, coordinate: str, xp: Any = Symbolic) -> sympy.Expr:
-    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force that it takes.
+    """Return d/dt ∂L/∂q' - ∂L/∂q + ∂D/∂q' - Q: zero for a free coordinate, else the force needed.
 
     Parameters
     ----------
     scene : Scene
-        The scene; its numbers do not matter.
+        The scene; the values of its parameters do not matter.
     coordinate : str
-        A coordinate that is free, moves, or rests.
+        A free, moving or resting coordinate.
     xp : namespace, default `Symbolic`
-        Functions of SymPy's expressions; with `Exact` the formulas' floats are taken to the last bit.
+        Functions of SymPy's expressions; with `Exact` the formulas' floats keep their exact values.
     """
     copy, (q, v, u) = symbolic(scene), motion(scene)
     of, rate, energy = q[coordinate], v[coordinate], _lagrangian(scene, xp)
@@ -141,7 +141,7 @@ def from_sympy(
     applied: Mapping | None,
     parameters: Mapping,
 ) -> Scene:
-    """Return a scene of SymPy expressions; see `Scene.from_sympy`."""
+    """Return a scene made from SymPy expressions; see `Scene.from_sympy`."""
     maps = {
         "coordinates": coordinates,
         "controls": controls,
@@ -165,7 +165,7 @@ def from_sympy(
 
 @lru_cache(maxsize=256)
 def _scene_type(name: str, items: tuple, formulas: tuple) -> type[Scene]:
-    """Return a class for these expressions; the same ones give the same class."""
+    """Return a class for these expressions; equal expressions give the same class."""
     given = {what: dict(pairs) for what, pairs in items}
     expressions = dict(formulas)
     named = {what: {_name(key): value for key, value in of.items()} for what, of in given.items()}
@@ -238,7 +238,7 @@ def evaluate(expression: Any, values: Mapping[Any, Any], xp: Any) -> Any:
     Parameters
     ----------
     expression : sympy.Expr
-        What to evaluate.
+        The expression.
     values : mapping
         A number for each symbol.
     xp : namespace

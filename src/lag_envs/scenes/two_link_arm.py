@@ -8,8 +8,8 @@ r"""A robot's arm of two links in a vertical plane, with a motor in each joint a
                    theta_2   angle of the forearm against the upper arm,
                              both positive counter-clockwise
 
-With l the lengths of the uniform links, m their masses and p the load's, G their centres at half length, and
-w = theta_1' or theta_1' + theta_2' their rates::
+With l the lengths of the uniform links, m their masses and p the load's mass, G the links' centres at half
+length, and w = theta_1' or theta_1' + theta_2' their rates::
 
     T = Σ (m |G'|² + m l² w²/12)/2 + p |C'|²/2,   V = g (Σ m y(G) + p y(C))
 
@@ -34,9 +34,9 @@ class TwoLinkArm(Scene):
     mass_1, mass_2 : float [kg]
         Masses m of upper arm and forearm, uniform bars.
     length_1, length_2 : float [m]
-        Lengths l of the two.
+        Lengths l of upper arm and forearm.
     load : float [kg]
-        Mass p of a point in the hand.
+        Mass p of a point mass in the hand.
     damping : float [N m s]
         Coefficient b of the viscous torque in both joints.
     gravity : float [m/s²]
@@ -65,7 +65,7 @@ class TwoLinkArm(Scene):
         first, second = v.theta_1, v.theta_1 + v.theta_2
 
         def point(mass: Any, upper: Any, fore: Any) -> Any:
-            """Return twice the energy of a mass that far along upper arm and forearm."""
+            """Return twice the energy of a mass at these distances along upper arm and forearm."""
             a, b = upper * first, fore * second
             return mass * (a**2 + b**2 + 2 * a * b * xp.cos(q.theta_2))
 
@@ -86,7 +86,7 @@ class TwoLinkArm(Scene):
         return self.gravity * (links + self.load * (upper + fore))
 
     def dissipation(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
-        """Return half of the joints' loss [W]."""
+        """Return half of the power lost in the joints [W]."""
         return 0.5 * self.damping * (v.theta_1**2 + v.theta_2**2)
 
     def applied(self, q: Any, v: Any, u: Any, xp: Any) -> Any:
@@ -94,7 +94,7 @@ class TwoLinkArm(Scene):
         return {"theta_1": u.shoulder, "theta_2": u.elbow}
 
     def poses(self, q: Any, xp: Any) -> Any:
-        """Return places and angles of the links."""
+        """Return the poses of the links."""
         elbow = self.length_1 * xp.cos(q.theta_1), self.length_1 * xp.sin(q.theta_1)
         return {"upper_arm": (0.0, 0.0, q.theta_1), "forearm": (*elbow, q.theta_1 + q.theta_2)}
 
@@ -109,7 +109,7 @@ class TwoLinkArm(Scene):
         }
 
     def indicators(self, now: Any, xp: Any) -> dict[str, Any]:
-        """Return where the arrows are."""
+        """Return the poses of the arrows."""
         x, y, _ = self.poses(now.q, xp)["forearm"]
         return {"shoulder": (0.0, 0.0, 0.0, now.share.shoulder), "elbow": (x, y, 0.0, now.share.elbow)}
 

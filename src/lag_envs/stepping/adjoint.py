@@ -1,12 +1,13 @@
-"""Reverse mode on a record: from the operations of a formula those of its derivatives.
+"""Reverse mode on a record: from the operations of a formula to the operations of its derivatives.
 
 A formula is run on the recording numbers of `Differentiable`, which keeps sines and exponentials whole. The
-record is then walked backwards, and what each operation passes on to its operands is recorded too. The
-result is printed like any other record, with the same arithmetic for sines (`stepping/elementary.py`).
+record is then walked backwards, and the contributions of each operation to its operands' cotangents are
+recorded too. The result is printed like any other record, with the same arithmetic for sines
+(`stepping/elementary.py`).
 
-Where a formula has kinks the derivative is that of the branch that its value came from: of ``minimum`` and
-``maximum`` at a tie that of the first operand, of ``abs`` at 0 that from above. What a comparison or
-``floor`` gives has the derivative 0. A branch that was not taken passes on exactly 0, whatever its numbers.
+Where a formula has kinks, the derivative is that of the branch that was taken: at a tie, ``minimum`` and
+``maximum`` use the first operand; at 0, ``abs`` has the derivative from above. Comparisons and ``floor``
+have the derivative 0. A branch that was not taken contributes exactly 0, whatever its numbers.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from lag_envs.stepping.compiling import compile_function, record_block
 from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.tracing import BOOLEAN, Number, Operation, Trace
 
-#: Lanes whose numbers lie together: few enough for the nearest cache, with all that goes in and out.
+#: Lanes whose numbers lie together: few enough that all inputs and outputs fit into the nearest cache.
 LANES = 64
 
 
@@ -52,12 +53,12 @@ class Differentiable(Trace):
         Parameters
         ----------
         outputs : sequence of number
-            What is differentiated.
+            The numbers to differentiate.
         seeds : sequence of number
             One for each output, its cotangent.
         inputs : sequence of Number
-            By what. Results of earlier operations are independent inputs here: what they were computed from
-            gets nothing through them.
+            The numbers to differentiate with respect to. Results of earlier operations count as independent
+            inputs: nothing is passed on to what they were computed from.
         """
         total: dict[str, Any] = {}
 
@@ -90,7 +91,7 @@ class Differentiable(Trace):
         return [node for node in self._nodes if node.name in needed - inputs]
 
     def _shares(self, node: Number, seed: Any) -> list[tuple[Any, Any]]:
-        """Return the operands of an operation, and what each gets of its cotangent."""
+        """Return an operation's operands, each with its share of the cotangent."""
         a, b, c = (*node.args, None, None)[:3]
         if node.op == "where":
             return [(b, self.where(a, seed, 0.0)), (c, self.where(a, 0.0, seed))]
@@ -118,7 +119,7 @@ class Differentiable(Trace):
 
     @staticmethod
     def _branches(nodes: Sequence[Number]) -> set[str]:
-        """Return the operations that lead into one of two branches: there numbers may be of any kind."""
+        """Return the operations that lead into branches of a selection: their numbers may be anything."""
         found: set[str] = set()
         for node in reversed(nodes):
             operands = node.args[1:] if node.op == "where" else node.args if node.name in found else ()
@@ -149,7 +150,7 @@ class Lanes:
     inputs : sequence of sequence of str
         For each array that is given, the names of its columns.
     constants : sequence of str
-        What the lanes have in common.
+        Numbers that all lanes share.
     absent : collection of str
         Constants that are known to be zero.
     """
@@ -176,7 +177,7 @@ class Lanes:
         used = set(re.findall(r"\w+", " ".join([*lines, *map(str, values)])))
         columns = {n: place for n, place in columns.items() if n in used}
         places = [f"found{i}[first + i, {j}]" for i, x in enumerate(found) for j in range(len(x))]
-        # As in `envs/program.py`: rows at distances known when compiling, so that lanes become vectors.
+        # As in `envs/program.py`: the rows' offsets are known at compile time, so that lanes become vectors.
         row = [f"rows[np.uint64({k * LANES}) + i]" for k in range(len(columns) + len(places))]
         into, out = row[: len(columns)], row[len(columns) :]
         arrays = [f"given{i}" for i in range(len(inputs))], [f"found{i}" for i in range(len(found))]

@@ -1,9 +1,9 @@
 """Compiled functions on disk, one file each, checked before they are used.
 
-Numba's own cache believes its files. A file that lost a byte, be it to a full disk, a killed process or an
-editor, then gives an error deep inside pickle or LLVM, or runs as it is. Here a file begins with what it was
-compiled from and with a digest of its content, and one that does not match is dropped and compiled anew.
-A cache that cannot be written to is done without.
+Numba's own cache trusts its files. A file that lost a byte to a full disk, a killed process or an editor
+causes an error deep inside pickle or LLVM, or runs as it is. Here a file begins with a key of what it was
+compiled from and a digest of its content. A file that does not match is dropped and compiled anew. If the
+cache cannot be written to, nothing is kept.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-#: Bytes that the cache may take; what has not been used for longest goes first.
+#: Maximum size of the cache in bytes; the least recently used files are removed first.
 LIMIT = 256 * 2**20
 
 _MAGIC = b"lag_envs 1"
 _SUFFIX = ".compiled"
 _DAY = 86400.0
-#: The latest Numba that was seen to run loaded code.
+#: The latest Numba known to run loaded code.
 _KNOWN = (0, 68)
 _warned = False
 
 
 class Damaged(Exception):
-    """A file that is not what was written."""
+    """A file whose content is not what was written."""
 
 
 class Entry(NamedTuple):
@@ -46,10 +46,10 @@ class Entry(NamedTuple):
 
 
 def folder() -> Path | None:
-    """Return where compiled functions are kept; None where there is no such place.
+    """Return the folder of compiled functions; None if there is none.
 
-    That is ``lag_envs`` in the folder named by the environment variable ``NUMBA_CACHE_DIR``, or else in the
-    place for caches that the system gives the user.
+    It is ``lag_envs`` in the folder named by the environment variable ``NUMBA_CACHE_DIR``, or else in the
+    system's cache folder of the user.
     """
     named = os.environ.get("NUMBA_CACHE_DIR") or (
         os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
@@ -66,7 +66,7 @@ def folder() -> Path | None:
 
 
 def entries(place: Path) -> list[Entry]:
-    """Return the files in a cache's folder, those used last first; leftovers of killed processes too."""
+    """Return the files in a cache's folder, most recently used first, with leftovers of killed processes."""
     found = []
     with contextlib.suppress(OSError):
         for item in os.scandir(place):
@@ -83,7 +83,7 @@ def clear(place: Path) -> int:
 
 
 def trim(place: Path, limit: int) -> None:
-    """Remove what has not been used for longest until the rest has at most `limit` bytes."""
+    """Remove the least recently used files until the rest has at most `limit` bytes."""
     total = 0
     for entry in entries(place):
         total += entry.size
@@ -92,7 +92,7 @@ def trim(place: Path, limit: int) -> None:
 
 
 def damage(path: Path) -> str:
-    """Return what is wrong with a file of the cache, or an empty string."""
+    """Say what is wrong with a file of the cache; an empty string if nothing is."""
     try:
         return "" if _read(path, None) is not None else "it cannot be read"
     except Damaged as error:
@@ -100,7 +100,7 @@ def damage(path: Path) -> str:
 
 
 def writable(place: Path) -> bool:
-    """Tell whether something can be kept in a folder, which need not exist yet."""
+    """Tell whether files can be kept in a folder, which need not exist yet."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=place):
@@ -117,9 +117,9 @@ def jit(function: Callable, key: str | None = None) -> Any:
     function : callable
         A function that Numba can compile.
     key : str, optional
-        What the result depends on: its own source, and that of all it calls and names. By default the file
-        that defines the function, and the numbers that it names. Types, machine, and the versions of Python
-        and Numba are added.
+        What the result depends on: its own source, and all functions and numbers that it uses. By default the
+        file that defines the function, and the numbers that it uses. Types, machine, and the versions of
+        Python and Numba are added.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def jit(function: Callable, key: str | None = None) -> Any:
 
 
 class _Cache:
-    """What a dispatcher of Numba's asks before it compiles, and tells afterwards; see numba.core.caching."""
+    """A cache that a Numba dispatcher asks before it compiles, and tells after; see numba.core.caching."""
 
     def __init__(self, name: str, key: str) -> None:
         self._name, self._key = re.sub(r"\W", "", name), key
@@ -158,7 +158,7 @@ class _Cache:
         self._enabled = False
 
     def flush(self) -> None:
-        """Forget all that was compiled from this function."""
+        """Forget everything compiled from this function."""
         for entry in entries(folder() or Path()):
             if entry.path.name.startswith(f"{self._name}-"):
                 _remove(entry.path)
@@ -172,7 +172,7 @@ class _Cache:
         return _load(path, key, lambda content: _rebuild(content, target))
 
     def save_overload(self, types: Any, result: Any) -> None:
-        """Keep a compiled function; where that cannot be done nothing happens."""
+        """Keep a compiled function; do nothing if that is impossible."""
         place = folder()
         if not self._enabled or place is None or result.lifted or result.library.has_dynamic_globals:
             return
@@ -181,7 +181,7 @@ class _Cache:
             _save(path, key, _reduce(result))
 
     def _entry(self, place: Path, types: Any, codegen: Any) -> tuple[Path, bytes]:
-        """Return the file for these types on this machine, and the digest of all that it depends on."""
+        """Return the file for these types on this machine, and the digest of everything it depends on."""
         import llvmlite
         from numba import __version__, config
 
@@ -192,16 +192,16 @@ class _Cache:
 
 
 def kept(name: str, parts: str, make: Callable[[], bytes]) -> bytes:
-    """Return what was made once, from the cache.
+    """Return bytes from the cache, or make and keep them.
 
     Parameters
     ----------
     name : str
-        What it is called there.
+        Their name in the cache.
     parts : str
-        All that it depends on.
+        Everything that they depend on.
     make : callable
-        Makes it, where the cache does not have it.
+        Makes them if they are not in the cache.
     """
     folder_now = folder()
     if folder_now is None:
@@ -215,13 +215,13 @@ def kept(name: str, parts: str, make: Callable[[], bytes]) -> bytes:
 
 
 def _place(place: Path, name: str, parts: str) -> tuple[Path, bytes]:
-    """Return the file of what depends on these parts, and their digest."""
+    """Return the file for a result that depends on these parts, and their digest."""
     key = hashlib.sha256(parts.encode()).digest()
     return place / f"{name}-{key[:8].hex()}{_SUFFIX}", key
 
 
 def _load(path: Path, key: bytes, rebuild: Callable[[bytes], Any]) -> Any:
-    """Return what a file holds; None where it is not there, or is dropped."""
+    """Return a file's content; None if it is missing, or is damaged and therefore dropped."""
     try:
         content = _read(path, key)
         return None if content is None else rebuild(content)
@@ -250,20 +250,20 @@ def _rebuild(content: bytes, target: Any) -> Any:
     from numba.core.compiler import CompileResult
     from numba.core.runtime import rtsys
 
-    # Compiled code needs Numba's memory system and none of what it is compiled with; making all that ready
-    # would take longer than all the rest. What a newer Numba needs is not known.
+    # Loaded code needs Numba's memory system but no compiler. Preparing everything would take longer than all
+    # the rest. What a newer Numba needs is not known.
     if tuple(map(int, __version__.split(".")[:2])) <= _KNOWN:
         rtsys.initialize(target)
     else:
         target.refresh()
     try:
         return CompileResult._rebuild(target, *pickle.loads(content))
-    except Exception as error:  # whole, but of another kind than this Numba reads
+    except Exception as error:  # intact, but in a format that this Numba does not read
         raise Damaged(f"{type(error).__name__}: {error}") from error
 
 
 def _read(path: Path, key: bytes | None) -> bytes | None:
-    """Return what was written for a key; None where nothing can be read, `Damaged` where it is not that."""
+    """Return the content written for a key; None if it cannot be read, `Damaged` if it does not match."""
     try:
         with open(
             path, "rb", opener=lambda p, flags: os.open(p, flags | getattr(os, "O_NONBLOCK", 0))
@@ -295,7 +295,7 @@ def _open_now(path: str, flags: int) -> int:
 
 
 def _write(path: Path, key: bytes, content: bytes) -> None:
-    """Write a file at once, so that whoever reads finds all of it or nothing."""
+    """Write a file atomically: readers find all of it or nothing."""
     head = _MAGIC + key
     descriptor, name = tempfile.mkstemp(_SUFFIX, "new-", path.parent)
     try:
@@ -309,7 +309,7 @@ def _write(path: Path, key: bytes, content: bytes) -> None:
 
 
 def _remove(path: Path) -> bool:
-    """Remove a file, or an empty folder in its place, and return whether that went well."""
+    """Remove a file, or an empty folder in its place, and return whether that succeeded."""
     for remove in (os.unlink, os.rmdir):
         with contextlib.suppress(OSError):
             remove(path)
@@ -318,7 +318,7 @@ def _remove(path: Path) -> bool:
 
 
 def _warn(path: Path, error: Damaged) -> None:
-    """Tell of the first damaged file."""
+    """Warn of the first damaged file."""
     global _warned
     if not _warned:
         _warned = True

@@ -1,6 +1,6 @@
 """Compile straight-line code with Numba, and keep the result on disk.
 
-Numba is imported on first use: it takes a while, and brings SciPy along where that is installed.
+Numba is imported on first use: importing takes a while, and also loads SciPy if that is installed.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from typing import Any
 
 from lag_envs.stepping.tracing import Trace, Value
 
-#: Lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, enough that those
-#: which need further substeps fill vectors.
+#: Lanes of a batch whose numbers lie together, as rows: few enough for the nearest cache, enough that the
+#: lanes that need further substeps fill vectors.
 BLOCK = 192
 
 _BLOCK = "block_[0-9a-f]{16}"
@@ -27,7 +27,7 @@ def record_block(
 ) -> tuple[list[str], list[Value]]:
     """Return the code that computes a trace's outputs, as one call of a straight-line function.
 
-    Numba need not infer the types of what happens inside, which is what most of compiling would take.
+    Numba then need not infer the types inside, which would be most of the compile time.
     ``fused`` is passed on to `Trace.operations`.
 
     Returns
@@ -50,7 +50,7 @@ def record_block(
 
 
 def count_operations(lines: Iterable[str], kinds: frozenset[str] | None = None) -> int:
-    """Return how many operations, of these kinds or of all, the blocks in these lines of code consist of."""
+    """Count the operations (of these kinds, or all) of the blocks in these lines of code."""
     blocks = (_blocks[name][0] for line in lines for name in re.findall(_BLOCK, line))
     return sum(kinds is None or operation.op in kinds for block in blocks for operation in block)
 
@@ -69,9 +69,9 @@ def compile_function(
         Python source of one function; it may use recorded blocks, `primitives.NAMES`, the helpers
         and the constants.
     *helpers : callable
-        What this function returned for the functions that the source calls, known there by their names.
+        Functions that the source calls, under their names there, as compiled by this function.
     **constants : float or tuple of int
-        Numbers that the source names.
+        Constants in the source.
 
     Returns
     -------
@@ -80,8 +80,8 @@ def compile_function(
 
     Notes
     -----
-    The name carries a digest of the source, the constants and every helper's name, which carries its own,
-    and so on down: all that the compiled code depends on, and so what the cache knows it by.
+    The name carries a digest of the source, the constants and the names of the helpers, which carry digests
+    of their own. So it covers everything that the compiled code depends on, and the cache uses it as the key.
     """
     from lag_envs.stepping import primitives
     from lag_envs.stepping.cache import jit
@@ -105,7 +105,7 @@ def compile_function(
 def compile_python(
     name: str, function: Callable, *helpers: Callable, **constants: float | tuple[int, ...]
 ) -> Callable:
-    """Compile, under a name, a function that is written out in Python; otherwise like `compile_function`."""
+    """Compile a function written in Python under a name; otherwise like `compile_function`."""
     source = inspect.getsource(function).replace(f"def {function.__name__}(", f"def {name}(", 1)
     return compile_function(name, source, *helpers, **constants)
 
@@ -113,7 +113,7 @@ def compile_python(
 def compile_traced(
     name: str, arguments: str, formula: Callable, absent: frozenset[str] = frozenset(), *, fused: bool = True
 ) -> Callable:
-    """Run ``formula(xp, *arguments)`` once on recording numbers and compile what it did.
+    """Run ``formula(xp, *arguments)`` once on recording numbers and compile the recorded operations.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Derivatives of a step: the same algorithm on numbers that carry derivatives along.
 
 A dual number is a value with one derivative per column; None stands for derivatives that are all zero. `Dual`
-makes a target of such numbers from two targets, one of plain numbers and one whose numbers are vectors with
-an entry per column, so that every recurrence stands once and all columns go through one operation. It takes
-what `Series.expand` and `Series.advance` need, not what the certificate does: comparisons have no derivative.
+makes a target of such numbers from two targets: one of plain numbers, and one whose numbers are vectors with
+an entry per column. So each recurrence is written once, and all columns share its operations. It supports
+what `Series.expand` and `Series.advance` need, but not the certificate: comparisons have no derivative.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Dual:
     wide : Target
         The derivatives, vectors with an entry per column.
     broadcast : callable
-        Makes of a value the vector whose entries are all this value.
+        Makes a vector whose entries all equal a value.
     tangents : mapping
-        For each input that has a derivative the vector that is 1 in its column.
+        For each input that has a derivative, the vector that is 1 in its column.
     """
 
     def __init__(self, target: Any, wide: Any, broadcast: Callable, tangents: Mapping[str, Any]) -> None:
@@ -60,7 +60,7 @@ class Dual:
         return Number(self._t.sub(a.value, b.value), slopes)
 
     def _times(self, slopes: Any, factor: Any, total: Any = None) -> Any:
-        """Return slopes times a value, plus a total; either may be zero."""
+        """Return slopes times a value, plus a total; None stands for zero."""
         if slopes is None:
             return total
         w, every = self._wide, self._broadcast(factor)
@@ -170,7 +170,7 @@ class Variable:
 
     @classmethod
     def of_column(cls, columns: Sequence[str], name: str, value: Any) -> Variable:
-        """Return the number of that name among those by which derivatives are taken, or a constant."""
+        """Return the variable of the column with this name, or a constant if there is no such column."""
         return cls(value, np.array([float(name == column) for column in columns], dtype=object))
 
     def _other(self, other: Any) -> Variable:
@@ -207,7 +207,7 @@ class Variable:
 
 
 def variables_of(*arrays: Any) -> list[list[Variable]]:
-    """Return for each array of shape (n, ...) its columns as variables, each with a derivative."""
+    """Return the columns of each array of shape (n, ...) as variables, each with a derivative."""
     columns = [x for array in arrays for x in array.T]
     unit = np.eye(len(columns))[:, :, None]
     given = iter([Variable(x, unit[i]) for i, x in enumerate(columns)])
@@ -228,7 +228,7 @@ class VariableFunctions:
     Parameters
     ----------
     xp : namespace
-        Those of its values.
+        The functions of its values.
     """
 
     def __init__(self, xp: Any = Numeric) -> None:

@@ -1,17 +1,17 @@
 """Sine, cosine, exponential, logarithm, arc tangent and hyperbolic tangent from plain arithmetic.
 
-Libraries of C, Python and JavaScript differ in the last bits of these functions. The formulas here consist
-of ``+ - * /``, comparisons, selections and the few exact operations of `Trace` (`pow2`, `exponent`,
+These functions differ in their last bits between the libraries of C, Python and JavaScript. The formulas here
+consist of ``+ - * /``, comparisons, selections and the few exact operations of `Trace` (`pow2`, `exponent`,
 `copysign`), without branches. Recorded and written unfused, they give the same bits on every machine and in
-every language whose numbers are IEEE doubles; every lane of a vector gives what a single number gives.
+every language whose numbers are IEEE doubles; each lane of a vector gives the same bits as a single number.
 
-Errors against exact values, fused and unfused, in units in the last place: 1.5 at most, of `tanh` 2.5, of
-`tan` 3 (`tests/test_elementary.py`). NaN gives NaN; what lies outside a function's domain does too.
+Errors against exact values, fused and unfused, in units in the last place: at most 1.5, except `tanh` 2.5 and
+`tan` 3 (`tests/test_elementary.py`). NaN, and arguments outside a function's domain, give NaN.
 
-Each function first reduces its argument, then sums a polynomial. The coefficients are minimax
+Each function first reduces its argument, then evaluates a polynomial. The coefficients are minimax
 approximations of relative error (Remez's algorithm in 45 digits, then rounded). A multiple of a constant is
-taken away in parts so short that the multiples of all but the last are exact, with or without fused
-operations [1]_. The nearest whole number is found by adding `MAGIC` and taking it away again.
+subtracted in parts, all but the last so short that their multiples are exact, with or without fused
+operations [1]_. The nearest integer is found by adding `MAGIC` and subtracting it again.
 
 References
 ----------
@@ -25,10 +25,10 @@ from typing import Any
 
 from lag_envs.stepping.tracing import MAGIC, Trace, polynomial
 
-#: Up to here [rad] `sincos` is accurate; beyond, it gives NaN.
+#: `sincos` is accurate up to this angle [rad]; beyond, it gives NaN.
 LARGEST_ANGLE = 2.6e7
 
-# pi/2 in parts: three of 29 bits, of which multiples by whole numbers up to 2^24 are exact; then the rest.
+# pi/2 in parts: three of 29 bits, whose multiples by integers up to 2^24 are exact; then the rest.
 _HALF_PI = (1.570796325802803, 9.920935774287987e-10, 2.2517417706346578e-18, 3.5215598651832e-27)
 # log 2 in two parts, the first of 32 bits.
 _LOG2 = (0.6931471803691238, 1.9082149292705877e-10)
@@ -91,15 +91,15 @@ _ATAN = (
     0.020101696639889047,
     -0.006288527189559517,
 )
-# φ₂ of `fading` in x, 0 <= x <= 1; what is left out is below 1/20! = 4e-19.
+# φ₂ of `fading` in x, 0 <= x <= 1; the truncation error is below 1/20! = 4e-19.
 _PHI2 = tuple((-1.0) ** k / math.factorial(k + 2) for k in range(18))
 
 
 def sincos(x: Any, xp: Any) -> tuple[Any, Any]:
     """Return sine and cosine of an angle [rad] up to `LARGEST_ANGLE`."""
     x = xp.where(xp.abs(x) <= LARGEST_ANGLE, x, math.nan)
-    # x = n pi/2 + r - rest. The first difference is exact, of the others the rounding errors are kept. The
-    # small terms have such signs that a negative zero stays one.
+    # x = n pi/2 + r - rest. The first difference is exact; the rounding errors of the others are kept. The
+    # signs of the small terms are chosen so that a negative zero stays negative.
     shifted = x * (2.0 / math.pi) + MAGIC
     n = shifted - MAGIC
     a = x - n * _HALF_PI[0]
@@ -128,7 +128,7 @@ def tan(x: Any, xp: Any) -> Any:
 
 
 def exp(x: Any, xp: Any) -> Any:
-    """Return e**x; too large results are infinite, small ones go through subnormal numbers to 0."""
+    """Return e**x; overflow gives infinity, small results go through subnormal numbers to 0."""
     n, rest = _exp_parts(xp.minimum(xp.maximum(x, -746.0), 710.0))
     half = _nearest(0.5 * n)  # 2**n itself may be too large or too small
     return (1.0 + rest) * xp.pow2(half) * xp.pow2(n - half)
@@ -136,7 +136,7 @@ def exp(x: Any, xp: Any) -> Any:
 
 def tanh(x: Any, xp: Any) -> Any:
     """Return the hyperbolic tangent."""
-    # 1 beyond 20. With exp(2 x) - 1 in place of exp(2 x), small arguments lose nothing.
+    # 1 beyond 20. Using exp(2 x) - 1 instead of exp(2 x) keeps small arguments accurate.
     n, rest = _exp_parts(2.0 * xp.minimum(xp.abs(x), 20.0))
     scale = xp.pow2(n)
     grown = scale * rest + (scale - 1.0)
@@ -145,7 +145,7 @@ def tanh(x: Any, xp: Any) -> Any:
 
 def log(x: Any, xp: Any) -> Any:
     """Return the natural logarithm."""
-    # Away from both ends of the range; then x = 2**k m with √½ <= m < √2.
+    # Scale numbers away from both ends of the range; then x = 2**k m with √½ <= m < √2.
     below = x < 1.0
     y = x * xp.where(below, 2.0**60, 2.0**-60)
     n = xp.exponent(y * math.sqrt(0.5))
@@ -168,7 +168,7 @@ def atan(x: Any, xp: Any) -> Any:
     t = xp.where(near, a, xp.where(far, -1.0, a - 1.0)) / xp.where(near, 1.0, xp.where(far, a, a + 1.0))
     base = xp.where(near, 0.0, xp.where(far, 0.5 * math.pi, 0.25 * math.pi))
     z = t * t
-    rest = t * z * polynomial(_ATAN, z) + base * 3.8981718325193755e-17  # what pi/2 lost, as a part of it
+    rest = t * z * polynomial(_ATAN, z) + base * 3.8981718325193755e-17  # the rounding error of base
     return xp.copysign(base + (t + rest), x)
 
 
@@ -183,7 +183,7 @@ def fading(x: Any, xp: Any) -> tuple[Any, Any, Any]:
 
 
 class ElementaryTrace(Trace):
-    """A recording that consists of the arithmetic above where formulas call functions."""
+    """A recording in which function calls are replaced by the arithmetic above."""
 
     def sin(self, a: Any) -> Any:
         """Return the sine."""
@@ -217,14 +217,14 @@ class ElementaryTrace(Trace):
 
 
 def _nearest(x: Any) -> Any:
-    """Return the nearest whole number, of two the even one; |x| < 2^51."""
+    """Return the nearest integer, ties to even; |x| < 2^51."""
     return (x + MAGIC) - MAGIC
 
 
 def _exp_parts(x: Any) -> tuple[Any, Any]:
-    """Return n and ``rest`` with exp(x) = 2**n (1 + rest), n whole.
+    """Return an integer n and ``rest`` with exp(x) = 2**n (1 + rest).
 
-    More of r is positive than negative: so `tanh` needs n only where little cancels.
+    The range of r reaches further up than down, so that `tanh` needs n only where little cancels.
     """
     n = _nearest(x * (1.0 / math.log(2.0)) - 0.25)
     r = (x - n * _LOG2[0]) - n * _LOG2[1]

@@ -1,8 +1,8 @@
-"""The three exact flows, and how a scene's control step is put together from one of them.
+"""The three exact flows, and how a scene's control step is built from one of them.
 
 A scene's normal form (`lag_envs.stepping.normal_forms`) says how its state and held controls become the
-flow's variables and coefficients. From that, this module makes the scalar ``advance`` that a single
-environment and `Scene.simulate` call, and the lines of the vectorised step. Both call the same recorded
+flow's variables and coefficients. From that, this module makes the scalar ``advance`` that single
+environments and `Scene.simulate` call, and the code lines of the vectorised step. Both call the same recorded
 blocks with the same roundings, which is why a batch and a single environment agree bit for bit.
 """
 
@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 
 
 class Flow(NamedTuple):
-    """An exact flow: what it moves, and two ways to run it.
+    """An exact flow and the ways to run it.
 
     ``fast(variables, coefficients, dt, xp)`` is the formula of an ordinary step,
-    ``within(variables, coefficients, dt, x, xp)`` tells whether this step is one, and ``compile(present)``
+    ``within(variables, coefficients, dt, x, xp)`` tells whether a step is ordinary, and ``compile(present)``
     makes the scalar function for any step. ``pull(variables, coefficients, dt, bars, xp)`` records an
     ordinary step backwards, from cotangents of the first two variables to those of variables and
-    coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step, by the
-    variables and by the coefficients that are named. ``order`` is that of the certified series, 0 where there
-    is none; ``tolerance`` is what one step's truncation error in θ' may reach [rad/s]. ``method`` says in
+    coefficients. ``compile_tangent(present, by)`` makes the function that differentiates any step with
+    respect to the variables and the named coefficients. ``order`` is the order of the certified series, 0 if
+    there is none; ``tolerance`` is the largest truncation error of θ' allowed in one step [rad/s]. ``method``
+    describes how a step is taken.
     words how a step is taken.
     """
 
@@ -74,7 +75,7 @@ def pendulum_flow(order: int = pendulum.ORDER, tolerance: float = pendulum.TOLER
 
 
 def _backwards(fast: Callable) -> Callable:
-    """Return a flow's `pull`, found by going back through what its fast formula records."""
+    """Return a flow's `pull`: reverse mode on its recorded fast formula."""
 
     def pull(variables: Sequence, coefficients: Any, dt: Any, bars: Sequence, xp: Differentiable) -> list:
         ends = fast(variables, coefficients, dt, xp)[:2]
@@ -130,14 +131,14 @@ def section(
     outputs : sequence of str
         Names for the results.
     kind : type
-        What records, and so which functions the formula has.
+        The kind of recording, which decides how functions are recorded.
 
     Returns
     -------
     lines : list of str
         The code.
     values : list of str or float
-        For each output its name, or the constant that it turned out to be.
+        For each output its name, or its value if it turned out to be constant.
     """
     trace = kind()
     results = formula(trace, *(_input(trace, i) for i in inputs))
@@ -151,7 +152,7 @@ def _input(trace: Trace, value: Any) -> Any:
 
 
 def split(values: Sequence, *sizes: int) -> list[list]:
-    """Cut a sequence into lists of the given lengths; what is left over makes the last.
+    """Cut a sequence into lists of the given lengths; the rest forms the last.
 
     Examples
     --------
@@ -225,10 +226,10 @@ class Stepper:
         if isinstance(condition, bool):
             tested = [f"within = {condition}"]
 
-        #: Ordinary step, without a branch; ``within`` tells whether it was one.
+        #: An ordinary step, without branches; ``within`` tells whether the step was ordinary.
         self.fast = [*prepared, *tested, *moved, *finished]
         present = tuple(not isinstance(v, float) for v in values[flow.size :])
-        #: Names of the flow's coefficients, and whether the code has them.
+        #: Names of the flow's coefficients, and whether each is in the code.
         self.terms = dict(zip(flow.coefficients._fields, present, strict=True))
         call = f"{', '.join(after)}, status = flow({', '.join(map(str, values))}, dt, x)"
         self._any = [*prepared, call, *finished]
@@ -250,7 +251,7 @@ class Stepper:
     def compile(self) -> Callable:
         """Compile ``advance(y..., u..., dt, x, constants...)`` to ``(z..., status)``.
 
-        It takes any step. The status is the number of substeps, or negative where the step is refused.
+        It takes any step. The status is the number of substeps, or negative if the step is refused.
         """
         body = [f"def advance({self.arguments}):", *self._any, f"return {', '.join(self.end)}, status"]
         return compile_function("advance", "\n    ".join(body) + "\n", self._flow())
@@ -259,9 +260,9 @@ class Stepper:
     def compile_jacobian(self, by: tuple[str, ...], constants: tuple[str, ...] = ()) -> Callable:
         """Compile ``jacobian(states, controls, out, dt, x, constants...)``.
 
-        It fills ``out[i]`` with the derivatives of the state after step i by state, controls and constants,
-        and returns the row whose step was refused, counted from 1, or 0. `by` names the coefficients that
-        these change.
+        It fills ``out[i]`` with the derivatives of the state after step i with respect to state, controls and
+        constants, and returns the row whose step was refused, counted from 1, or 0. `by` names the
+        coefficients that depend on these.
         """
         n = self._n_state
         columns = [*self.start[:n], *self.controls, *(f"k_{name}" for name in constants)]
@@ -325,7 +326,7 @@ class Stepper:
         seeds: Sequence,
         by: Sequence,
     ) -> tuple[list, Any]:
-        """Record the step backwards; return cotangents, and whether the step is an ordinary one.
+        """Record the step backwards; return cotangents, and whether the step is ordinary.
 
         Parameters
         ----------
@@ -338,12 +339,12 @@ class Stepper:
         seeds : sequence of number
             Cotangents of the state after the step.
         by : sequence of number
-            What cotangents are wanted of.
+            The numbers whose cotangents are wanted.
         """
         form, flow, angle = self._form, self.flow, self._angle
         lifted = state if angle is None else [*state, xp.cos(state[angle]), xp.sin(state[angle])]
         variables, coefficients = form.unpack(lifted, u, k), form.drive(lifted, u, k, xp)
-        # The end is linear in what was moved, so that needs no values.
+        # The end is linear in the moved variables, so their values are not needed.
         moved = xp.inputs("moved0", "moved1")
         ends = form.pack([*moved, *variables[2:]], lifted, u, k.dt, k)[: self._n_state]
         *bars, direct = split(xp.adjoint(ends, seeds, [*moved, *by]), 1, 1)
@@ -354,10 +355,11 @@ class Stepper:
 
     @cache  # noqa: B019
     def vjp(self, constants: tuple[str, ...] = ()) -> Lanes:
-        """Return ordinary steps backwards, by lanes.
+        """Return the reverse mode of ordinary steps, compiled for lanes.
 
-        Given are numbers dt, x and constants; states, controls, and cotangents of the states after the step.
-        Found are those of states and controls, of `constants`, and 1 where the step is an ordinary one.
+        Its inputs are the numbers dt, x and constants; states, controls, and cotangents of the states after
+        the step. Its results are the cotangents of states and controls, those of `constants`, and 1 if the
+        step is ordinary.
         """
         y, seeds = self.start[: self._n_state], [f"seed{i}" for i in range(self._n_state)]
 
@@ -375,13 +377,13 @@ class Stepper:
 
     @cached_property
     def simulation(self) -> Callable:
-        """What `compile_simulate` makes."""
+        """The function that `compile_simulate` makes."""
         return self.compile_simulate()
 
     def compile_simulate(self) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, x, constants...)``.
 
-        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0.
+        It fills the trajectory's rows from the second on, and returns the row whose step was refused, or 0.
         """
         n = self._n_state
         load = [f"y{i} = trajectory[0, {i}]" for i in range(n)]

@@ -1,7 +1,7 @@
 """One control step of any scene: from its state to the series' variables, the series, and back.
 
-Controls that set the acceleration of a prescribed coordinate move it exactly. Where its rate is held,
-velocities jump when the rate is switched, and the state carries w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
+A control that sets the acceleration of a prescribed coordinate moves it exactly. If it sets the rate instead,
+velocities jump when the rate is switched, and the state holds w = v + M⁻¹ Σ_m G_m ṡ_m in their place; it is
 converted at both ends of the control step.
 """
 
@@ -26,7 +26,8 @@ from lag_envs.stepping.elementary import ElementaryTrace
 from lag_envs.stepping.lowering import CLOCK, Lowering, SeriesRecord
 from lag_envs.stepping.series import TOLERANCE
 
-#: What stands in for a parameter that is 0 where a step is divided so that derivatives by it are accurate.
+#: Stands in for a parameter that is 0 when deciding how to divide a step, so that derivatives with respect to
+#: it are accurate.
 GUIDE = 1e-2
 
 
@@ -50,7 +51,7 @@ class SeriesStepper:
         self._parameters = sorted({s.name for e in converted for s in e.symbols() if s.kind == "parameter"})
 
     def _lowered(self, tangents: Sequence[str] | None = None) -> tuple[Lowering, tuple[list[int], dict]]:
-        """Return what the equations have become, and its parts."""
+        """Return the lowering of the equations, and its parts."""
         lowering = Lowering(self._layout.free, self._moving(), tangents)
         return lowering, lowering.parts(self.mechanics.mass, self.mechanics.force)
 
@@ -72,9 +73,9 @@ class SeriesStepper:
     # --- constants ------------------------------------------------------------------------------------------
 
     def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
-        """Return the numbers that a step needs, made from the parameters; one that is zero leaves no code.
+        """Return the numbers that a step needs, computed from the parameters; zeros leave no code.
 
-        `functions` has sine, cosine and the like.
+        `functions` has sine, cosine and so on.
         """
         return _evaluated(self.expressions(), parameters, functions)
 
@@ -82,16 +83,16 @@ class SeriesStepper:
 
     @property
     def arguments(self) -> list[str]:
-        """Names of what the code takes for the controls."""
+        """Names of the code's arguments for the controls."""
         return [f"u{i}" for i in range(len(self._layout.controls))]
 
     @property
     def applied(self) -> list[str]:
-        """Names of what `followed` returns."""
+        """Names of the results of `followed`."""
         return []
 
     def followed(self, xp: Any, u: Sequence, dt: Any) -> list:
-        """Return what became of the controls; nothing, where they are held."""
+        """Return the lagged controls after the step; nothing if controls are held."""
         return []
 
     def _state(self, y: Sequence) -> dict[str, Any]:
@@ -111,9 +112,7 @@ class SeriesStepper:
         given = self._state(y)
         known = {f"start_{name}": value for name, value in given.items()} | self._inputs(xp, u)
         inputs = {name: known[name] for name in self._whole.inputs if name in known}
-        q = [
-            given.get(name, 0.0) for name in self._layout.free
-        ]  # where one is left out, nothing depends on it
+        q = [given.get(name, 0.0) for name in self._layout.free]  # if one is left out, nothing depends on it
         driven = {p.name: given.get(p.name) for p in self._layout.prescribed}
         shift = self._shift(xp, q, driven, self._starting(xp, u), k)
         for i, name in enumerate(self._layout.free):
@@ -179,13 +178,13 @@ class SeriesStepper:
         return after, u
 
     def _by(self, p: Prescribed, numbers: Sequence) -> Any:
-        """Return, of one number for each control, that of the control which moves a prescribed coordinate."""
+        """Return, from numbers for each control, the number of the control of a prescribed coordinate."""
         return numbers[self._layout.controls.index(p.control or "")]
 
     # --- derivatives ---------------------------------------------------------------------------------------
 
     def tangent(self, parameters: Mapping[str, float], by: tuple[str, ...] = ()) -> SeriesTangent:
-        """Return what differentiates steps of a scene with these parameters, and by which of them."""
+        """Return the differentiated step of a scene with these parameters, with respect to those in `by`."""
         if by not in self._tangents:
             self._tangents[by] = self._lowered(tangents=by)
         lowering, parts = self._tangents[by]
@@ -195,7 +194,7 @@ class SeriesStepper:
         for p in by:
             slopes = _evaluated({n: derivative(e, parameter(p)) for n, e in exprs.items()}, parameters)
             lifted |= {name: e for name, e in exprs.items() if slopes[name] != 0.0}
-        # Where a series comes in by a parameter that is 0, steps must be short enough for it.
+        # If a parameter that is 0 brings in a further series, steps must be short enough for that one too.
         above = {name: parameters[name] or (GUIDE if name in by else 0.0) for name in parameters}
         guide = _evaluated(lifted, above)
         numbers = {f"p_{name}": float(parameters[name]) for name in self._parameters}
@@ -207,14 +206,14 @@ class SeriesStepper:
     def code(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> StepCode:
         """Return the step without the terms of constants that are zero.
 
-        Unfused, it gives the bits of plain + - * / √ and comparisons on any machine, see `Plain`.
+        Unfused, it has the same bits as plain + - * / √ and comparisons on any machine; see `Plain`.
         """
         if (absent, fused) not in self._codes:
             self._codes[absent, fused] = StepCode(self, self.record(absent, fused), absent, fused)
         return self._codes[absent, fused]
 
     def record(self, absent: frozenset[str] = frozenset(), fused: bool = True) -> SeriesRecord:
-        """Return what is stepped, without the terms of constants that are zero."""
+        """Return the record of the step, without the terms of constants that are zero."""
         return self._lowering.without(*self._parts, absent, fused)
 
     def expressions(self) -> dict[str, Expr]:
@@ -232,23 +231,23 @@ def _evaluated(
 
 
 class SeriesTangent:
-    """What differentiates control steps of one scene.
+    """Derivatives of control steps of one scene.
 
-    Only what the equations contain has a column that is computed: by a coordinate that they do not contain
-    the derivatives are those of a shift.
+    Columns are computed only for variables that the equations contain: with respect to a coordinate that does
+    not occur, the derivatives are those of a shift.
 
     Parameters
     ----------
     stepper : SeriesStepper
         The scene's stepper.
     record : SeriesRecord
-        What is stepped, made with tangents.
+        The record of the step, made with tangents.
     constants, numbers : mapping from str to float
         Constants of the record, and the parameters that `SeriesStepper.prepare` takes.
     by : tuple of str
-        Parameters by which derivatives are taken too.
+        Parameters with respect to which derivatives are taken, besides state and controls.
     guide : mapping from str to float
-        Constants in whose place others decide how a step is divided.
+        Constants that decide how a step is divided, in place of `constants`.
     """
 
     def __init__(
@@ -283,7 +282,7 @@ class SeriesTangent:
         self._guide = np.array([guide.get(name, 0.0) for name in record.given])
 
     def jacobian(self, states: Any, controls: Any, dt: float, order: int) -> tuple[Any, int]:
-        """Return the derivatives of the states at the step's end by states, controls and parameters.
+        """Return the derivatives of the end states with respect to states, controls and parameters.
 
         Parameters
         ----------
@@ -299,9 +298,9 @@ class SeriesTangent:
         Returns
         -------
         derivatives : ndarray, shape (n, n_state, n_state + n_controls + n_parameters)
-            The derivatives; None where a step was refused.
+            The derivatives; None if a step was refused.
         refused : int
-            The row whose step was refused, counted from 1; 0 where there is none.
+            The row whose step was refused, counted from 1; 0 if none was.
         """
         count, size, first = len(states), len(self._moving) // 2, len(self._given)
         xp = VariableFunctions()
@@ -330,7 +329,7 @@ class SeriesTangent:
                 found[i] = getattr(before[name], "slopes", 0.0)
             return found.transpose(2, 0, 1)
 
-        # Where no rate is held, these derivatives are the same for all states.
+        # If no rate is held, these derivatives are the same for all states.
         width = max(np.shape(getattr(x, "slopes", 0.0))[-1:] for x in before.values())[0]
         ends = slopes[..., : len(self._columns)] @ stack(self._columns)
         start = stack(self._moving)
@@ -344,7 +343,7 @@ class SeriesTangent:
         return stacked(finished, count), 0
 
     def vjp(self, states: Any, controls: Any, dt: float, order: int, cotangents: Any) -> tuple[Any, int]:
-        """Return gradients by states, controls and parameters from those by the states at the step's end.
+        """Return gradients with respect to states, controls and parameters from those of the end states.
 
         The result has the shape (n, n_state + n_controls + n_parameters); the rest is as for `jacobian`.
         """
@@ -352,7 +351,7 @@ class SeriesTangent:
             found, refused = self.jacobian(states, controls, dt, order)
             return (None if refused else np.einsum("ni,nij->nj", cotangents, found)), refused
         linear = self._known_linear.get(dt) or self._linear(dt)
-        self._known_linear = {dt: linear}  # the last one's: a scene has one dt, mostly
+        self._known_linear = {dt: linear}  # only the latest: a scene mostly has one dt
         given, found = np.concatenate([states.T, controls.T]), np.empty((self._width, len(states)))
         seeds = np.ascontiguousarray(cotangents.T)
         refused = self._pull(given, seeds, found, *linear, dt, order)
@@ -361,9 +360,9 @@ class SeriesTangent:
         return found.T, refused
 
     def _linear(self, dt: float) -> tuple[Any, ...]:
-        """Return what `_pull` takes of the constants, what series start from, and their end's effect.
+        """Return the constants, and derivatives of the series' start and of the end state, for `_pull`.
 
-        Where no rate is held, all are the same for all states.
+        If no rate is held, all are the same for all states.
         """
         xp, layout, moving = VariableFunctions(), self._stepper._layout, len(self._moving)
         ends, y, u, p = variables_of(
@@ -412,12 +411,12 @@ class SeriesTangent:
 
 
 class StepBound(NamedTuple):
-    """How a control step is divided, and what its series leave out.
+    """How a control step is divided, and how large its truncation error can be.
 
     Attributes
     ----------
     substeps : int
-        Number of attempts that the step took; 1 where the first one was certified as a whole.
+        Number of attempts that the step took; 1 if the first one was certified for the whole step.
     order : int
         Order of the series.
     bounds : dict of str to float
@@ -440,14 +439,14 @@ class StepCode:
     start, end : list of str
         Names of the state's entries before and after the step.
     controls : list of str
-        Names of the controls, or of what they follow from.
+        Names of the controls, or of the inputs that they follow from.
     applied : list of str
-        Names of what `compile` returns about lagged controls.
+        Names of the results about lagged controls that `compile` returns.
     constants : list of str
         Names of the constants that the code uses.
     rows : list of str
         Rows of a lane that the block function reads and writes: inputs, then places and velocities, then the
-        status, then what it fills itself.
+        status, then rows that it fills itself.
     """
 
     def __init__(
@@ -510,11 +509,11 @@ class StepCode:
             if isinstance(value, str)
             and value in used.replace("(", " ").replace(",", " ").replace(")", " ").split()
         ]
-        #: Rows that are to be filled in before the step.
+        #: Rows that must be filled in before the step.
         self.given = [*self._inputs, *q, *v, "status"]
         own = [*self.given, "left", "wish"]
         self.rows = [*own, *(f"rest_{name}" for name in own), "rest_lane"]
-        #: Those of them that the rest of the step needs afterwards.
+        #: Those of them that are read after the step.
         self.results = [*q, *v, "status"]
 
     @property
@@ -532,8 +531,8 @@ class StepCode:
     def compile(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``advance(rows, y..., u..., dt, order, constants...)`` to ``(z..., applied..., status)``.
 
-        The status is the number of attempts, or negative where the step is refused. In `rows`, `scratch`
-        numbers long, the sums of the substeps' bounds on places and velocities are left at the end.
+        The status is the number of attempts, or negative if the step is refused. The sums of the substeps'
+        bounds on places and velocities are left at the end of `rows`, which has `scratch` numbers.
         """
         from lag_envs.stepping.driver import compile_advance
         from lag_envs.stepping.machine import Layout
@@ -575,7 +574,7 @@ class StepCode:
 
     @cached_property
     def simulation(self) -> Callable:
-        """What `compile_simulate` makes."""
+        """The function that `compile_simulate` makes."""
         return self.compile_simulate()
 
     def compile_block(self, tolerance: float = TOLERANCE) -> Callable:
@@ -587,8 +586,8 @@ class StepCode:
     def compile_simulate(self, tolerance: float = TOLERANCE) -> Callable:
         """Compile ``simulate(trajectory, controls, dt, order, constants...)``.
 
-        It fills the trajectory's rows from the second on, and returns the row that was refused, or 0. A row
-        is the state, and what lagged controls have reached; `controls` holds what is given for each step.
+        It fills the trajectory's rows from the second on, and returns the row whose step was refused, or 0.
+        A row is the state, followed by the lagged controls; `controls` holds the commands of each step.
         """
         extra = "".join(f", {name}" for name in self.constants)
         reached = [name.removesuffix("_end") for name in self.applied if name.endswith("_end")]
@@ -616,14 +615,14 @@ _steppers: dict[str, SeriesStepper] = {}
 
 
 def stepper_of(mechanics: Mechanics) -> SeriesStepper:
-    """Return the stepper of these equations of motion; equal ones share it."""
+    """Return the stepper of these equations of motion; equal equations share one."""
     if mechanics.key not in _steppers:
         _steppers[mechanics.key] = SeriesStepper(mechanics)
     return _steppers[mechanics.key]
 
 
 def code_of(scene: Any) -> tuple[StepCode, list[float]]:
-    """Return the code by which the general series steps a scene, and the constants that it takes."""
+    """Return the code with which the general series steps a scene, and the constants that it takes."""
     stepper = stepper_of(scene.mechanics)
     constants = stepper.constants({name: getattr(scene, name) for name in scene._numbers()})
     code = stepper.code(frozenset(name for name, value in constants.items() if value == 0.0))
@@ -631,5 +630,5 @@ def code_of(scene: Any) -> tuple[StepCode, list[float]]:
 
 
 def usual_order(dt: float) -> int:
-    """Return the order of the series for a control step [s], unless a scene is given another."""
+    """Return the order of the series for a control step [s], unless a scene sets another."""
     return 16 if dt <= 0.03 else 20 if dt <= 0.1 else 22

@@ -1,8 +1,9 @@
 """Control steps behind an actuator of first order: u' = (w - u)/τ, with the command w held.
 
-From its value u₀ at the step's start a control follows u(t) = w + (u₀ - w) e^(-t/τ). Its series is known to
-every order, and so is that of what it moves from outside. The state follows ẏ = f(y, u(t)) with the scene's
-own f: a place that is a control remains quasi-static, and a rate that is one accelerates what it moves.
+From its value u₀ at the step's start a control follows u(t) = w + (u₀ - w) e^(-t/τ). The series of the
+control, and of the prescribed coordinate that it moves, are known to every order. The state follows
+ẏ = f(y, u(t)) with the scene's own f: a control that is a place remains quasi-static; a control that is a
+rate accelerates the coordinate that it moves.
 """
 
 from __future__ import annotations
@@ -21,21 +22,20 @@ from lag_envs.stepping.lowering import CLOCK, FADING, Lowering
 class LaggedStepper(SeriesStepper):
     """One scene's control step with lagged controls, by the general series.
 
-    In place of the controls its code takes where they are at the step's start, ``u0``, ...; then their
+    In place of the controls, its code takes their values at the step's start, ``u0``, ...; then their
     commands, ``u0_command``, ...; then 1/τ [1/s], ``u0_decay``, ..., where 0 means no lag. After the state it
-    returns where the controls are at the step's end, ``u0_end``, ...; then their means over the step,
-    ``u0_mean``, ....
+    returns the controls at the step's end, ``u0_end``, ...; then their means over the step, ``u0_mean``, ....
     """
 
     @property
     def arguments(self) -> list[str]:
-        """Names of what the code takes for the controls."""
+        """Names of the code's arguments for the controls."""
         names = super().arguments
         return [*names, *(f"{u}_command" for u in names), *(f"{u}_decay" for u in names)]
 
     @property
     def applied(self) -> list[str]:
-        """Names of what `followed` returns."""
+        """Names of the results of `followed`."""
         names = super().arguments
         return [*(f"{u}_end" for u in names), *(f"{u}_mean" for u in names)]
 
@@ -48,7 +48,7 @@ class LaggedStepper(SeriesStepper):
         lowering = Lowering(layout.free, self._moving(), tangents, rates)
         force = list(m.force)
         of = {p.name: p.control or "" for p in layout.prescribed}
-        for (i, name), entry in sorted(m.coupling.items()):  # a rate that changes pushes
+        for (i, name), entry in sorted(m.coupling.items()):  # a changing rate exerts a force
             force[i] = force[i] - entry * Expr.of(velocity(of[name]))
         return lowering, lowering.parts(m.mass, force)
 
@@ -76,7 +76,7 @@ class LaggedStepper(SeriesStepper):
     # --- from the state and back ----------------------------------------------------------------------------
 
     def _split(self, xp: Any, u: Sequence) -> list[tuple[Any, Any, Any, Any]]:
-        """Return for each control where it starts, w, u₀ - w and 1/τ."""
+        """Return for each control its starting value, w, u₀ - w and 1/τ."""
         n = len(self._layout.controls)
         found = []
         for now, command, decay in zip(u[:n], u[n : 2 * n], u[2 * n :], strict=True):
@@ -94,7 +94,7 @@ class LaggedStepper(SeriesStepper):
         return found
 
     def followed(self, xp: Any, u: Sequence, dt: Any) -> list:
-        """Return where the controls are at the step's end, and their means over it."""
+        """Return the controls at the step's end, and their means over the step."""
         ends, means, _ = self._after(xp, u, dt)
         return [*ends, *means]
 
@@ -128,7 +128,7 @@ _steppers: dict[str, LaggedStepper] = {}
 
 
 def lagged_stepper(mechanics: Mechanics) -> LaggedStepper:
-    """Return the stepper of these equations of motion with lagged controls; equal ones share it."""
+    """Return the stepper of these equations of motion with lagged controls; equal equations share one."""
     if mechanics.key not in _steppers:
         _steppers[mechanics.key] = LaggedStepper(mechanics)
     return _steppers[mechanics.key]

@@ -1,13 +1,12 @@
-"""From equations of motion to a record of series: what has to be computed at each order, and nothing twice.
+"""From equations of motion to a record of series: what each order has to compute, without repetition.
 
-The record is what every printer prints (`lag_envs.stepping.series`). Its nodes are series in time:
-coordinates, velocities, their functions, products and weighted sums. Weights do not change within a step:
-they are scalars, computed once from the held control and from constants. Constants are polynomials in the
-parameters, computed once per scene; one that is zero takes every term that it multiplies along
-(`SeriesRecord.without`).
+All printers print this record (`lag_envs.stepping.series`). Its nodes are series in time: coordinates,
+velocities, their functions, products and weighted sums. Weights do not change within a step: they are
+scalars, computed once from the held control and from constants. Constants are polynomials in the parameters,
+computed once per scene; if one is zero, the terms that it multiplies are left out (`Lowering.without`).
 
-Products are what costs, order² each, sums only order. So common factors are pulled out of sums, squares are
-made first, and what two equations share is computed once.
+Products are the main cost, order² each; sums cost only order. So common factors are pulled out of sums,
+squares are made first, and parts that two equations share are computed once.
 """
 
 from __future__ import annotations
@@ -29,11 +28,10 @@ Weight = str | float
 
 #: Kinds of symbols that change within a step.
 VARYING = frozenset({"place", "velocity"})
-#: Kinds of symbols for what `fading` makes of the time since the control step began, as a part of the lag.
+#: Symbols for the functions of `fading`, of the time since the control step began in units of the lag.
 FADING = ("fading_0", "fading_1", "fading_2")
 
-#: The time since the control step began, as a symbol of the places of prescribed coordinates, and as an
-#: input.
+#: The time since the control step began: a symbol in the places of prescribed coordinates, and an input.
 CLOCK = Atom("clock", "elapsed")
 ELAPSED = "clock_elapsed"
 
@@ -49,11 +47,11 @@ class Node:
     """A series in time.
 
     ``op`` is one of ``place``, ``velocity`` (of the free coordinate `index`), ``polynomial`` (known from the
-    start: `weights` are its coefficients in powers of t), ``decay`` (a polynomial and
-    an exponential: `weights` are the first coefficients c_k, four at most, and then a rate, by which all
-    further ones are c_k = c_{k-1} rate/k), ``sum`` (`weights` times `args`, and a constant
-    `weights[-1]`), ``product``, ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These
-    obey z' = w x', and their `args` are x, w (of a cosine: -w), and x' where x is a weighted sum of places.
+    start: `weights` are its coefficients in powers of t), ``decay`` (a polynomial plus an exponential:
+    `weights` are the first coefficients c_k, four at most, and then a rate, with which all further ones are
+    c_k = c_{k-1} rate/k), ``sum`` (`weights` times `args`, plus a constant `weights[-1]`), ``product``,
+    ``reciprocal``, ``sqrt`` (of `args`), and the functions `FUNCTIONS`. These obey z' = w x'. Their `args`
+    are x, w (of a cosine: -w), and x' if x is a weighted sum of places.
     """
 
     op: str
@@ -64,7 +62,7 @@ class Node:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SeriesRecord:
-    """What a step computes. Records with the same `digest` have the same code.
+    """The computation of a step. Records with the same `digest` have the same code.
 
     Attributes
     ----------
@@ -75,16 +73,16 @@ class SeriesRecord:
     constants : mapping from str to Expr
         Constants among them, as expressions in the parameters.
     scalars : tuple of Operation
-        What computes the weights from the inputs.
+        Operations that compute the weights from the inputs.
     nodes : tuple of Node
-        In an order in which each needs earlier ones only (at the same order of the series).
+        Ordered so that each needs only earlier ones (at the same order of the series).
     mass : mapping from (i, j), i <= j, to (node, weight, constant)
         Entries of the mass matrix, weight times node plus constant; the node is -1 where nothing changes.
     force : tuple of int
         Nodes of the right-hand side; -1 where it vanishes.
     tangents : mapping from str to mapping
-        For scalars that depend on controls, starts or chosen parameters their derivatives by each of them;
-        empty unless asked for.
+        For scalars that depend on controls, starts or chosen parameters, their derivatives with respect to
+        each of them; empty unless asked for.
     """
 
     size: int
@@ -103,7 +101,7 @@ class SeriesRecord:
 
     @cached_property
     def digest(self) -> str:
-        """All that decides the code, in short: not what the constants are made of."""
+        """A digest of everything that decides the code; how the constants are computed does not."""
         parts: tuple = (
             self.size,
             self.inputs,
@@ -131,14 +129,14 @@ class Lowering:
     free : sequence of str
         Names of the free coordinates.
     prescribed : mapping from str to sequence of Expr
-        For each moving prescribed coordinate its place as a polynomial in time, by coefficients in symbols of
+        For each moving prescribed coordinate its place as a polynomial in time: coefficients in symbols of
         kind ``control`` (held), ``start`` (its place and rate when the control step begins) and `CLOCK`.
     tangents : sequence of str, optional
-        Parameters by which the scalars come with derivatives, besides those by controls and starts; by
-        default they come without any.
+        Parameters with respect to which the scalars get derivatives, besides controls and starts; by default
+        they get none at all.
     rates : mapping from str to Expr
-        Where controls are lagged: for each of them, and for each coordinate that it moves, the rate of its
-        exponential. Then `prescribed` holds the controls too, and coefficients as a node ``decay`` has them,
+        With lagged controls: for each control, and for each coordinate that it moves, the rate of its
+        exponential. Then `prescribed` contains the controls too, with coefficients as in a node ``decay``,
         in symbols of kind ``command``, ``gap``, ``decay`` and `FADING` in place of ``control``.
     """
 
@@ -206,7 +204,7 @@ class Lowering:
         return self._scalars[expr.text]
 
     def _differentiate(self, weights: Sequence[Any]) -> None:
-        """Make the derivatives of weights by what they are wanted by."""
+        """Record the derivatives of weights with respect to their chosen sources."""
         for weight in weights:
             if self._wanted is None or not isinstance(weight, Number) or weight.name in self._slopes:
                 continue
@@ -278,7 +276,7 @@ class Lowering:
                 slope = self._node("reciprocal", (x,))
             first = len(self.nodes)
             self._known[key] = first
-            if key[0] == "pair":  # made at once; each is the other's slope
+            if key[0] == "pair":  # both are made at once; each is the other's slope
                 self.nodes += [("sin", (x, first + 1, *rate), (), 0), ("cos", (x, first, *rate), (), 0)]
             elif atom.function == "tanh":  # the slope is 1 - tanh²
                 self.nodes += [
@@ -320,7 +318,7 @@ class Lowering:
         return self._sum(self._factored({k: e for k, e in terms.items() if e.terms}))
 
     def _halved(self, factors: Counter[int]) -> Counter[int]:
-        """Return the factors with squares of squares in place of higher powers."""
+        """Return the factors with higher powers replaced by squares of squares."""
         result: Counter[int] = Counter()
         pending = dict(factors)
         while pending:
@@ -364,7 +362,7 @@ class Lowering:
         return result
 
     def _single(self, terms: list[tuple[int, Expr]]) -> tuple[int, Expr]:
-        """Return one node and its weight: a common weight is pulled out, so that nodes are shared."""
+        """Return one node and its weight: a common weight is pulled out so that nodes can be shared."""
         first = terms[0][1]
         if all(e.same(first) or e.same(-first) for _, e in terms):
             one = Expr.of(1)
@@ -385,7 +383,7 @@ class Lowering:
     # --- the whole ------------------------------------------------------------------------------------------
 
     def parts(self, mass: Mapping[tuple[int, int], Expr], force: Sequence[Expr]) -> tuple[list[int], dict]:
-        """Return nodes of the right-hand sides and entries of the mass matrix, see `without`.
+        """Return nodes of the right-hand sides and entries of the mass matrix; see `without`.
 
         Parameters
         ----------
@@ -411,9 +409,9 @@ class Lowering:
     def without(
         self, right: list[int], entries: dict, zero: frozenset[str] = frozenset(), fused: bool = True
     ) -> SeriesRecord:
-        """Leave out the terms of constants that are zero, and what nobody needs.
+        """Leave out the terms of constants that are zero, and everything unused.
 
-        Terms are left out after products have been arranged: what is left rounds as it would with them.
+        Terms are left out after products have been arranged, so the others round as they would with them.
         """
         weights = _weights(self.nodes, entries)
         slopes = [
@@ -435,13 +433,13 @@ class Lowering:
             return now[old]
 
         def vanish(i: int) -> None:
-            """Leave a series out, or keep it as a zero that functions can be taken of."""
+            """Leave a series out, or keep it as a zero if it is an argument of a function."""
             now[i] = len(nodes) if i in arguments else -1
             if i in arguments:
                 nodes.append(Node("sum", (), (0.0,)))
 
         arguments = {args[0] for op, args, _, _ in self.nodes if op not in ("sum", "product") and args}
-        # Slopes may be named before they are made; then they follow at a fixed distance.
+        # Slopes may be referred to before they are made; they follow at a fixed distance.
         for i, (op, args, ws, index) in enumerate(self.nodes):
             numbers = tuple(next(value) for _ in ws)
             if op == "sum":

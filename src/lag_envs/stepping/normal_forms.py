@@ -1,13 +1,13 @@
-"""Equations of motion that have an exact flow of their own, recognised from what was derived.
+"""Equations of motion that have an exact flow of their own, recognised from the derived equations.
 
-With one free coordinate of constant inertia there are three of them (`lag_envs.stepping.flows`)::
+For one free coordinate of constant inertia there are three (`lag_envs.stepping.flows`)::
 
     driven pendulum   q'' = -alpha sin(q) - beta cos(q) - gamma q' + delta + ramp t
     fixed slope       x'' = acceleration - damping_rate x'
     turning slope     x'' = gravity sin(phi) + centrifugal phi'² x - damping_rate x',  phi' held
 
-Each coefficient is a sum of constants, which the parameters make, times what is held during the step. Any
-other equation is stepped by the general series (`lag_envs.stepping.general`).
+Each coefficient is a sum of terms: a constant, computed from the parameters, times a quantity that is held
+during the step. Any other equation is stepped by the general series (`lag_envs.stepping.general`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from lag_envs.stepping.general import StepBound
 
 
 class Term(NamedTuple):
-    """A part of a coefficient: a constant, by name, times what is held during the step."""
+    """A term of a coefficient: a constant, by name, times a quantity that is held during the step."""
 
     constant: str
     held: Expr
@@ -45,7 +45,7 @@ class Term(NamedTuple):
 class NormalForm:
     """An equation of motion with an exact flow of its own.
 
-    The lifted state is the scene's, followed by cosine and sine of its angle, where it has one.
+    The lifted state is the scene's, followed by cosine and sine of its angle if it has one.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class NormalForm:
     terms : mapping
         For each coefficient its terms.
     expressions : mapping
-        For each constant what it is, times the inertia.
+        Each constant as an expression, times the inertia.
     inertia : Expr
         The free coordinate's entry of the mass matrix.
     """
@@ -74,7 +74,7 @@ class NormalForm:
 
     @property
     def angle(self) -> int | None:
-        """Index of the state whose cosine and sine travel along, or None."""
+        """Index of the state's entry whose cosine and sine are carried along, or None."""
         return None
 
     @property
@@ -88,7 +88,7 @@ class NormalForm:
         )
 
     def order(self, dt: float) -> int:
-        """Return the order of the flow's series for a control step; 0 where there is no such series."""
+        """Return the order of the flow's series for a control step; 0 if it has no series."""
         return 0
 
     def flow(self, dt: float) -> Flow:
@@ -96,7 +96,7 @@ class NormalForm:
         raise NotImplementedError
 
     def constants(self, parameters: Mapping[str, float], functions: Any = math) -> dict[str, float]:
-        """Return the constants, each rounded once; `functions` has sine, cosine and the like."""
+        """Return the constants, each rounded once; `functions` has sine, cosine and so on."""
         numbers = evaluate([self.inertia, *self.expressions.values()], exactly(parameters), Exact(functions))
         return {name: _float(x, numbers[0]) for name, x in zip(self.expressions, numbers[1:], strict=True)}
 
@@ -108,7 +108,7 @@ class NormalForm:
         return y if self.angle is None else (*y, np.cos(y[self.angle]), np.sin(y[self.angle]))
 
     def drive(self, y: Sequence, u: Sequence, k: Any, xp: Any) -> Any:
-        """Return the flow's coefficients while controls are held, from lifted state and constants."""
+        """Return the flow's coefficients under held controls, from lifted state and constants."""
         values: dict[Atom, Any] = {control(name): x for name, x in zip(self.layout.controls, u, strict=True)}
         for entry, x in zip(self.layout.state, y, strict=False):
             if entry.kind == "velocity":
@@ -128,7 +128,7 @@ class NormalForm:
         return {}
 
     def _carried(self, u: Sequence, k: Any) -> Any:
-        """Return the part of the momentum that is no velocity of the free coordinate."""
+        """Return the part of the momentum that does not come from the free coordinate's velocity."""
         return 0.0
 
     def unpack(self, y: Sequence, u: Sequence, k: Any) -> list:
@@ -157,7 +157,7 @@ class NormalForm:
     # --- derivatives ---------------------------------------------------------------------------------------
 
     def rates(self, parameters: Mapping[str, float], by: Sequence[str]) -> dict[str, list[float]]:
-        """Return the derivatives of the constants by parameters, rounded once; rows of 0 are left out."""
+        """Return the derivatives of constants with respect to parameters, rounded once, without rows of 0."""
         exprs, values = [self.inertia, *self.expressions.values()], exactly(parameters)
         inertia, *numbers = map(Fraction, evaluate(exprs, values, Exact()))
         found: dict[str, list[float]] = {name: [] for name in self.expressions}
@@ -177,10 +177,10 @@ class NormalForm:
         rates: Mapping[str, Sequence[float]],
         parameters: int,
     ) -> tuple[Any, int]:
-        """Return the derivatives of the states at the step's end by states, controls and parameters.
+        """Return the derivatives of the end states with respect to states, controls and parameters.
 
-        Parameters and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
-        `rates` their derivatives by the parameters.
+        Arguments and results are those of `SeriesTangent.jacobian`; `constants` are those of this form, and
+        `rates` their derivatives with respect to the parameters.
         """
         stepper, absent = self._stepper(dt, constants)
         by = tuple(
@@ -210,9 +210,9 @@ class NormalForm:
         rates: Mapping[str, Sequence[float]],
         parameters: int,
     ) -> tuple[Any, int]:
-        """Return gradients by states, controls and parameters from those by the states at the step's end.
+        """Return gradients with respect to states, controls and parameters from those of the end states.
 
-        The other arguments are those of `jacobian`, which is called where a step is no ordinary one.
+        The other arguments are those of `jacobian`, which is used if a step is not ordinary.
         """
         stepper, _ = self._stepper(dt, constants)
         numbers = np.array([dt, self.largest_majorant(dt), *constants.values()])
@@ -230,7 +230,7 @@ class NormalForm:
         return slopes, 0
 
     def _stepper(self, dt: float, constants: Mapping[str, float]) -> tuple[Stepper, frozenset[str]]:
-        """Return the code of a step with these constants, and those that are zero."""
+        """Return the code of a step with these constants, and the names of those that are zero."""
         absent = frozenset(name for name, value in constants.items() if value == 0.0)
         return self.stepper(dt, absent), absent
 
@@ -241,28 +241,28 @@ class NormalForm:
         return self.drive(self.lift(state), controls, SimpleNamespace(**constants), np)
 
     def largest_majorant(self, dt: float) -> float:
-        """Return the bound's x up to which one series is certified; closed forms do without."""
+        """Return the largest x for which one series is certified; closed forms do not need it."""
         return pendulum.largest_majorant(dt, self.order(dt) or pendulum.ORDER)
 
     def certified_speed(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> float | None:
-        """Return the |q'| up to which one series per step is certified, if the rest is as given [rad/s].
+        """Return the largest |q'| for which one series per step is certified, all else as given [rad/s].
 
-        Up to it, and not beyond, `step_bound` reports one substep, which leaves out at most 1e-12 rad/s. It
-        is below 0 where drive, drag or field are too strong for one series at any speed, and None for a form
-        that is stepped to rounding.
+        Up to it, and not beyond, `step_bound` reports one substep, whose truncation error is at most
+        1e-12 rad/s. It is negative if drive, drag or field are too strong for one series at any speed, and
+        None for a form that is stepped to rounding.
         """
         return None
 
     def step_bound(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> StepBound:
-        """Return what is known of a step before it is taken; see `Scene.step_bound`."""
+        """Return the step's bounds, known before it is taken; see `Scene.step_bound`."""
         return StepBound(1, 0, dict.fromkeys(self.state_names, 0.0), "stepped to rounding")
 
     def stepper(self, dt: float, absent: frozenset[str] = frozenset()) -> Stepper:
-        """Return the code of a control step; constants that are zero leave none."""
+        """Return the code of a control step; constants that are zero leave no code."""
         return _stepper(self, self.flow(dt), absent)
 
 
@@ -285,7 +285,7 @@ class DrivenPendulum(NormalForm):
         """Return the order of the series for a control step.
 
         With order 14, one series of 0.02 s is certified up to 13 rad/s. Longer steps, and a brake that may be
-        strong, call for order 20: with it one of 0.05 s is certified up to 9.5 rad/s, where 16 takes two.
+        strong, need order 20: one series of 0.05 s is then certified up to 9.5 rad/s; order 16 takes two.
         """
         brakes = any(term.held.number is None for term in self.terms["gamma"])
         return 20 if brakes or dt > 0.03 else 14
@@ -297,7 +297,7 @@ class DrivenPendulum(NormalForm):
     def certified_speed(
         self, state: ArrayLike, controls: Sequence, dt: float, constants: Mapping[str, float]
     ) -> float:
-        """Return the |q'| up to which one series per step is certified [rad/s]; see `NormalForm`."""
+        """Return the largest |q'| for which one series per step is certified [rad/s]; see `NormalForm`."""
         drive = self.kind(*map(float, self.coefficients(state, controls, constants)))
         return pendulum.certified_speed(drive, dt, self.order(dt))
 
@@ -326,7 +326,7 @@ class FixedSlope(NormalForm):
 
 
 class TurningSlope(NormalForm):
-    """The slope that turns at a rate that is held: a series summed to rounding."""
+    """The slope that turns at a held rate: a series summed to rounding."""
 
     kind = slope.TurningSlope
 
@@ -357,7 +357,7 @@ def _float(x: Any, divisor: Any) -> float:
 
 
 def normal_form(m: Mechanics) -> NormalForm | None:
-    """Return the normal form of these equations of motion, or None where they have none."""
+    """Return the normal form of these equations of motion, or None if they have none."""
     if m.key not in _known:
         _known[m.key] = _recognised(m)
     return _known[m.key]
@@ -400,12 +400,12 @@ def _recognised(m: Mechanics) -> NormalForm | None:
     return _form(m, DrivenPendulum, terms | {"delta": delta, "ramp": ramp})
 
 
-#: What is held, by its text, with the constant that multiplies it.
+#: For the text of each held quantity: the quantity, and the constant that multiplies it.
 _Parts = dict[str, tuple[Expr, Expr]]
 
 
 def _split(force: Expr, of: Mapping[Atom, str]) -> dict[str, _Parts] | None:
-    """Sort a force's terms by the one factor in `of` that each has, "" for none; None for others."""
+    """Sort a force's terms by their single factor in `of` ("" for none); None if a term does not fit."""
     parts: dict[str, _Parts] = {}
     for monomial, c in force.sorted_terms():
         constant: Monomial = ()
@@ -436,13 +436,13 @@ def _negative(part: _Parts) -> _Parts:
 
 
 def _unheld(part: _Parts) -> _Parts:
-    """Return the one constant of a coefficient that is multiplied by what is held elsewhere."""
+    """Return the coefficient's only constant on its own; its held factor is applied elsewhere."""
     constants = [constant for _, constant in part.values()]
     return {Expr.of(1).text: (Expr.of(1), constants[0])} if constants else {}
 
 
 def _turning(m: Mechanics, parts: dict[str, _Parts]) -> NormalForm | None:
-    """Return the turning slope's form, where the rate of one coordinate is held."""
+    """Return the turning slope's form, for a scene that holds the rate of one coordinate."""
     (rate, *others), one = m.layout.at("rate"), Expr.of(1).text
     held = Expr.of(control(rate.control or ""))
     wanted = {"gravity": one, "centrifugal": (held * held).text, "gamma": one}
@@ -467,7 +467,7 @@ def _form(
     parts: Mapping[str, _Parts],
     others: Mapping[str, Expr] | None = None,
 ) -> NormalForm:
-    """Give names to constants; equal ones share a name."""
+    """Name the constants; equal ones share a name."""
     expressions: dict[str, Expr] = dict(others or {})
     names = {expr.text: name for name, expr in expressions.items()}
     terms = {}

@@ -1,25 +1,25 @@
 """The driven, damped pendulum: Taylor series without trigonometry, with a bound known before the step.
 
-The bar on its pivot and the cylinder in its shell are the same equation while a control is held::
+The bar on its pivot and the cylinder in its shell obey the same equation while a control is held::
 
     theta'' = -alpha sin(theta) - beta cos(theta) - gamma theta' + delta + ramp t
 
 Let h be the step, t = h tau, and A = alpha h², B = beta h², Γ = gamma h, D = delta h², R = ramp h³,
 W = h theta', P = A sin + B cos, Q = A cos - B sin. The Taylor coefficients in tau follow from
-W' = -P - ΓW + D + R tau, P' = QW, and from the energy identity Q' = WW' + ΓW² - DW - R tau W, which spares a
-second convolution: with H = W²/2 it reads Q' = H' + 2ΓH - (D + R tau) W. No sine and no cosine is
-called; the pair (cos, sin) is turned by the step's angle with two short polynomials.
+W' = -P - ΓW + D + R tau, P' = QW, and from the energy identity Q' = WW' + ΓW² - DW - R tau W, which saves a
+second convolution: with H = W²/2 it reads Q' = H' + 2ΓH - (D + R tau) W. No sine or cosine is called; the
+pair (cos, sin) is rotated by the step's angle with two short polynomials.
 
 **Bound** (method of majorants). E = Q + iP obeys E' = iWE, so |E_0| = G = √(A² + B²). Suppose that for some x
 
     |W_0| <= x,   x²/2 >= |Γ|x + G + |D|,   x (x²/2 - |Γ|x/2 - G) >= |R|.
 
 With κ = x/2 the series x/(1-κτ) and G/(1-κτ)² then satisfy the same recurrences with >= in place of =, so
-|W_k| <= xκ^k for every k. A series cut off after W_N leaves out at most xκ^(N+1)/(1-κ) of hθ', and
-at most xκ^(N+1)/((1-κ)(N+2)) of θ.
+|W_k| <= xκ^k for every k. For a series cut off after W_N, the truncation error is at most xκ^(N+1)/(1-κ) in
+hθ', and at most xκ^(N+1)/((1-κ)(N+2)) in θ.
 
-Where one series is not enough the step is divided. What many substeps add up is computed with twice the
-digits (`substep`), and where damping is heavy most of them are spared by following the slow manifold.
+If one series is not enough, the step is divided. Sums over many substeps are computed with twice the digits
+(`substep`); under heavy damping most substeps are saved by following the slow manifold.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 ORDER = 16
 TOLERANCE = 1e-12
 MAX_SUBSTEPS = 1_000_000
-#: Substeps compute the coefficients up to this one with twice the digits; what rounding takes from later ones
-#: is below 1e-20, for they shrink at least fivefold from one to the next.
+#: Substeps compute the coefficients up to this one with twice the digits. Rounding errors of later ones are
+#: below 1e-20, for the coefficients shrink at least fivefold from one to the next.
 TWOFOLD = 5
 
 _SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(8)]
@@ -58,7 +58,7 @@ class Coefficients(NamedTuple):
 
     @property
     def damping_rate(self) -> Any:
-        """The rate at which drag alone slows the motion down [1/s]; every flow's coefficients have it."""
+        """The rate at which drag alone slows the motion [1/s]; every flow's coefficients have one."""
         return self.gamma
 
 
@@ -98,7 +98,7 @@ def taylor_coefficients(w: Any, c: Any, s: Any, coeffs: Coefficients, order: int
         if k > 1:
             work = work - r * W[k - 2] * (1.0 / k)
         Q.append(H[k] + work)
-        # P_k itself is not needed: it goes straight into W. What is known last enters last.
+        # P_k itself is not needed: it goes straight into W. The terms known last are added last.
         early = sorted(range(k), key=lambda j: (max(j, k - 1 - j), j))
         torque = sum_of_products((Q[j], W[k - 1 - j]) for j in early)
         change = W[k] * (gamma * (-1.0 / (k + 1))) + torque * (-1.0 / (k * (k + 1)))
@@ -110,14 +110,14 @@ def rotate(c: Any, s: Any, angle: Any, polynomial: Callable = polynomial) -> tup
     """Turn the pair (cos, sin) by an angle of at most 0.6 rad and restore its length to rounding."""
     z = angle * angle
     sine = angle * polynomial(_SIN, z)
-    # One Newton step towards c² + s² = 1 goes into the same sum, so that what is added to c and s is small
-    # and is rounded once, to either side. Scaling afterwards favours one side, and energy drifts.
+    # One Newton step towards c² + s² = 1 goes into the same sum. So the change of c and s is small and is
+    # rounded once, without bias. Scaling afterwards would be biased, and energy would drift.
     less = z * polynomial(_COS[1:], z) - 0.5 * ((c * c - 1.0) + s * s)
     return c + (c * less - s * sine), s + (s * less + c * sine)
 
 
 def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order: int = ORDER) -> tuple:
-    """Return by how much θ and hθ' change in one step of the series, and (cosθ, sinθ) after it."""
+    """Return the changes of θ and hθ' in one step of the series, and (cosθ, sinθ) after it."""
     W, _ = taylor_coefficients(omega * h, c, s, scaled(coeffs, h), order)
     change = pairwise_sum(W[1:])
     angle = pairwise_sum([w * (1.0 / (k + 1)) for k, w in enumerate(W)])
@@ -125,10 +125,10 @@ def step_change(omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, order:
 
 
 def substep(w: Twofold, c: Twofold, s: Twofold, coeffs: Coefficients, order: int = ORDER) -> tuple:
-    """Return hθ', cosθ and sinθ after one of many steps, and by how much θ changes, with twice the digits.
+    """Return hθ', cosθ and sinθ after one of many steps, and the change of θ, with twice the digits.
 
-    Errors of many steps add up, at best like a random walk. They change a pendulum's energy, so its rate, and
-    that its phase, more and more with time. So each step has to be more exact than a float.
+    Errors of many steps add up, at best like a random walk. They change a pendulum's energy, hence its
+    frequency, and so its phase error grows with time. So each step has to be more exact than a float.
 
     Parameters
     ----------
@@ -154,15 +154,15 @@ def step(theta: Any, omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, o
 
 
 def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, order: int = ORDER) -> list:
-    """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step, from those of θ, θ' after.
+    """Return cotangents of θ, θ', cosθ, sinθ and the coefficients before a step from those of θ, θ' after it.
 
-    Those of cosθ and sinθ are counted with θ. Changes obey the linearised equation: with S, C the series of
-    sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on its right-hand side,
+    Those of cosθ and sinθ are included in θ's. Changes obey the linearised equation: with S, C the series of
+    sine and cosine, dW_k = (k+1) dθ_{k+1}, and dD for k = 0, dR for k = 1 on the right-hand side,
 
         (k+1) dW_{k+1} = -Σ_j Q_j dθ_{k-j} - Γ dW_k - S_k dA - C_k dB - W_k dΓ.
 
-    Backwards that takes one sum of products for each order, where going back through `taylor_coefficients`
-    would take three.
+    Backwards, this takes one sum of products per order; reverse mode through `taylor_coefficients` would take
+    three.
 
     Parameters
     ----------
@@ -215,18 +215,18 @@ def pull(variables: Sequence, coeffs: Coefficients, h: Any, bars: Sequence, orde
 def step_slopes(
     omega: Any, c: Any, s: Any, coeffs: Coefficients, h: Any, elapsed: Any, columns: Sequence[str], order: int
 ) -> list:
-    """Return the derivatives of what one step of the series adds to θ, then of what it adds to θ'.
+    """Return the derivatives of the changes of θ, then of θ', in one step of the series.
 
     Parameters
     ----------
     omega, c, s : number
         θ', cosθ and sinθ at the start.
     coeffs : Coefficients
-        Coefficients, those at the time 0.
+        Coefficients at time 0.
     h, elapsed : number
         The step, and the time at which it begins.
     columns : sequence of str
-        By what derivatives are taken: ``theta``, ``omega`` and names of coefficients.
+        Variables of the derivatives: ``theta``, ``omega`` and names of coefficients.
     order : int
         The highest coefficient of W.
     """
@@ -260,7 +260,7 @@ def certified(omega: Any, coeffs: Coefficients, h: Any, x: Any, xp: Any) -> Any:
 def largest_majorant(dt: float, order: int = ORDER, tolerance: float = TOLERANCE) -> float:
     """Return the largest x for which one step of length dt is exact to the tolerance in θ' [rad/s].
 
-    Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2, and stays below by more than rounding.
+    Solves xκ^(N+1)/(1-κ) = tolerance·dt with κ = x/2, minus a margin larger than rounding.
 
     Examples
     --------
@@ -277,7 +277,7 @@ def largest_majorant(dt: float, order: int = ORDER, tolerance: float = TOLERANCE
 def certified_speed(
     coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
 ) -> float:
-    """Return the |θ'| up to which one series is enough [rad/s]; below 0 where it never is."""
+    """Return the largest |θ'| for which one series is enough [rad/s]; negative if it never is."""
     x = largest_majorant(dt, order, tolerance)
     if not certified(0.0, coeffs, dt, x, np):
         return -1.0
@@ -286,7 +286,7 @@ def certified_speed(
 
 
 class Bound(NamedTuple):
-    """What is known before a step is taken."""
+    """Bounds on a step, known before it is taken."""
 
     substeps: int
     order: int
@@ -297,21 +297,21 @@ class Bound(NamedTuple):
 def truncation_bound(
     omega: float, coeffs: Coefficients, dt: float, order: int = ORDER, tolerance: float = TOLERANCE
 ) -> Bound:
-    """Return the number of substeps of a step and the proved bound on what they leave out.
+    """Return the number of substeps of a step and the proved bound on their truncation error.
 
-    One series is taken only where it is proved to leave out at most the tolerance of θ' [rad/s]. Where it is
-    not, the step is divided, and all of its substeps together leave out at most the tolerance times the size
-    of θ', max(1, |θ'|, (alpha² + beta²)^¼).
+    A single series is used only if its truncation error of θ' is proved to be at most the tolerance [rad/s].
+    If not, the step is divided, and the truncation errors of all substeps together are at most the tolerance
+    times the size of θ', max(1, |θ'|, (alpha² + beta²)^¼).
 
-    Each substep's bound is proved; they are added up without the amplification, by the system itself, of what
-    earlier substeps left out. Where `flow` jumps along the slow manifold (heavy damping) the count is that
-    of plain substeps, which the jump replaces.
+    Each substep's bound is proved; their sum does not account for the system's own amplification of earlier
+    truncation errors. If `flow` jumps along the slow manifold (heavy damping), the count is that of the plain
+    substeps that the jump replaces.
     """
     largest = largest_majorant(dt, order, tolerance)
     one = certified(omega, coeffs, dt, largest, np)
     n = 1.0 if one else min(float(_substeps(omega, *coeffs, dt, order, tolerance)), 1e15)
     h = dt / n
-    # One step needs the bound at its start only, several need it all the way.
+    # One step needs the bound only at its start, several need it throughout.
     x = _rate(omega, *coeffs, 0.0 if one else dt) * h
     if one:
         x = min(x, largest)
@@ -320,11 +320,11 @@ def truncation_bound(
 
 
 def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untyped-def]
-    """Return x/h such that the bound holds anywhere in the interval, for small h."""
+    """Return x/h such that, for small h, the bound holds anywhere in the interval."""
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
-    # What the field adds to the speed is limited by its acceleration and, from top to bottom, by its energy,
-    # 2 field.
+    # What the field adds to the speed is limited by its acceleration, and by its energy between top and
+    # bottom, 2 field.
     speed = min(abs(omega) + field * dt, math.sqrt(omega * omega + 4.0 * field)) + push * dt
     if gamma * speed > field + push:
         speed = max(abs(omega), (field + push) / gamma)
@@ -335,7 +335,7 @@ def _rate(omega, alpha, beta, gamma, delta, ramp, dt):  # type: ignore[no-untype
 
 
 def _substeps(omega, alpha, beta, gamma, delta, ramp, dt, order, tolerance):  # type: ignore[no-untyped-def]
-    """Return the number of substeps where one is not enough, as a float that may be huge.
+    """Return the number of substeps of a step that needs several, as a float, which may be huge.
 
     From n · xκ^(N+1)/(1-κ)/h <= tolerance · size with x = rate h, κ = x/2 <= 0.2, h = dt/n.
     """
@@ -364,22 +364,22 @@ def _divided(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, n):  # typ
 def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slopes):  # type: ignore[no-untyped-def]
     """Advance by dt along the slow manifold in n equal substeps; return θ, θ', cosθ, sinθ.
 
-    A column of `slopes` holds the derivatives, by anything, of θ, θ', cosθ, sinθ and the coefficients at the
-    start; those of θ and θ' are replaced.
+    A column of `slopes` holds the derivatives of θ, θ', cosθ, sinθ and the coefficients at the start, with
+    respect to anything; those of θ and θ' are replaced.
 
-    There θ' is the drift that drive and drag alone lead to, known in closed form, plus a part V due to the
-    field. In a substep V = -(P + V')/Γ has a series of its own. It is found by sweeps, each of which gains a
-    factor of about |θ'|/gamma.
+    On the manifold θ' is the drift due to drive and drag alone, known in closed form, plus a part V due to
+    the field. In a substep V = -(P + V')/Γ has a series of its own. It is found by sweeps, each of which
+    gains a factor of about |θ'|/gamma.
     """
     h = dt / n
     a, b, g = alpha * h * h, beta * h * h, gamma * h
     V, P, Q = np.zeros(order + 2), np.zeros(order + 1), np.zeros(order + 1)
     drift = slope = w = 0.0
     start_c, start_s = c, s
-    # What rounding takes from the sum is handed on (Kahan): equal terms would all round to one side.
+    # The sum's rounding error is carried forward (Kahan): equal terms would all round in the same direction.
     turned = lost = 0.0
     for i in range(int(n)):
-        # In units of the substep: the drift's rate at its start, and by how much it grows.
+        # In units of the substep: the drift's rate at its start, and its growth.
         drift = (delta + ramp * (i * h) - ramp / gamma) / gamma * h
         slope = ramp / gamma * h * h
         P[0] = a * s + b * c
@@ -407,7 +407,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
         end = turned + angle
         lost = (end - turned) - angle
         turned = end
-        # From the start of all, so that nothing adds up.
+        # Computed from the very start, so that errors do not add up.
         p, q = math.cos(turned), math.sin(turned)
         p, q = p + lost * q, q - lost * p
         c, s = start_c * p - start_s * q, start_s * p + start_c * q
@@ -415,7 +415,7 @@ def _slow_motion(theta, c, s, alpha, beta, gamma, delta, ramp, dt, n, order, slo
 
 
 def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp, order):  # type: ignore[no-untyped-def]
-    """Carry derivatives over a substep along the slow manifold: `_slow_motion` differentiated."""
+    """Carry derivatives over a substep along the slow manifold: the derivative of `_slow_motion`."""
     drift = (delta + ramp * elapsed - ramp / gamma) / gamma * h
     slope = ramp / gamma * h * h
     U = V.copy()
@@ -451,16 +451,17 @@ def _slow_slopes(slopes, V, P, Q, c, s, a, b, g, h, elapsed, gamma, delta, ramp,
 
 
 def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # type: ignore[no-untyped-def]
-    """Return how a step is divided: until when, into how many substeps, how many follow the slow manifold.
+    """Return how a step is divided: until when, into how many substeps, and how many along the slow manifold.
 
-    Last comes whether drive and drag alone move it there. That is not asked for where derivatives by the
-    field are wanted (`field_counts`). The second number is negative where there would be too many.
+    The last result tells whether drive and drag alone determine the motion there; it is false if derivatives
+    with respect to the field are wanted (`field_counts`). The second result is negative if there would be
+    too many substeps.
     """
     field = math.sqrt(alpha * alpha + beta * beta)
     push = abs(delta) + abs(ramp) * dt
     # Heavy damping: resolve the boundary layer, which decays like exp(-gamma t), then follow the slow
-    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. Where the
-    # field is nothing beside the push, the drift is all there is.
+    # manifold. Tested against 40 digits for field/gamma² up to 1e-3 and push/gamma² up to 1e-2. If the field
+    # is negligible compared with the push, the drift is the whole motion.
     drift = field <= 1e-18 * push and not field_counts
     layer = dt
     if gamma > 0.0 and field <= 1e-3 * gamma * gamma and (drift or push <= 1e-2 * gamma * gamma):
@@ -474,16 +475,16 @@ def _plan(omega, alpha, beta, gamma, delta, ramp, dt, order, field_counts):  # t
         m = 1.0
         if not drift:
             m = np.ceil(max(1.0, (12.0 * field + 4.0 * push) / gamma * (dt - layer)))
-    # A substep along the slow manifold costs as much as 50 others.
+    # A substep along the slow manifold costs as much as 50 plain ones.
     if not n + 50.0 * m <= MAX_SUBSTEPS:
         n = -1.0
     return layer, n, m, drift
 
 
 def _flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x):  # type: ignore[no-untyped-def]
-    """Advance by dt with as many substeps as the bound asks for; return the state and their number.
+    """Advance by dt with as many substeps as the bound requires; return the state and their number.
 
-    The number is negative where the step is refused: too many substeps, or no finite result.
+    The number is negative if the step is refused: too many substeps, or no finite result.
     """
     if holds(omega, alpha, beta, gamma, delta, ramp, dt, x):
         angle, change, c, s = series(omega, c, s, alpha, beta, gamma, delta, ramp, dt)
@@ -511,17 +512,17 @@ def compile_flow(present: tuple[bool, ...], order: int = ORDER, tolerance: float
     Parameters
     ----------
     present : tuple of bool
-        For each coefficient of `Coefficients`, whether it is there; the others leave no code behind.
+        For each coefficient of `Coefficients`, whether it is present; the others leave no code.
     order : int, default 16
         Order of the series.
     tolerance : float, default 1e-12
-        What substeps are chosen for [rad/s].
+        The truncation error for which substeps are chosen [rad/s].
 
     Returns
     -------
     callable
         ``flow(theta, omega, c, s, alpha, beta, gamma, delta, ramp, dt, x)`` to
-        ``(theta, omega, c, s, substeps)``; `substeps` is negative where the step is refused.
+        ``(theta, omega, c, s, substeps)``; `substeps` is negative if the step is refused.
     """
     holds, series = _compile_parts(present, order)
     divided = compile_python("divided", _divided, *_divided_parts(order))
@@ -562,7 +563,7 @@ def _compile_slow_motion() -> Callable:
 
 @cache
 def _divided_parts(order: int) -> tuple[Callable, Callable]:
-    """Compile what `_divided` calls, once for all pendulums; what is zero adds nothing."""
+    """Compile the helpers of `_divided`, once for all pendulums; zero coefficients add nothing."""
     coefficients = ", ".join(Coefficients._fields)
     pairs = ", ".join(f"{name}, {name}_low" for name in ("w", "c", "s", "turned", *Coefficients._fields))
 
@@ -588,9 +589,9 @@ def _divided_parts(order: int) -> tuple[Callable, Callable]:
 
 
 def _carry(slopes, lost, change):  # type: ignore[no-untyped-def]
-    """Carry derivatives of θ and θ' over a substep, whose own are `change`, by those that `ROWS` names.
+    """Carry derivatives of θ and θ' over a substep; `change` holds its own, by the variables in `ROWS`.
 
-    What rounding takes is handed on in `lost` (Kahan), as many substeps add up.
+    Rounding errors are carried forward in `lost` (Kahan), since many substeps add up.
     """
     for column in range(slopes.shape[1]):
         before = slopes[0, column], slopes[1, column]
@@ -603,10 +604,10 @@ def _carry(slopes, lost, change):  # type: ignore[no-untyped-def]
 
 
 def _tangent(values, slopes, scratch, dt, x):  # type: ignore[no-untyped-def]
-    """Differentiate a step; return 0, or -1 where it is refused.
+    """Differentiate a step; return 0, or -1 if it is refused.
 
-    `values` are θ, θ', cosθ, sinθ and the coefficients, `slopes` their derivatives at the step's start, by
-    anything, of shape (9, columns). Those of θ and θ' are replaced by those at its end.
+    `values` are θ, θ', cosθ, sinθ and the coefficients. `slopes` are their derivatives at the step's start
+    with respect to anything, of shape (9, columns). Those of θ and θ' are replaced by those at the end.
     """
     theta, omega, c, s, alpha, beta, gamma, delta, ramp = values
     change, lost = scratch[:2], scratch[2:]
@@ -646,7 +647,7 @@ def compile_tangent(
     Parameters
     ----------
     present : tuple of bool
-        For each coefficient of `Coefficients`, whether it is there.
+        For each coefficient of `Coefficients`, whether it is present.
     by : tuple of str
         Coefficients that have derivatives.
     order, tolerance : int, float

@@ -1,9 +1,9 @@
-"""What compiled code is made of: recorded formulas as blocks, a few instructions, the random generator.
+"""Building blocks of compiled code: recorded formulas, a few instructions, the random generator.
 
-The generator is counter-based: a draw is a pure function of (key, episode, step, index). So it can be made
-inside a compiled loop, costs a few integer operations, and does not depend on how many environments are
-stepped together. The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence whose origin is
-itself such a mix of key and episode.
+The generator is counter-based: a draw is a pure function of (key, episode, step, index). So draws can be made
+inside a compiled loop, cost a few integer operations, and do not depend on how many environments are stepped
+together. The function is the output mix of SplitMix64 [1]_ applied to a Weyl sequence. The origin of that
+sequence is itself such a mix of key and episode.
 
 References
 ----------
@@ -28,7 +28,7 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
 _M2 = np.uint64(0x94D049BB133111EB)
 _S30, _S27, _S31, _S11 = (np.uint64(n) for n in (30, 27, 31, 11))
-_DRAWS = np.uint64(16)  # draws set aside for each step
+_DRAWS = np.uint64(16)  # draws reserved for each step
 _ONE = np.uint64(1)
 
 
@@ -78,7 +78,7 @@ def select(typingctx, condition, a, b):  # type: ignore[no-untyped-def]
 
 
 def _atomic(instruction: Callable, arguments: int, result: Any) -> Callable:
-    """Return an instruction for threads, ``(array, index, *arguments)``, on a number of an array."""
+    """Return an atomic instruction, ``(array, index, *arguments)``, on one number of an array."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         array = context.make_array(signature.args[0])(context, builder, args[0])
@@ -97,20 +97,20 @@ def _replace(builder: ir.IRBuilder, at: ir.Value, old: ir.Value, new: ir.Value) 
     return builder.extract_value(builder.cmpxchg(at, old, new, "acq_rel", "acquire"), 1)
 
 
-#: ``(array, index)``: the number. What another thread wrote before it stored the number is there too.
+#: ``(array, index)``: the number. What another thread wrote before it stored the number is visible then too.
 atomic_load = _atomic(lambda b, at: b.load_atomic(at, "acquire", 8), 0, types.uint64)
 #: ``(array, index, value)``
 atomic_store = _atomic(lambda b, at, value: b.store_atomic(value, at, "release", 8), 1, types.void)
-#: ``(array, index, value)``: the number before.
+#: ``(array, index, value)``: adds to the number and returns its old value.
 atomic_add = _atomic(lambda b, at, value: b.atomic_rmw("add", at, value, "acq_rel"), 1, types.uint64)
 atomic_max = _atomic(lambda b, at, value: b.atomic_rmw("umax", at, value, "acq_rel"), 1, types.uint64)
-#: ``(array, index, old, new)``: whether it was the old number, and so is the new one now.
+#: ``(array, index, old, new)``: replaces the number if it is ``old``, and returns whether it was.
 atomic_replace = _atomic(_replace, 2, types.boolean)
 
 
 @intrinsic
 def address(typingctx, array):  # type: ignore[no-untyped-def]
-    """Return where an array's numbers lie, as uint64."""
+    """Return the address of an array's numbers, as uint64."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         given = context.make_array(signature.args[0])(context, builder, args[0])
@@ -121,7 +121,7 @@ def address(typingctx, array):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
-    """Return an array like this one whose numbers lie at an address (uint64), where nothing keeps them."""
+    """Return an array like this one with its numbers at an address (uint64), which nothing keeps alive."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
         made = context.make_array(signature.return_type)(context, builder, args[0])
@@ -137,12 +137,12 @@ def moved(typingctx, array, address):  # type: ignore[no-untyped-def]
 def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
     """Ask for 512-bit vectors where the processor has them.
 
-    LLVM prefers 256 bits on many such processors for the sake of mixed code; these loops are nothing but
-    arithmetic and run faster with the full width. The result's bits do not depend on it.
+    On many such processors LLVM prefers 256 bits because code is usually mixed. These loops are pure
+    arithmetic and run faster at full width. The bits of the result do not depend on the width.
     """
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        # llvmlite knows no string attributes, but prints what the set holds.
+        # llvmlite does not support string attributes, but prints whatever the set contains.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return ir.Constant(ir.IntType(8).as_pointer(), None)
 
@@ -150,12 +150,12 @@ def wide_vectors(typingctx):  # type: ignore[no-untyped-def]
 
 
 def block(operations: Sequence[Operation], inputs: Sequence[str], outputs: Sequence[Any]) -> Callable:
-    """Return a function that carries out recorded operations, written straight in LLVM's language.
+    """Return a function that carries out recorded operations, written directly in LLVM's language.
 
     Parameters
     ----------
     operations : sequence of Operation
-        What to do.
+        The operations.
     inputs : sequence of str
         The arguments, all float64.
     outputs : sequence of str or float
@@ -183,7 +183,7 @@ _INT = ir.IntType(64)
 def emit(
     builder: ir.IRBuilder, operations: Iterable[Operation], values: dict[str, ir.Value]
 ) -> dict[str, ir.Value]:
-    """Write recorded operations where the builder stands.
+    """Write recorded operations at the builder's position.
 
     Every lane of a vector goes through the same operations as a single number, and gets the same bits.
 
@@ -192,10 +192,10 @@ def emit(
     builder : llvmlite.ir.IRBuilder
         Where to write.
     operations : iterable of Operation
-        What to do.
+        The operations.
     values : dict of str to llvmlite.ir.Value
-        What the names stand for: doubles (truth values: i1), or vectors of them, all of one length; a
-        single number meets a vector as one whose lanes are all alike. Results are added.
+        The named values: doubles (truth values: i1), or vectors of them, all of one length. A single number
+        combined with a vector stands for a vector of equal lanes. Results are added to this dict.
 
     Returns
     -------
@@ -214,7 +214,7 @@ def _constant(value: Any) -> ir.Constant:
 
 
 def splat(b: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
-    """Return the vector whose lanes all are this number; a vector as it is."""
+    """Return the vector whose lanes all equal this number; a vector is returned as it is."""
     if isinstance(value.type, ir.VectorType):
         return value
     kind = ir.VectorType(value.type, lanes)
@@ -226,7 +226,7 @@ def splat(b: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
 
 
 def _like(kind: ir.Type, value: Any, element: ir.Type = _DOUBLE) -> ir.Constant:
-    """Return a constant of as many lanes as this type has."""
+    """Return a constant with as many lanes as this type."""
     if isinstance(kind, ir.VectorType):
         return ir.Constant(ir.VectorType(element, kind.count), [ir.Constant(element, value)] * kind.count)
     return ir.Constant(element, value)
@@ -292,14 +292,14 @@ def _exp(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
 
 
 def _pow2(b: ir.IRBuilder, n: ir.Value) -> ir.Value:
-    """Write 2**n: the sum has n + 1023 in its last bits, from where it is moved into the exponent."""
+    """Write 2**n: n + 1023 is put into the last bits of a sum and shifted into the exponent."""
     integers = _integers(n.type)
     biased = b.fadd(n, _like(n.type, MAGIC + 1023.0))
     return b.bitcast(b.shl(b.bitcast(biased, integers), _like(n.type, 52, _INT)), n.type)
 
 
 def _exponent(b: ir.IRBuilder, x: ir.Value) -> ir.Value:
-    """Write the exponent: its bits, put at the end of 2**52, and the bias taken away."""
+    """Write the exponent: its bits are put at the end of 2**52, then the bias is subtracted."""
     bits = b.lshr(b.bitcast(x, _integers(x.type)), _like(x.type, 52, _INT))
     bits = b.or_(b.and_(bits, _like(x.type, 0x7FF, _INT)), _like(x.type, 0x433 << 52, _INT))
     return b.fsub(b.bitcast(bits, x.type), _like(x.type, 2.0**52 + 1023.0))
@@ -309,7 +309,7 @@ def _integers(kind: ir.Type) -> ir.Type:
     return ir.VectorType(_INT, kind.count) if isinstance(kind, ir.VectorType) else _INT
 
 
-#: What the source of a compiled function may name.
+#: Names that the source of a compiled function may use.
 NAMES = {
     "np": np,
     "math": math,

@@ -1,8 +1,8 @@
 """Prints recorded formulas and the series' step as source text, in Python, JavaScript or C++.
 
-What is printed is unfused: + - * / √, comparisons, and a few exact operations on bits. So the text of any
-language gives the same bits, on any machine; C++ also on a GPU. `OPERATIONS` has a line per operation and a
-column per language; loops, over the order of the series among them, are printed as loops.
+The text is unfused: + - * / √, comparisons, and a few exact operations on bits. So it gives the same bits in
+every language and on any machine; C++ also on a GPU. `OPERATIONS` has a line per operation and a column per
+language; loops, including those over the order of the series, are printed as loops.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ STATEMENTS: Mapping[str, tuple[str, str, str]] = {
 }
 
 
-#: Statements of a function, beyond which it is cut: a browser runs functions of more than some 60 kB of its
-#: own code much slower.
+#: Statements of a function, beyond which it is split: browsers run functions with more than about 60 kB of
+#: code much more slowly.
 LARGEST = 1500
 
 
@@ -79,21 +79,21 @@ class Language(NamedTuple):
     column : int
         Its column in `OPERATIONS` and `STATEMENTS`.
     words : mapping
-        Its words for truth values and for numbers that are none.
+        Its words for truth values, infinity and NaN.
     head : str
-        What the operations on bits are made of.
+        Code that defines the operations on bits.
     rounded : callable
-        A float as the language's numbers hold it.
+        Rounds a float to the language's numbers.
     suffix : str
-        What is written behind it.
+        The suffix of a literal.
     arguments : mapping
-        A function's arguments as it declares them, where that is not by name alone.
+        Declarations of a function's arguments, where their names are not enough.
     largest : int, optional
-        Statements of a function, beyond which it is cut.
+        Statements of a function, beyond which it is split.
     own_functions : bool
-        Whether sines are printed too. If not, those of its library are called, which have other bits.
+        Whether sines and so on are printed too. If not, the library's functions are called, with other bits.
     own_memory : bool
-        Whether each function has arrays of its own, and not all of them the same.
+        Whether each function has its own arrays; if not, all functions share them.
     """
 
     column: int
@@ -129,7 +129,7 @@ function copysign(x, sign) {{
 }}
 """,
 )
-#: C++ for compilers for processors and for GPUs; INLINE, INF and UNDEFINED come with what is around it.
+#: C++ for processors and GPUs; INLINE, INF and UNDEFINED are defined by the surrounding code.
 CPP = Language(
     2,
     {"True": "true", "False": "false", "inf": "INF", "-inf": "(-INF)", "nan": "UNDEFINED"},
@@ -174,7 +174,7 @@ INLINE real rough_log2(real x) { return log2(x); }
 
 
 class Formulas(ElementaryTrace):
-    """A recording in which functions stay calls; scripts have each function once."""
+    """A recording in which function calls stay calls; a script contains each function once."""
 
     def _function(self, name: str, a: Any) -> Any:
         if isinstance(a, Number):
@@ -254,7 +254,7 @@ class Script:
     # --- text ----------------------------------------------------------------------------------------------
 
     def text(self, language: Language) -> str:
-        """Return all that was written, in a language."""
+        """Return everything written so far, as text in a language."""
         functions, spilled = self._functions, 0
         if language.largest:
             functions = []
@@ -285,14 +285,14 @@ class Script:
         return name
 
     def _inside(self, write: Callable[[], Any]) -> tuple[Statement, ...]:
-        """Return the statements that are written meanwhile."""
+        """Return the statements that ``write`` writes."""
         outer, self._block = self._block, []
         write()
         written, self._block = self._block, outer
         return tuple(written) or (Statement("nothing", ()),)
 
     def function(self, name: str, arguments: str, body: Callable[[], Any]) -> None:
-        """Write a function whose body returns what it returns, or None."""
+        """Write a function that returns the result of `body`, if not None."""
         self._functions.append(_without_unused(self._function(name, arguments, body)))
 
     def _function(self, name: str, arguments: str, body: Callable[[], Any]) -> Statement:
@@ -305,7 +305,7 @@ class Script:
         return Statement("function", (name, arguments), self._inside(inside))
 
     def emit(self, operations: Iterable[Operation], values: Mapping[str, Any]) -> dict[str, Any]:
-        """Write recorded operations; return what all names stand for."""
+        """Write recorded operations; return the values of all names."""
         known = dict(values)
         for name, op, args in operations:
             given = [known[a] if isinstance(a, str) else a for a in args]
@@ -315,7 +315,7 @@ class Script:
     def formula(self, formula: Callable, inputs: Mapping[str, Value]) -> list[Any]:
         """Record ``formula(xp, *numbers)`` and write it; return its results.
 
-        Inputs are names of this script by names of one's own; one that is 0.0 is known to be zero.
+        Inputs map the formula's names to names of this script; an input 0.0 is known to be zero.
         """
         trace = Formulas()
         given = [
@@ -326,7 +326,7 @@ class Script:
         known = self.emit(operations, inputs)
         return [known[r] if isinstance(r, str) else r for r in results]
 
-    # --- what `series.Target` asks for ----------------------------------------------------------------------
+    # --- the operations of `series.Target` ------------------------------------------------------------------
 
     def number(self, value: float) -> Any:
         return float(value)
@@ -454,7 +454,7 @@ class Script:
         return self.emit(record.scalars, inputs)
 
 
-#: Numbers that are set aside for one series.
+#: Numbers reserved for one series.
 STRIDE = LARGEST_ORDER + 3
 _NAME = re.compile(r"\b[xyk][0-9]+\b")
 
@@ -491,11 +491,11 @@ def _lines(block: Iterable[Statement], language: Language, depth: int = 0) -> It
                 yield " " * depth + end
 
 
-# --- what is done with statements ---------------------------------------------------------------------------
+# --- transformations of statements --------------------------------------------------------------------------
 
 
 def _named(value: Any) -> Iterator[str]:
-    """Return the variables that occur in a part of a statement."""
+    """Return the variables in a part of a statement."""
     if isinstance(value, str):
         yield from _NAME.findall(value)
     elif isinstance(value, Term):
@@ -510,7 +510,7 @@ def _all(block: Iterable[Statement]) -> Iterator[Statement]:
 
 
 def _without_unused(function: Statement) -> Statement:
-    """Leave out operations whose results nobody needs."""
+    """Leave out operations whose results are not used."""
     makes = ("let", "vary", "set")
     uses: Counter[str] = Counter()
     made: dict[str, list[str]] = {}
@@ -540,7 +540,7 @@ def _without_unused(function: Statement) -> Statement:
 
 
 def _with_memory(function: Statement, arrays: Iterable[Statement]) -> Statement:
-    """Return a function that makes those arrays itself which it uses."""
+    """Return a function that declares the arrays that it uses."""
     every = list(_all(function.body))
     used = {part.args[0] for s in every for part in s.parts if isinstance(part, Term) and part.op == "read"}
     used |= {s.parts[0] for s in every if s.kind == "write"}
@@ -548,7 +548,7 @@ def _with_memory(function: Statement, arrays: Iterable[Statement]) -> Statement:
 
 
 def _cut(function: Statement, largest: int) -> tuple[list[Statement], int]:
-    """Return a function as several where it is long, and how many numbers go from one to another."""
+    """Split a long function into several; return them, and how many numbers they share."""
     name, arguments = function.parts
     found: list[Statement] = []
 
@@ -588,7 +588,7 @@ def _cut(function: Statement, largest: int) -> tuple[list[Statement], int]:
     whole = function._replace(body=shortened(function.body))
     if not found:
         return [whole], 0
-    # What one function makes and another needs goes through the array s.
+    # Numbers that several of the functions need are kept in the array s.
     places: dict[str, set[int]] = {}
     for i, part in enumerate([*found, whole]):
         for statement in _all(part.body):
@@ -599,7 +599,7 @@ def _cut(function: Statement, largest: int) -> tuple[list[Statement], int]:
 
 
 def _sharing(block: Sequence[Statement], shared: Mapping[str, str]) -> tuple[Statement, ...]:
-    """Return a block whose shared variables lie in an array."""
+    """Return a block with its shared variables kept in an array."""
 
     def put(value: Any, known: Mapping[str, str]) -> Any:
         if isinstance(value, Term):
@@ -640,11 +640,11 @@ def motion(
     Parameters
     ----------
     t : Script
-        Where to.
+        The script to write to.
     record : SeriesRecord
-        What is stepped.
+        The equations to step.
     inputs : dict
-        Names of its inputs' values.
+        Names of the values of the record's inputs.
     q, v : list
         Names of places and velocities at the start.
     dt : str or float
@@ -652,7 +652,7 @@ def motion(
     order : int
         Order of the series.
     tolerance : float
-        What a substep's velocities may leave out, in their sizes.
+        Largest truncation error of a substep's velocities, relative to their size.
     """
     n, step = record.size, Series(record)
     smallest = t.mul(SMALLEST_PART, dt)

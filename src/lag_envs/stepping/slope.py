@@ -1,17 +1,17 @@
 """The rolling cylinder on a slope: both of its equations are linear, so both are stepped by their exact flow.
 
 Fixed slope
-    ``x'' = a - Γx'``, acceleration less damping rate times speed, solved by φ-functions, with
+    ``x'' = a - Γx'``: acceleration minus damping rate times speed. It is solved by φ-functions, with
     φ₁(z) = (e^z - 1)/z and φ₂(z) = (e^z - 1 - z)/z² [1]_::
 
         x₁ = x + vT φ₁(-ΓT) + aT² φ₂(-ΓT),   v₁ = v e^(-ΓT) + aT φ₁(-ΓT)
 
-    A sum of terms without cancellation for any Γ >= 0; without damping it is the quadratic.
+    The sum has no cancellation for any Γ >= 0; without damping it is the quadratic.
 Turning slope
     ``x'' = kg sin(φ) + kΩ²x - Γx'`` with φ' = Ω held: linear in (x, x', sin φ, cos φ). Its Taylor series has
-    the factorial bound |V_k| <= M σ^k/k! with σ = h (2Γ + 2 √k |Ω| + |Ω|). Where σ is large, short steps are
-    taken one after the other; where that is due to the damping, the matrix of a short step is
-    squared until it spans the whole one ("scaling and squaring").
+    the factorial bound |V_k| <= M σ^k/k! with σ = h (2Γ + 2 √k |Ω| + |Ω|). If σ is large, short steps are
+    taken one after the other; if it is large because of the damping, the matrix of a short step is squared
+    until it spans the whole step ("scaling and squaring").
 
 References
 ----------
@@ -33,7 +33,7 @@ from lag_envs.stepping.pendulum import TWOFOLD, rotate
 from lag_envs.stepping.tracing import clip, pairwise_sum, polynomial
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, twofold_parts
 
-SMALL_DECAY = 0.25  # up to here the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
+SMALL_DECAY = 0.25  # up to this, the series of φ₂ below is exact to rounding: .25^12/14! = 7e-19
 _PHI2 = [(-1.0) ** k / math.factorial(k + 2) for k in range(12)]
 TURN_ORDER = 12
 SMALL_TURN = 0.25  # .25^13/13! = 2e-18
@@ -67,7 +67,7 @@ def slides(force: FixedSlope, dt: Any) -> Any:
 
 
 def _slide_any(x, v, acceleration, damping_rate, dt, _):  # type: ignore[no-untyped-def]
-    """Advance by dt at any damping; return the state and 1, or -2 where there is no finite result."""
+    """Advance by dt at any damping; return the state and 1, or -2 if there is no finite result."""
     if not holds(acceleration, damping_rate, dt):
         z = damping_rate * dt
         if abs(z) < 1.5:  # where 1 - phi1 would cancel
@@ -87,7 +87,7 @@ def _slide_any(x, v, acceleration, damping_rate, dt, _):  # type: ignore[no-unty
 
 
 def crossing_time(x: Any, v: Any, force: FixedSlope, dt: Any, xp: Any) -> Any:
-    """Return the time at which a cylinder rolling down from x < 0 passes 0, if it does so within dt.
+    """Return the time at which a cylinder rolling down from x < 0 passes 0, if that happens within dt.
 
     Parameters
     ----------
@@ -98,15 +98,15 @@ def crossing_time(x: Any, v: Any, force: FixedSlope, dt: Any, xp: Any) -> Any:
     dt : number
         The step.
     xp : namespace
-        Where functions are taken from.
+        The functions.
 
     Notes
     -----
-    Newton's method on the closed form, from below: from the time that it would take without damping, or on
-    the line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the former.
-    For one that slows down Newton's method is monotone but may advance by no more than 1/Γ at a time, so
-    there it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone too, and
-    the later of both times is taken.
+    Newton's method on the closed form, from below. It starts from the time of the motion without damping, or
+    from the line that x(t) approaches if it slows down. A cylinder that speeds up is never far from the
+    former. For one that slows down, Newton's method is monotone but may advance by no more than 1/Γ at a
+    time. So there it is also applied to the logarithm of the boundary layer, e^-z = m(z), which is monotone
+    too, and the later of the two times is taken.
     """
     acceleration, damping_rate = force
     excess = damping_rate * v - acceleration
@@ -164,7 +164,7 @@ def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-d
     phi1 = 1.0 - z * phi2
     slope1 = -(phi2 + z * slope2)
     decay = 1.0 - z * phi1
-    if not abs(z) < 1.5:  # where those would cancel
+    if not abs(z) < 1.5:  # where the sums below would cancel
         decay = math.exp(-z)
         phi1 = -math.expm1(-z) / z
         phi2 = (1.0 - phi1) / z
@@ -183,7 +183,7 @@ def _slide_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-d
 
 @cache
 def compile_slide_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
-    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_slide_tangent`; it takes any terms."""
+    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_slide_tangent`; all terms are allowed."""
 
     def short(xp: Any, z: Any) -> tuple:
         phi2 = polynomial(_PHI2, Variable.of_column(["z"], "z", z))
@@ -225,7 +225,7 @@ def turn_coefficients(
 
 
 def turn_change(x: Any, v: Any, c: Any, s: Any, turn: TurningSlope, h: Any) -> tuple[Any, Any]:
-    """Return by how much (x, x') change, by the Taylor series; (c, s) are cosφ and sinφ at the start."""
+    """Return the changes of (x, x') by the Taylor series; (c, s) are cosφ and sinφ at the start."""
     X, V = turn_coefficients(x, h * v, c, s, turn, h)
     return _sum(X[1:]), _sum(V[1:]) * (1.0 / h)
 
@@ -266,7 +266,7 @@ def rate_factor(centrifugal: Any, xp: Any) -> Any:
 
 
 def _halved(growth, dt):  # type: ignore[no-untyped-def]
-    """Return how often a step is halved until one series does, and its length; -1 where that is too often."""
+    """Return how often a step is halved until one series suffices, and its length; -1 if too often."""
     for halvings in range(61):
         if growth <= SMALL_TURN:
             return halvings, dt
@@ -298,9 +298,9 @@ def _turn_any(x, v, c, s, centrifugal, gravity, damping_rate, rate, dt, _):  # t
     doublings, h = halved(growth, dt)
     if doublings < 0:
         return x, v, c, s, -1
-    # Rows (x, x'), columns (x, x', cos, sin): what a short step adds, from its effect on unit vectors. The
-    # unit matrix stays out of it: (1 + M)² = 1 + 2M + M² keeps a small M's digits, of which 1 + M would lose
-    # a bit with each squaring.
+    # Rows (x, x'), columns (x, x', cos, sin): the change in a short step, from its effect on unit vectors.
+    # The unit matrix is left out: (1 + M)² = 1 + 2M + M² keeps the digits of a small M, whereas 1 + M would
+    # lose a bit with each squaring.
     m = np.empty((2, 4))
     m[0, 0], m[1, 0] = change(1.0, 0.0, 0.0, 0.0, centrifugal, gravity, damping_rate, rate, h)
     m[0, 1], m[1, 1] = change(0.0, 1.0, 0.0, 0.0, centrifugal, gravity, damping_rate, rate, h)
@@ -371,8 +371,8 @@ def compile_turn(present: tuple[bool, ...]) -> Callable:
 def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-def]
     """Differentiate a step; see `pendulum._tangent`.
 
-    The values are x, x', cosφ, sinφ, centrifugal, gravity, damping_rate and rate; `ROWS` are those of the
-    last four by which derivatives are taken. A long step is made of a short one by squaring, as in
+    The values are x, x', cosφ, sinφ, centrifugal, gravity, damping_rate and rate; `ROWS` holds the rows of
+    those among the last four that have derivatives. A long step is made from a short one by squaring, as in
     `_turn_any`.
     """
     x, v, c, s, centrifugal, gravity, damping_rate, rate = values
@@ -423,7 +423,7 @@ def _turn_tangent(values, slopes, scratch, dt, _):  # type: ignore[no-untyped-de
 
 @cache
 def compile_turn_tangent(present: tuple[bool, ...], by: tuple[str, ...]) -> Callable:
-    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; it takes any terms."""
+    """Compile ``tangent(values, slopes, scratch, dt, _)``, see `_turn_tangent`; all terms are allowed."""
     names = ("x", "v", "c", "s", *TurningSlope._fields, "h")
     columns = tuple(name for name in TurningSlope._fields if name == "rate" or name in by)
 

@@ -1,16 +1,15 @@
 """Run a formula once on recording numbers and turn it into straight-line code.
 
-Scenes, tasks and the Taylor recurrences are written as short loops on "numbers": floats, NumPy
-arrays, torch tensors and SymPy symbols all will do. For speed the same functions are run once on
-`Number` objects, which record every operation; the record then becomes one straight-line compiled function.
-Three things happen on the way:
+Scenes, tasks and the Taylor recurrences are written as short loops on "numbers": floats, NumPy arrays, torch
+tensors or SymPy symbols. For speed the same functions are run once on `Number` objects, which record every
+operation; the record then becomes one straight-line compiled function. Three things happen on the way:
 
-* Equal operations are recorded once, and operations on constants are done at once.
-* ``a * b + c`` with a product that nobody else uses becomes one fused multiply-add. The fusion is thus
+* Equal operations are recorded once, and operations on constants are evaluated at once.
+* ``a * b + c`` becomes one fused multiply-add if the product is used nowhere else. The fusion is thus
   chosen here and not by the compiler, so that one environment and ten thousand give the same bits.
-* A term that is zero is dropped. This is the one place where it is decided what a scene pays for: a
-  coefficient that a scene does not have is returned as ``0.0``, a parameter that is zero is known to be
-  (`Trace.zero`), and both leave nothing behind in the compiled code.
+* A zero term is dropped. Only here is it decided which terms a scene pays for: a coefficient that a scene
+  does not have is returned as ``0.0``, a parameter that is zero is known to be zero (`Trace.zero`), and
+  neither leaves any compiled code.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
 
-#: Added to a number below 2^51 and taken away again, it leaves the nearest whole number, ties to even.
+#: Adding this to a number below 2^51 and subtracting it again gives the nearest integer, ties to even.
 MAGIC = 1.5 * 2.0**52
 
 
@@ -31,7 +30,7 @@ def _bits(value: float) -> int:
 
 
 def _pow2(n: float) -> float:
-    # As in machine code: 2^52 and 2^51 ahead of it, a number has n + 1023 in its last bits.
+    # As in machine code: with 2^52 and 2^51 added, the number's last bits hold n + 1023.
     bits = _bits(n + (MAGIC + 1023.0)) << 52
     return float(struct.unpack("<d", struct.pack("<Q", bits % 2**64))[0])
 
@@ -78,7 +77,7 @@ def _fma(a: Any, b: Any, c: Any) -> Any:
         return math.inf if exact > 0 else -math.inf
 
 
-#: Every operation on Python's floats, with the bits of machine code (but for the functions of its own).
+#: Every operation on Python's floats, with the bits of machine code (except for library functions).
 IEEE: dict[str, Callable] = _FLOAT | {
     "/": _divide,
     "sqrt": lambda a: math.nan if a < 0.0 else math.sqrt(a),
@@ -88,7 +87,7 @@ IEEE: dict[str, Callable] = _FLOAT | {
     "c-a*b": lambda a, b, c: _fma(-a, b, c),
 }
 
-#: What a sum becomes when its first or its second term is a product that nobody else uses.
+#: What a sum becomes if its first or its second term is a product that is used nowhere else.
 FUSED = {"+": ("a*b+c", "a*b+c"), "-": ("a*b-c", "c-a*b")}
 BOOLEAN = frozenset({"<", "<=", "&", "|", "~"})
 
@@ -195,8 +194,8 @@ class Number:
 class Trace:
     """One recording: inputs, operations, and the code they make.
 
-    A trace is also the ``xp`` namespace that traced formulas take their functions from, so that
-    ``xp.where`` means `numpy.where` on arrays and a recorded selection here.
+    A trace is also the ``xp`` namespace of traced formulas: ``xp.where`` means `numpy.where` on arrays and a
+    recorded selection here.
 
     Examples
     --------
@@ -217,7 +216,7 @@ class Trace:
         return [Number(self, name) for name in names]
 
     def record(self, op: str, *args: Any) -> Any:
-        """Record an operation, or do it at once where it needs no recording."""
+        """Record an operation, or evaluate it if it needs no recording."""
         args = tuple(a if isinstance(a, Number | bool) else float(a) for a in args)
         if not any(isinstance(a, Number) for a in args):
             return _FLOAT[op](*args)
@@ -234,9 +233,9 @@ class Trace:
     def zero(self) -> Number:
         """Return a number known to be zero.
 
-        Its terms are dropped, like those of a literal 0.0, but only after products have been fused: so the
-        other terms round as they would if it were not zero, and environments with and without, say,
-        damping go through the same bits in one batch.
+        Its terms are dropped, like those of a literal 0.0, but only after products have been fused. So the
+        other terms round as they would if it were not zero, and environments with and without, say, damping
+        get the same bits in one batch.
         """
         number = Number(self, f"zero{len(self._zeros)}")
         self._zeros.add(number.name)
@@ -245,11 +244,11 @@ class Trace:
     def operations(
         self, outputs: Iterable[Any], zeros: Iterable[str] = (), *, fused: bool = True
     ) -> tuple[list[Operation], list[Value]]:
-        """Return what computes the outputs, in order and without detours, and what the outputs are then.
+        """Return the operations that compute the outputs, and the outputs as names or constants.
 
-        Inputs named in `zeros` are known to be zero, like the numbers that `zero` returns. With
-        ``fused=False`` no product is fused with a sum: all that is left rounds alike on every machine and in
-        every language (see `evaluate`).
+        The operations are in order, without those that no output needs. Inputs named in `zeros` are known to
+        be zero, like the numbers that `zero` returns. With ``fused=False`` no product is fused with a sum:
+        then all operations round alike on every machine and in every language (see `evaluate`).
         """
         outputs = list(outputs)
         results = [_name(value) for value in outputs]
@@ -328,21 +327,21 @@ class Trace:
         return self.record("cos", a)
 
     def floor(self, a: Any) -> Any:
-        """Return the largest whole number that is not above."""
+        """Return the largest integer not above a number."""
         return self.record("floor", a)
 
-    # What elementary functions are made of, beside arithmetic; each is exact.
+    # Building blocks of elementary functions, besides arithmetic; each is exact.
 
     def pow2(self, n: Any) -> Any:
-        """Return 2**n for a whole number n in [-1022, 1023]."""
+        """Return 2**n for an integer n in [-1022, 1023]."""
         return self.record("pow2", n)
 
     def exponent(self, a: Any) -> Any:
-        """Return the whole number n with 2**n <= abs(a) < 2**(n + 1), for normal numbers a."""
+        """Return the integer n with 2**n <= abs(a) < 2**(n + 1), for normal numbers a."""
         return self.record("exponent", a)
 
     def copysign(self, a: Any, sign: Any) -> Any:
-        """Return a with the sign of another number, be it a zero."""
+        """Return a with the sign of another number, which may be a signed zero."""
         return self.record("copysign", a, sign)
 
 
@@ -353,17 +352,17 @@ def evaluate(
 ) -> dict[str, Any]:
     """Carry out recorded operations on Python's floats, or on other numbers.
 
-    Unfused operations without sin, cos, exp and log give the bits that compiled code gives; fused ones
-    too, though slowly.
+    Unfused operations without sin, cos, exp and log give the same bits as compiled code; so do fused ones,
+    but slowly.
 
     Parameters
     ----------
     operations : iterable of Operation
-        What to do.
+        The operations.
     values : mapping of str to number
         The inputs by name.
     functions : mapping of str to callable, optional
-        What to do instead for some operations, such as ``{"sqrt": mpmath.sqrt}``.
+        Replacements for some operations, such as ``{"sqrt": mpmath.sqrt}``.
 
     Returns
     -------
@@ -386,7 +385,7 @@ def evaluate(
 
 
 def sum_of_products(factors: Iterable[tuple[Any, Any]]) -> Any:
-    """Sum products one after the other, each but the first by one fused operation.
+    """Sum products one after the other, all but the first by fused operations.
 
     Examples
     --------
@@ -439,7 +438,7 @@ def _is(value: Any, number: float) -> bool:
 
 
 def _simplify(op: str, args: tuple) -> Any:
-    """Return the operation's value where it is trivial, else None."""
+    """Return an operation's value if it is trivial, else None."""
     if op in ("+", "-") and _is(args[1], 0.0):
         return args[0]
     if op == "+" and _is(args[0], 0.0):
@@ -468,7 +467,7 @@ def _simplify(op: str, args: tuple) -> Any:
 
 
 def _drop_zeros(operations: list[Operation], results: list[Value], zeros: set[str]) -> list[Operation]:
-    """Return the operations without terms that are zero; rename the results accordingly."""
+    """Return the operations without zero terms; rename the results accordingly."""
     now: dict[Value, Value] = dict.fromkeys(zeros, 0.0)
     kept = []
     for name, op, names in operations:

@@ -1,9 +1,9 @@
-"""Numbers with twice the digits: a value and what its rounding left out.
+"""Numbers with twice the digits: a value and its rounding error.
 
-What many substeps add up is as exact as a single one only if each of them is more exact than a float. The
-formulas of the series run on these numbers as they do on floats, and are recorded as they are. Each operation
-is made of error-free transformations [1]_: the rounded result, and from additions and one fused multiply-add
-what was rounded off.
+A sum over many substeps is as exact as a single step only if each substep is more exact than a float. The
+series' formulas run on these numbers as they do on floats, and are recorded in the same way. Each operation
+is made of error-free transformations [1]_: the rounded result, and the rounding error, from additions and one
+fused multiply-add.
 
 References
 ----------
@@ -21,9 +21,9 @@ from lag_envs.stepping.tracing import Number, polynomial
 
 
 class Twofold:
-    """The number ``high + low``; `low` is of the size of the rounding of `high`.
+    """The number ``high + low``; `low` is about as large as the rounding error of `high`.
 
-    A float that it meets stands for the simplest fraction that rounds to it, such as 1/3, or else for itself.
+    A float operand stands for the simplest fraction that rounds to it, such as 1/3, or else for itself.
 
     Examples
     --------
@@ -69,14 +69,14 @@ class Twofold:
 
 
 def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return a + b as a float, and what its rounding left out."""
+    """Return a + b as a float, and its rounding error."""
     total = a + b
     b_part = total - a
     return total, (a - (total - b_part)) + (b - b_part)
 
 
 def two_product(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return a * b as a float, and what its rounding left out."""
+    """Return a * b as a float, and its rounding error."""
     product = a * b
     for factor in (a, b):
         if isinstance(factor, Number):

@@ -1,4 +1,4 @@
-"""What becomes of an action on its way to the control: noise, delay, slew."""
+"""From an action to the control: noise, delay, slew."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from lag_envs.tasks.imperfections import Imperfections
 
 
 class Actuators:
-    """Prints what actuators do.
+    """Prints the lines for actuators.
 
-    Rows of its own are the commands that the slew has reached ``c``, and those under way ``sent`` with the
-    time ``at`` which each takes.
+    Its own rows are the commands ``c`` that the slew has reached, and those under way, ``sent``, with their
+    delays ``at``.
 
     Parameters
     ----------
     options : Imperfections
-        What the actuators are like.
+        The imperfections of the actuators.
     formulas : Formulas
-        Those of the task.
+        The task's formulas.
     a, y, u : sequence of str
         Actions, state and controls.
     clip : sequence of str
@@ -79,7 +79,7 @@ class Actuators:
             self.command = record(asked, a, wanted)
         within = constants | {"dt": "h"}  # within a piece of a step, its length
         self.command += record(guarded, [*wanted, *y, *within.values()], u)
-        #: The command before the first.
+        #: The command before the first action.
         self.at_rest = [f"{name} = {constants[f'rest{i}']}" for i, name in enumerate(a)]
         if self.reached:
             self.at_rest += record(asked, a, self.reached)
@@ -96,7 +96,7 @@ class Actuators:
         ]
 
     def send(self, rows: Rows) -> list[str]:
-        """Return the lines that put a command on its way, where it takes time."""
+        """Return the lines that send a command, if it is delayed."""
         if not self.ring.slots:
             return []
         low, high = self._constants["late_low"], self._constants["late_high"]
@@ -110,9 +110,9 @@ class Actuators:
         ]
 
     def choose(self, rows: Rows) -> list[str]:
-        """Return the lines that find the command in force at `t`, and when it will be followed by another.
+        """Return the lines that find the command in force at `t`, and when the next one takes effect.
 
-        It is the last sent of those that have come; the others' times end this piece of the step.
+        It is the one sent last among those that have arrived; this piece of the step ends when another does.
         """
         ring = self.ring
         if not ring.slots:

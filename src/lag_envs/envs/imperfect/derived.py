@@ -1,4 +1,4 @@
-"""Constants that follow from drawn parameters."""
+"""Constants computed from drawn parameters."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from lag_envs.tasks.base import Task
 
 
 class DerivedConstants:
-    """Which constants follow from the drawn parameters, and the lines that compute them.
+    """The constants that depend on the drawn parameters, and the lines that compute them.
 
-    They are computed with twice the digits, from the drawn values and the others, and rounded once: an
-    environment has the bits of one that is made with the values.
+    They are computed with twice the digits, from drawn and other parameters, and rounded once. So an
+    environment has the same bits as one made with these values.
     """
 
     def __init__(self, task: Task, absent: frozenset[str]) -> None:
@@ -37,18 +37,18 @@ class DerivedConstants:
         parameters = {n for n, x in inner.items() if isinstance(x, Number)}
         found = self._task.formulas.starts_of(inner) | {f"self_{n}": x for n, x in inner.items()}
         found |= {n: x for n, x in self._motion(trace, inner, parameters).items() if n not in absent}
-        #: Constants that differ from episode to episode.
+        #: Constants that change from episode to episode.
         self.changed = [name for name, x in found.items() if isinstance(x, Number)]
         self._parameters = parameters
 
     def _follow(self, numbers: dict[str, Any]) -> None:
-        """Replace the parameters that follow from others."""
+        """Replace the parameters that are computed from others."""
         for name, made in self._made.items():
             with naming(self._scene, name):
                 numbers[name] = made(twin(self._scene, numbers))
 
     def _motion(self, trace: Any, numbers: dict[str, Any], changed: set[str]) -> dict[str, Any]:
-        """Return the constants of the motion that depend on parameters that change."""
+        """Return the constants of the motion that depend on changing parameters."""
         form, scene = self._scene._form, self._scene
         below = {s.name for s in form.inertia.symbols()} if form else set()
         wanted = dict(form.expressions if form else scene._stepper.expressions())
@@ -79,7 +79,7 @@ class DerivedConstants:
             outputs[f"p_{d.name}"] = d.printed(share, base, low, high, trace)
         code, values = record_block(trace, outputs, fused=False)
         code += [f"{name} = {value}" for name, value in zip(outputs, values, strict=True) if name != value]
-        # Those that follow are made as Python makes them: one rounding for each operation.
+        # Derived parameters are computed as Python does it: one rounding for each operation.
         trace = ElementaryTrace()
         numbers = self._given(trace, constants)
         self._follow(numbers)
@@ -97,7 +97,7 @@ class DerivedConstants:
         return [*code, *last, *rename]
 
     def _given(self, trace: Any, constants: dict[str, Any]) -> dict[str, Any]:
-        """Return all parameters as inputs; what is zero as zero."""
+        """Return all parameters as inputs, but zeros as zero."""
         numbers: dict[str, Any] = {}
         for name in self._scene._numbers():
             at = constants[f"self_{name}"]

@@ -12,10 +12,10 @@ from lag_envs.tasks.base import Task
 
 
 class DrawnProgram(Program):
-    """The compiled functions of a task whose parameters are drawn; parameters as those of `Program`.
+    """The compiled functions of a task with drawn parameters; the arguments are those of `Program`.
 
-    The drawn parameters ``p_`` are rows, and so are the constants that follow from them. Beside that, and for
-    observations within their bounds, steps are those of any batch whose environments differ.
+    The drawn parameters ``p_`` are rows, and so are the constants that depend on them. Apart from that, and
+    from keeping observations within their bounds, steps are those of any batch of different environments.
     """
 
     def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:

@@ -10,7 +10,7 @@ from lag_envs.envs.program import DRAWS
 from lag_envs.stepping.tracing import Trace
 from lag_envs.tasks.imperfections import normals
 
-#: What has draws of its own, by the number that its key is made with.
+#: Purposes that have draws of their own, with the numbers from which their keys are made.
 PURPOSES = {"parameters": 1, "observation": 2, "action": 3, "delay": 4, "push": 5}
 
 
@@ -26,21 +26,21 @@ def noise(
     constants: Mapping[str, Any],
     trace: type[Trace],
 ) -> list[str]:
-    """Return the lines that add normal draws to values; each two share a pair of uniform ones.
+    """Return the lines that add normal draws to values; every two of them share a pair of uniform draws.
 
     Parameters
     ----------
     values : sequence of str
-        What gets noise.
+        The values that get noise.
     purpose : str
         One of `PURPOSES`.
     sigmas : mapping of str to float
-        For each value the name of its standard deviation among the constants, and its size, which decides
-        whether there is any noise; none for no noise at all.
+        For each value, the name of its standard deviation among the constants, and its size, which decides
+        whether there is noise; empty for no noise at all.
     constants : mapping
         Name, or zero, of each constant.
     trace : type of Trace
-        What formulas are recorded with.
+        The kind of recording for formulas.
     """
     if not sigmas:
         return []
@@ -49,7 +49,7 @@ def noise(
         return normals(first, second, xp)
 
     lines = [f"key_{purpose} = {key_of(purpose)}"]
-    per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step has that many times `DRAWS`
+    per_step = -(-(len(values) + len(values) % 2) // DRAWS)  # each step reserves this many times `DRAWS`
     names = list(sigmas)
     for i in range(0, len(values), 2):
         pair = [j for j in (i, i + 1) if j < len(values) and sigmas[names[j]] > 0.0]

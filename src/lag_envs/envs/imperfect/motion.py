@@ -1,6 +1,6 @@
 """How the state moves in a piece of a control step, from ``y`` to ``z`` in a time ``h``.
 
-The controls are held at their commands ``u`` (`Held`), or go towards them from where they are (`Lagged`).
+The controls are held at their commands ``u`` (`Held`), or approach them from their present values (`Lagged`).
 Both print the mean of the controls in force over the step, ``mean_u``.
 """
 
@@ -13,27 +13,27 @@ from lag_envs.envs.imperfect.rows import Rows
 
 
 class Held:
-    """Prints the motion under controls that are held.
+    """Prints the motion under held controls.
 
     Parameters
     ----------
     stepper : object
-        The scene's.
+        The scene's stepper.
     y, z, u : sequence of str
         State before and after, and controls.
     x : str or float
-        Order of the general series, or what bounds the closed form: in proportion to the time.
+        Order of the general series, or the bound of the closed form, which is proportional to the time.
     """
 
-    #: Constants that are used.
+    #: Constants that it uses.
     constants: Sequence[str] = ()
 
     def __init__(self, stepper: Any, y: Sequence[str], z: Sequence[str], u: Sequence[str], x: Any) -> None:
         general = not hasattr(stepper, "fast")
         arguments = [*(["room"] if general else []), *y, *u, "h", "limit", *stepper.constants]
         limit = str(x) if general or x == 0.0 else f"{x} * (h / k_dt)"
-        #: The lines of the move; behind it; and, behind a command, those of the mean, which within a piece is
-        #: the control.
+        #: The lines of the move; those after it; and, after a command is chosen, the lines of the mean, where
+        #: the mean over a piece is the control itself.
         self.move = [f"limit = {limit}", f"{', '.join(z)}, status = advance({', '.join(arguments)})"]
         self.behind: list[str] = []
         self.mean = [f"mean_{name} += (h / k_dt) * {name}" for name in u]
@@ -41,21 +41,21 @@ class Held:
         self.reached = u
 
     def begin(self, rows: Rows) -> list[str]:
-        """Return the lines before a step: none, for controls begin at their commands."""
+        """Return the lines before a step: none, since controls begin at their commands."""
         return []
 
 
 class Lagged:
-    """Prints the motion under controls whose actuators lag.
+    """Prints the motion under lagging controls.
 
     Parameters
     ----------
     code : object
-        That of the scene with lag.
+        The code of the scene's step with lag.
     lift_end : sequence of str
         The lines that add cosine and sine of the angle to ``z``.
     n_state : int
-        Entries of the state without them.
+        Entries of the state, without cosine and sine.
     y, z, u : sequence of str
         State before and after, and commands.
     constants : mapping
@@ -90,5 +90,5 @@ class Lagged:
         self._u = u
 
     def begin(self, rows: Rows) -> list[str]:
-        """Return the lines before a step: controls begin where they were."""
+        """Return the lines before a step: controls begin at their previous values."""
         return [f"{reached} = {rows.at(u)}" for reached, u in zip(self.reached, self._u, strict=True)]

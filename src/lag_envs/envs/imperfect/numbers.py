@@ -28,7 +28,7 @@ def numbers_of(task: Task) -> dict[str, float]:
         *zip(("seen_low", "seen_high"), seen_box(task), strict=True),
     ):
         numbers |= {f"{name}{i}": float(value) for i, value in enumerate(values)}
-    # Pushes that come at a rate: the chance that there is one in a step.
+    # Pushes come at a rate: this is the probability of one in a step.
     numbers["push_chance"] = -math.expm1(-found.push_rate * task.dt)
     numbers["late_low"], numbers["late_high"] = found.action_delay
     if found.lag:

@@ -20,9 +20,9 @@ from lag_envs.tasks.base import Task
 
 
 class ImperfectProgram(DrawnProgram):
-    """The compiled functions of a task with imperfections; parameters as those of `Program`.
+    """The compiled functions of a task with imperfections; the arguments are those of `Program`.
 
-    Rows that are kept besides are those of `Sensors` and `Actuators`.
+    The further rows that it keeps are those of `Sensors` and `Actuators`.
     """
 
     def __init__(self, task: Task, absent: frozenset[str], varying: frozenset[str]) -> None:
@@ -59,7 +59,7 @@ class ImperfectProgram(DrawnProgram):
         ]  # fmt: skip
 
     def _bound_observations(self) -> None:
-        """Leave what is observed as it is: what is shown follows later."""
+        """Leave observations unbounded: what the sensors show is bounded later."""
 
     # --- one environment, alone or in a batch ---------------------------------------------------------------
 
@@ -75,7 +75,7 @@ class ImperfectProgram(DrawnProgram):
     def take(self) -> Callable:
         """``take(f, base, stride, par, work, room, key)`` to (reward, over): a step of one environment.
 
-        `work` has the action; it gets what is shown, or the controls of a step that is refused.
+        `work` holds the action; it receives the shown observation, or the controls of a refused step.
         """
         n_act, rows, actuators, sensors = len(self.a), self._where, self._actuators, self._sensors
         body = [
@@ -97,7 +97,7 @@ class ImperfectProgram(DrawnProgram):
 
     @property
     def _through(self) -> list[str]:
-        """The lines that go through a step: from ``y`` to ``z``, with the mean controls in ``u``."""
+        """The lines of a whole step: from ``y`` to ``z``, with the mean controls in ``u``."""
         within, motion, actuators = self.options.within, self._motion, self._actuators
         move = [
             "h = end - t", *motion.move,
@@ -108,7 +108,7 @@ class ImperfectProgram(DrawnProgram):
             *(f"{y} = {z}" for y, z in zip(self.y, self.z, strict=True)),
             "t = end",
         ]  # fmt: skip
-        # Where nothing changes within the step it is one piece, and its mean control is the control.
+        # If nothing changes within the step it is one piece, and its mean control is the control itself.
         whole = ["h, t, end = k_dt, 0.0, k_dt", *actuators.command, *motion.mean, *move]
         commands = [*actuators.choose(self._where), "h = switch - t", *actuators.command, *motion.mean]
         pieces = [
@@ -151,7 +151,7 @@ class ImperfectProgram(DrawnProgram):
     # --- the functions of `Program` ------------------------------------------------------------------------
 
     def _slices(self, at: int, work: int) -> list[str]:
-        """Return the lines that cut constants, the room of a step, and that of the series out of an array."""
+        """Return the lines that cut constants, working memory of a step and of the series out of an array."""
         return [
             f"par = memory[{at}:]",
             f"work = memory[{work}:]",
@@ -197,7 +197,7 @@ class ImperfectProgram(DrawnProgram):
 
     @property
     def room_of_all(self) -> int:
-        """Numbers that `step_all` needs behind the constants."""
+        """Numbers that `step_all` needs after the constants."""
         return len(self.scratch) + self.room
 
     @cached_property

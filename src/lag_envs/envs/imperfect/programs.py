@@ -1,4 +1,4 @@
-"""Which program an environment or a batch has."""
+"""The choice of an environment's or a batch's program."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lag_envs.tasks.imperfections import Imperfections
 
 
 def program_of(task: Task, constants: Sequence[dict[str, float]]) -> Program:
-    """Return the program of an environment, or of a batch of tasks that have these constants."""
+    """Return the program of an environment, or of a batch of tasks with these constants."""
     absent = frozenset(name for name in constants[0] if all(c[name] == 0.0 for c in constants))
     varying = frozenset(
         name for name in constants[0] if any(c[name] != constants[0][name] for c in constants)

@@ -1,4 +1,4 @@
-"""Random impulses: what pushes free velocities, now and then, after a step."""
+"""Random impulses, which change free velocities now and then after a step."""
 
 from __future__ import annotations
 

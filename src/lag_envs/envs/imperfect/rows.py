@@ -7,19 +7,19 @@ from typing import NamedTuple
 
 
 class Ring(NamedTuple):
-    """Rows that are kept several times, in slots that are used in turn."""
+    """Rows that are stored several times, in slots that are used in turn."""
 
     rows: Sequence[str]
     slots: int
 
     @property
     def names(self) -> list[str]:
-        """The rows of all slots, one slot behind the other."""
+        """The rows of all slots, one slot after the other."""
         return [f"{row}_{slot}" for slot in range(self.slots) for row in self.rows]
 
 
 class Rows:
-    """Where rows lie.
+    """The places of rows.
 
     Parameters
     ----------
@@ -31,11 +31,11 @@ class Rows:
         self._kept = list(kept)
 
     def at(self, row: str) -> str:
-        """Return where a row lies."""
+        """Return the place of a row."""
         return f"f[base + {self._kept.index(row)} * stride]"
 
     def in_slot(self, ring: Ring, row: str) -> str:
-        """Return where a row of a ring lies, in the slot whose number is ``slot``."""
+        """Return the place of a row of a ring, in the slot numbered ``slot``."""
         first = self._kept.index(f"{row}_0")
         return f"f[base + ({first} + slot * {len(ring.rows)}) * stride]"
 

@@ -1,4 +1,4 @@
-"""What is shown of what is observed: late, with noise, and not after every step."""
+"""What sensors show of the observation: late, with noise, and not after every step."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from lag_envs.tasks.imperfections import Imperfections
 
 
 class Sensors:
-    """Prints what sensors do.
+    """Prints the lines for sensors.
 
-    Rows of its own are what was shown last ``h``, and observations that are still to be seen ``seen``.
+    Its own rows are the observation shown last, ``h``, and observations still to be shown, ``seen``.
 
     Parameters
     ----------
     options : Imperfections
-        What the sensors are like.
+        The imperfections of the sensors.
     observed : sequence of str
-        What a perfect sensor shows.
+        The observation that a perfect sensor shows.
     observe, bounded : sequence of str
-        The lines that compute that, and those that keep it within its bounds.
+        The lines that compute it, and those that keep it within its bounds.
     constants : mapping
         Name, or zero, of each constant.
     trace : type of Trace
-        What formulas are recorded with.
+        The kind of recording for formulas.
     """
 
     def __init__(
@@ -50,16 +50,16 @@ class Sensors:
 
     @property
     def watch(self) -> list[str]:
-        """The lines that note, within a step, what will be shown."""
+        """The lines that store, within a step, what will be shown later."""
         seen = [*self._observe, *(f"m{i} = {o}" for i, o in enumerate(self._o))]
         return ["if t == k_shown_at:", *indent(seen)]
 
     def begin(self, rows: Rows) -> list[str]:
-        """Return the lines that show a start, as if it had stood there for long."""
+        """Return the lines that show a start as if it had lasted for a long time."""
         return [*self._observe, *rows.fill(self.ring, self._seen), *self.sense, *self._show(rows)]
 
     def read(self, rows: Rows) -> list[str]:
-        """Return the lines that show what is observed at the end of a step."""
+        """Return the lines that show the observation at the end of a step."""
         lines, found = [*self._observe], self._options
         if found.readings:
             values = {row: f"m{i}" for i, row in enumerate(self._seen)} if found.within else self._seen

@@ -1,4 +1,4 @@
-"""Arithmetic with twice the digits, in which constants are computed from drawn parameters."""
+"""Arithmetic with twice the digits, for computing constants from drawn parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lag_envs.stepping.twofold import two_product, two_sum
 
 
 class Twice:
-    """A number with twice the digits, for what `evaluate` does with parameters."""
+    """A number with twice the digits, for the operations of `evaluate` on parameters."""
 
     __slots__ = ("high", "low")
 
@@ -61,7 +61,7 @@ def rounded(value: Any) -> Any:
 
 
 class Functions:
-    """Functions of numbers with twice the digits: of their nearest floats."""
+    """Functions of numbers with twice the digits, evaluated at the nearest floats."""
 
     Rational, mpf, pi = Fraction, None, Fraction(math.pi)
 

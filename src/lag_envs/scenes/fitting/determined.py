@@ -1,4 +1,4 @@
-"""What data determine of the parameters, by the derivatives of the residuals at the solution."""
+"""Which parameters the data determine, and how well, from derivatives of the residuals at the solution."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from lag_envs.scenes.fitting.shooting import Shooting
 
 Array = NDArray[np.float64]
 
-#: Derivatives whose singular values, at unit length, are below this depend on each other.
+#: Derivatives with a singular value below this, at unit length, count as dependent.
 DEPENDENT = 1e-7
-#: Where twice a parameter, or one more unit of it, moves no state by more than this part of its range, it has
-#: no effect.
+#: A parameter has no effect if doubling it, or adding one unit, moves no state by more than this part of its
+#: range.
 NO_EFFECT = 1e-10
 
 
 class Determined:
-    """What remains of the derivatives by the parameters when the starts, which are unknown too, take theirs.
+    """The derivatives with respect to the parameters, after projecting out those of the unknown starts.
 
     Parameters
     ----------
@@ -31,11 +31,11 @@ class Determined:
     Attributes
     ----------
     covariance : ndarray, shape (p, p)
-        Of the scaled parameters.
+        Covariance of the scaled parameters.
     leverage : ndarray, shape (number of residuals,)
-        The part of each residual that the unknowns take up.
+        The part of each residual that the unknowns absorb.
     freedom : int
-        Number of residuals less that of unknowns.
+        Number of residuals minus number of unknowns.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class Determined:
         lengths = np.linalg.norm(by_starts, axis=0)
         starts = orth(by_starts / np.where(lengths > 0.0, lengths, 1.0), rcond=1e-10)
         rest = by_parameters - starts @ (starts.T @ by_parameters)
-        rest -= starts @ (starts.T @ rest)  # once more, for what rounding left
+        rest -= starts @ (starts.T @ rest)  # once more, to remove rounding errors
         left = np.linalg.norm(rest, axis=0)
         none = np.abs(moved[of >= 0]).max(axis=0) < NO_EFFECT
         none |= left <= DEPENDENT * np.linalg.norm(by_parameters, axis=0)
@@ -69,7 +69,7 @@ class Determined:
         self.freedom = len(derivatives) - starts.shape[1] - p
 
     def _refuse(self, directions: list[Array]) -> None:
-        """Raise an error for directions in which the scaled parameters can change and nothing else does."""
+        """Raise an error for directions in which the scaled parameters can change without any effect."""
         texts = []
         for direction in directions:
             change = direction / self._whole
@@ -89,5 +89,5 @@ class Determined:
         if texts:
             raise ValueError(
                 f"the data do not determine {'; nor '.join(texts)}. Leave one out of free, so that it is "
-                "held, or add recordings that it shows in, such as some under known controls"
+                "held, or add recordings in which it has an effect, such as some under known controls"
             )

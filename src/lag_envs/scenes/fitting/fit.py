@@ -23,19 +23,19 @@ from lag_envs.scenes.fitting.shooting import Shooting, cut
 
 Array = NDArray[np.float64]
 
-#: Lengths of pieces [measured samples] by which parameters are sought first, from the smoothed data.
+#: Lengths of pieces [measured samples] in the first searches, which start from the smoothed data.
 SHORT = (3, 10)
 #: The most unknowns for starts, unless there are more recordings: the time of a step grows as their square.
 MOST_STARTS = 200
-#: Gaps between pieces are expected to be as large as the noise at first, then these parts of it: none.
+#: Gaps between pieces may first be as large as the noise, then only these parts of it; finally none remain.
 CLOSING = (0.03, 1e-3)
-#: Relative changes of sum of squares and unknowns at which a search ends, on the way and at last.
+#: Relative changes of sum of squares and unknowns at which intermediate searches and the last one end.
 COARSE, FINE = 1e-4, 1e-12
-#: Noise is taken for at least this part of a state's range, for rounding and the errors of who made the data.
+#: Noise is at least this part of a state's range, to allow for rounding and for errors of simulated data.
 LEAST_NOISE = 1e-9
-#: A standard error above this part of the estimate, or a correlation above this, is warned of.
+#: A standard error above this part of the estimate, or a correlation above this, causes a warning.
 WIDE, CORRELATED = 0.5, 0.999
-#: Residuals that are so many times the noise are not noise; those below this part of the range do not matter.
+#: Residuals this many times the noise are a misfit; residuals below this part of the range do not matter.
 MISFIT, INVISIBLE = 2.0, 1e-6
 #: How often the noise is estimated, and the fit repeated with it, at most.
 WEIGHINGS = 8
@@ -50,7 +50,7 @@ def fit(
 ) -> Fit:
     """See `Scene.fit`."""
     if importlib.util.find_spec("scipy") is None:
-        raise ModuleNotFoundError('to fit needs SciPy: pip install "lag-envs[fit]"', name="scipy")
+        raise ModuleNotFoundError('fitting needs SciPy: pip install "lag-envs[fit]"', name="scipy")
     try:
         names = check_parameters(scene, free)
     except ValueError as error:
@@ -89,11 +89,11 @@ class _Sizes:
     Attributes
     ----------
     range : ndarray, shape (n_state,)
-        Largest less smallest value; of what was not measured, in the guess.
+        Largest minus smallest value; if not measured, that of the guess.
     noise : ndarray, shape (n_state,)
         Standard deviation of the residuals.
     given : bool
-        Whether it was given.
+        Whether the noise was given.
     """
 
     def __init__(self, scene: Scene, data: Sequence[Recording], noise: Mapping[str, float] | None) -> None:
@@ -124,12 +124,12 @@ class _Sizes:
 
     @property
     def gap(self) -> Array:
-        """Noise as far as it is known, else the same part of the range."""
+        """Noise of measured states; for the others the same part of their range."""
         part = np.median((self.noise / self.range)[self.seen])
         return np.where(self.seen, self.noise, part * self.range)
 
     def estimate(self, shooting: Shooting, z: Array, leverage: Array | float = 0.0) -> None:
-        """Take the noise from residuals; `leverage` is the part of each that the unknowns have taken up."""
+        """Estimate the noise from residuals; `leverage` is the part of each that the unknowns absorb."""
         if self.given:
             return
         residuals, of = shooting.residuals(z), shooting.states_of_residuals()
@@ -141,7 +141,7 @@ class _Sizes:
 
 
 def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) -> tuple[Shooting, Array]:
-    """Return a problem of short pieces and its solution: first for parameters alone, then for starts too."""
+    """Return a problem of short pieces and its solution: first for parameters alone, then with starts."""
     n, p = len(sizes.noise), len(parameters.names)
     samples = sum(len(r.states) for r in data)
     spacing = samples // sum(int(r.measured.any(axis=1).sum()) for r in data)
@@ -153,7 +153,7 @@ def _approach(parameters: FreeParameters, data: list[Recording], sizes: _Sizes) 
         starts = [sizes.guesses[piece.recording][piece.first] for piece in pieces]
         shooting = Shooting(parameters, data, pieces, sizes.noise, sizes.gap)
         z = np.concatenate([z[:p], *starts])
-        shooting.simulate(z)  # where this is refused, its error says why
+        shooting.simulate(z)  # if this is refused, its error says why
         z[:p] = shooting.solve(z, COARSE, starts=False).x
         sizes.estimate(shooting, z)
     shooting = shooting.weighed(sizes.noise, sizes.gap)
@@ -202,7 +202,7 @@ def _result(
 
 
 def _doubts_of_parameters(fitted: Fit, parameters: FreeParameters, best: Array, errors: Array) -> list[str]:
-    """Return what there is to warn of in what is known of the parameters."""
+    """Return warnings about the estimates of the parameters."""
     texts, names = [], list(fitted.estimates)
     for i, (name, value) in enumerate(fitted.estimates.items()):
         if min(best[i] - parameters.low[i], parameters.high[i] - best[i]) < 0.01 * errors[i]:
@@ -222,9 +222,9 @@ def _doubts_of_parameters(fitted: Fit, parameters: FreeParameters, best: Array, 
 
 
 def _doubts_of_model(fitted: Fit, sizes: _Sizes, relaxed: Array) -> list[str]:
-    """Return what there is to warn of in the residuals.
+    """Return warnings about the residuals.
 
-    `relaxed` is the noise that remained when the motion was allowed to have gaps.
+    `relaxed` is the noise that remains if the motion may have gaps.
     """
     texts = []
     for i in np.flatnonzero(sizes.seen):

@@ -12,22 +12,22 @@ from lag_envs.scenes.base import ORDER, Scene
 
 Array = NDArray[np.float64]
 
-#: What a parameter that is 0 begins with: at 0 its terms are left out of the motion.
+#: Starting value of a parameter that is 0: at 0 its terms would be left out of the motion.
 NEARLY_ZERO = 1e-6
 
 
 class FreeParameters:
-    """Free parameters of a scene, on the scale on which they are sought: the logarithm of positive ones.
+    """Free parameters of a scene, on the scale of the search: the logarithm of positive ones.
 
-    A parameter that is not free and has the value which its default makes from others goes on following them,
-    as a bar's inertia does its mass.
+    A parameter that is not free and has the default value computed from others keeps following those, as a
+    bar's inertia follows its mass.
 
     Attributes
     ----------
     names : tuple of str
-        Those that are free.
+        The free parameters.
     logs : ndarray of bool, shape (p,)
-        Which are sought by their logarithm.
+        Whether the logarithm of each is sought.
     start, low, high : ndarray, shape (p,)
         The scene's values and their bounds, on that scale.
     """
@@ -47,16 +47,16 @@ class FreeParameters:
         self._fixed |= {n: getattr(scene, n) for n in made if n not in self._followers}
 
     def scaled(self, values: Any) -> Array:
-        """Return values on the scale on which they are sought."""
+        """Return values on the scale of the search."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.logs, np.log(values), values)
 
     def values(self, scaled: Array) -> Array:
-        """Return values from that scale."""
+        """Return the values of scaled ones."""
         return np.where(self.logs, np.exp(np.where(self.logs, scaled, 0.0)), scaled)
 
     def slopes(self, scaled: Array) -> Array:
-        """Return the values' derivatives by their scale."""
+        """Return the derivatives of the values with respect to the scaled ones."""
         return np.where(self.logs, self.values(scaled), 1.0)
 
     def scene(self, scaled: Array) -> Scene:
@@ -68,14 +68,14 @@ class FreeParameters:
         return made
 
     def chain(self, scaled: Array) -> tuple[list[str], Array]:
-        """Return names of all parameters that change with the scale, and their derivatives by it.
+        """Return names of all parameters that depend on the scaled ones, and their derivatives.
 
         Returns
         -------
         names : list of str
-            The free ones, and those that follow them.
+            The free ones, and those that follow.
         derivatives : ndarray, shape (number of names, p)
-            The followers' are differences: a default is any function of the scene.
+            Those of followers are finite differences: a default may be any function of the scene.
         """
         steps = 1e-5 * np.diag(np.where(self.logs, 1.0, scaled))
         rows = np.zeros((len(self._followers), len(scaled)))

@@ -1,4 +1,4 @@
-"""Recordings of a motion: what is accepted, and a first guess of what was not measured."""
+"""Recordings of a motion: which are accepted, and a first guess of the missing values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: 2π, and what rounding may add to it.
+#: 2π, with a margin for rounding.
 ONE_TURN = 2.0 * np.pi * (1.0 + 1e-9)
 
 
@@ -27,7 +27,7 @@ class Recording:
     Attributes
     ----------
     states : ndarray, shape (N, n_state)
-        What was measured; NaN is what was not.
+        The measurements, NaN where missing.
     controls : ndarray, shape (N - 1, n_controls)
         Row i is held from state i to state i + 1.
     dt : float
@@ -40,7 +40,7 @@ class Recording:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Where there is a measurement."""
+        """Whether each value was measured."""
         return np.isfinite(self.states)
 
 
@@ -85,12 +85,12 @@ def _recording(scene: Scene, states: Any, controls: Any, dt: Any) -> Recording:
 
 
 def _controls(scene: Scene, controls: Any, count: int) -> Array:
-    """Return the controls of the steps between so many states; None are controls that are all 0."""
+    """Return the controls of this many steps; None means that all are 0."""
     steps, n = count - 1, len(scene.control_names)
     if controls is None:
         return np.zeros((steps, n))
     given = check_sequence(scene, controls)
-    if len(given) == count:  # sampled together with the states: the last one acts after the last state
+    if len(given) == count:  # sampled together with the states: the last one acts only after the last state
         given = given[:steps]
     if len(given) != steps:
         raise ValueError(
@@ -101,7 +101,7 @@ def _controls(scene: Scene, controls: Any, count: int) -> Array:
 
 
 def _unwrapped(scene: Scene, states: Array) -> Array:
-    """Return the states with angles that were measured within one turn made continuous."""
+    """Return the states, with angles that were measured within one turn made continuous."""
     for i, entry in enumerate(scene._layout.state):
         seen = np.isfinite(states[:, i])
         angles = states[seen, i]
@@ -118,8 +118,8 @@ def _row(bad: NDArray[np.bool_]) -> int:
 def guess(scene: Scene, recording: Recording) -> Array:
     """Return states near those of a recording, shape (N, n_state), with a value for each entry.
 
-    What was measured is smoothed lightly, and gaps are bridged. A rate that was not measured is the place's
-    slope, a place that was not is the rate's integral from 0.
+    Measurements are smoothed lightly, and gaps are bridged. A rate that was not measured is the slope of the
+    place; a place that was not measured is the integral of the rate from 0.
     """
     dt, count = recording.dt, len(recording.states)
     entries = scene._layout.state
@@ -152,7 +152,7 @@ def _parabolas(values: Array, dt: float) -> tuple[Array, Array]:
     windows = np.lib.stride_tricks.sliding_window_view(values, len(k))
     value, slope, curvature = fitted @ windows.T
     at = np.arange(len(values))
-    centre = np.clip(at, half, len(values) - 1 - half)  # at the ends, of the last full window
+    centre = np.clip(at, half, len(values) - 1 - half)  # at the ends, use the last full window
     off, centre = at - centre, centre - half
     smooth = value[centre] + off * (slope[centre] + off * curvature[centre])
     return smooth, (slope[centre] + 2.0 * off * curvature[centre]) / dt

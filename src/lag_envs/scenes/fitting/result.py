@@ -1,4 +1,4 @@
-"""What a fit has found: numbers, a table, a picture."""
+"""The result of a fit: numbers, a table, a picture."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 
 class FitWarning(UserWarning):
-    """The data determine a parameter badly, or the model does not follow them."""
+    """The data determine a parameter poorly, or the model does not follow them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """What `Scene.fit` found.
+    """The result of `Scene.fit`.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Fit:
     simulated : list of ndarray, shape (N, n_state)
         The fitted motion of each recording; its first row is the estimated start.
     warnings : tuple of str
-        What has been warned of.
+        The warnings given.
     """
 
     scene: Scene
@@ -61,7 +61,7 @@ class Fit:
 
     @property
     def residuals(self) -> list[Array]:
-        """What was measured less what is simulated, NaN where nothing was measured."""
+        """Measured minus simulated states, NaN where nothing was measured."""
         return [r.states - x for r, x in zip(self.recordings, self.simulated, strict=True)]
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ class Fit:
         rows = [("parameter", "estimate", "std. error", f"{100 * self.level:g} % interval", "unit")]
         for name, value in self.estimates.items():
             error = self.errors[name]
-            # As many digits as the error has, with two of its own.
+            # As many digits as the error, which has two significant digits.
             digits = max(
                 2, 2 + math.floor(math.log10(max(abs(value), error))) - math.floor(math.log10(error))
             )
@@ -83,7 +83,7 @@ class Fit:
         return "\n".join([one, *columns(rows), *(f"! {text}" for text in self.warnings)])
 
     def plot(self) -> Any:
-        """Return a Matplotlib figure: for each measured state data and model, residuals, their histogram."""
+        """Return a Matplotlib figure: data and model of each measured state, residuals, their histogram."""
         from matplotlib.figure import Figure
 
         names = list(self.noise)

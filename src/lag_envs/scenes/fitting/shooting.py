@@ -1,8 +1,9 @@
-"""Multiple shooting: a recording is cut into pieces, each of which is simulated from a start of its own.
+"""Multiple shooting: a recording is cut into pieces, each simulated from a start of its own.
 
-The unknowns are the free parameters and the pieces' starts. The residuals are what was measured less what is
-simulated, and the gaps between the end of a piece and the start of the next, each divided by its expected
-size. Pieces make it robust: a motion of a few steps is never far off, whatever the parameters are.
+The unknowns are the free parameters and the pieces' starts. The residuals are the differences between
+measurements and simulation, and the gaps between the end of each piece and the start of the next, all divided
+by their expected sizes. Pieces make it robust: a motion of a few steps is never far off, whatever the
+parameters are.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: The largest factor by which one search may change a parameter that is sought by its logarithm: what short
-#: pieces do not determine must not run away.
+#: The largest factor by which one search may change a parameter that is sought by its logarithm: parameters
+#: that short pieces do not determine must not run away.
 FARTHEST = np.log(1e3)
 
 
 class Piece(NamedTuple):
-    """Samples ``first`` to ``last`` of a recording; a next piece begins at ``last``."""
+    """Samples ``first`` to ``last`` of a recording; the next piece begins at ``last``."""
 
     recording: int
     first: int
@@ -37,12 +38,12 @@ class Piece(NamedTuple):
 
     @property
     def own(self) -> slice:
-        """The samples that are compared with this piece's motion."""
+        """The samples to compare with this piece's motion."""
         return slice(self.first, self.last + (not self.continues))
 
 
 def cut(recordings: Sequence[Recording], length: int) -> list[Piece]:
-    """Return all recordings in pieces of so many steps; the last ones may be shorter."""
+    """Cut all recordings into pieces of this many steps; the last ones may be shorter."""
     found = []
     for i, recording in enumerate(recordings):
         end = len(recording.states) - 1
@@ -60,11 +61,11 @@ class Shooting:
     Parameters
     ----------
     parameters : FreeParameters
-        What is free.
+        The free parameters.
     recordings : sequence of Recording
         The data.
     pieces : sequence of Piece
-        How they are cut.
+        The pieces of the recordings.
     noise : ndarray, shape (n_state,)
         Expected size of the residuals of each state.
     gap : ndarray, shape (n_state,)
@@ -102,7 +103,7 @@ class Shooting:
         return self._known[1]
 
     def residuals(self, z: Array) -> Array:
-        """Return the residuals, divided by their expected sizes; infinite where the motion cannot be had."""
+        """Return the residuals divided by their expected sizes; infinite if the simulation fails."""
         try:
             _, motions = self.simulate(z)
         except (StepRefused, ValueError):
@@ -132,9 +133,9 @@ class Shooting:
         return np.concatenate(parts)
 
     def sensitivities(self, z: Array) -> list[Array]:
-        """Return for each piece the derivatives of its motion, shape (steps + 1, n_state, n_state + p).
+        """Return the derivatives of each piece's motion, shape (steps + 1, n_state, n_state + p).
 
-        They are those by its start, followed by those by the scaled parameters.
+        First come those with respect to its start, then those with respect to the scaled parameters.
         """
         scene, motions = self.simulate(z)
         p, n = len(self.parameters.names), len(self.noise)
@@ -156,7 +157,7 @@ class Shooting:
         return found
 
     def jacobian(self, z: Array) -> Array:
-        """Return the derivatives of the residuals by z."""
+        """Return the derivatives of the residuals with respect to z."""
         p, n = len(self.parameters.names), len(self.noise)
         found, row = np.zeros((self.count, len(z))), 0
         for j, (piece, total) in enumerate(zip(self.pieces, self.sensitivities(z), strict=True)):
@@ -174,7 +175,7 @@ class Shooting:
         return found
 
     def solve(self, z: Array, tolerance: float, *, starts: bool = True) -> Any:
-        """Return SciPy's result of a minimisation that begins at z; with `starts` held if that is False."""
+        """Return SciPy's result of a minimisation that begins at z; unless `starts`, starts are held."""
         from scipy.optimize import least_squares
 
         p, parameters = len(self.parameters.names), self.parameters
