@@ -81,7 +81,7 @@ class Formulas:
             if exponent.is_negative:
                 return self._add("inverse", self._of(1 / e))
             if not (2 * exponent).is_Integer:
-                raise ValueError(f"the power {e} is neither an integer nor a half")
+                raise ValueError(f"the power {e} is neither whole nor a half")
             root = self._of(base) if exponent.is_Integer else self._add("sqrt", self._of(base))
             power = root
             for _ in range(int(exponent if exponent.is_Integer else 2 * exponent) - 1):
