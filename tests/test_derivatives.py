@@ -190,7 +190,7 @@ def starts(task, rng, n):
             if ended[0]:
                 break
             states[i] = after[0]
-    # A guard leads exactly to the edge of its action: there, two derivatives meet.
+    # A guard leads exactly to the edge where it begins to act: there, two derivatives meet.
     return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
 
 

@@ -81,7 +81,7 @@ def test_full_period():
 
 @pytest.mark.parametrize("track", [1.5, None])
 def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
-    """The bar's own equation is recognised, only when undamped, with its support at a state or left out."""
+    """The bar's own equation is recognised, but only if undamped, with its moving support or without one."""
     bar, start = scenes.PivotedBar(track=track), [0.3, -0.2][: 2 if track else 0]
     state = [*start, 2.0, 3.0]
     exact = oracle_of(bar).flow(state, 4.0, 1.5)

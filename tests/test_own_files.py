@@ -20,7 +20,7 @@ from lag_envs.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
-#: Two controls, a choice among three, and no control.
+#: A task with two controls, one with a choice among three, and one without controls.
 SEVERAL = str(ROOT / "tests" / "own_tasks.py")
 pytestmark = pytest.mark.usefixtures("unregistered")
 
