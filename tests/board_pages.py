@@ -1,4 +1,4 @@
-"""A board as the page gets it, with made-up scores and real episodes, for tests and for looking at the page.
+"""A board's page data, with made-up scores and real episodes, for tests and for looking at the page.
 
 ``python -m tests.board_pages FOLDER`` writes its page.
 """
@@ -38,7 +38,7 @@ COMBINED = {
 
 @cache
 def replay(env_id, seed):
-    """Return an episode of a policy that is random, but slowly so, in the form of the page's data."""
+    """Return an episode of a slowly varying random policy, in the form of the page's data."""
     env = gym.make(env_id)
     env.reset(seed=seed)
     rng, action, done = np.random.default_rng(seed), 0.0, False
@@ -106,7 +106,7 @@ def value():
 
 
 def data(env_ids=("PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id), agents=AGENTS):
-    """Return what `board_data` returns, for environments of all three scenes."""
+    """Return data like that of `board_data`, for environments of all three scenes."""
     boards = [
         {
             "id": env_id,

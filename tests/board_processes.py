@@ -1,4 +1,4 @@
-"""Processes that work on a board at once, and processes that are killed at it. Run by tests/test_board.py."""
+"""Processes that work on a board at once, or are killed while doing so. Run by tests/test_board.py."""
 
 import collections
 import json
@@ -20,12 +20,12 @@ from lag_envs.leaderboard import (
 from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.pending import finish
 
-#: What changes files. Each call is a moment to be killed at.
+#: Calls that change files. Each is a moment to be killed at.
 CALLS = ("open", "write", "fsync", "ftruncate", "rename", "replace", "mkdir", "rmdir", "unlink", "close")
 
 
 def forked(work, *args):
-    """Run a function in a process of its own and return the process's id."""
+    """Run a function in a separate process and return the process's id."""
     child = os.fork()
     if child == 0:
         status = 1
@@ -47,7 +47,7 @@ def events(board):
 
 
 def add(board, folder, nonce):
-    """Do what the command `leaderboard add FOLDER --nonce NONCE` does."""
+    """Do the same as the command `leaderboard add FOLDER --nonce NONCE`."""
     entry = board.add(submission.load(folder))
     if entry.state == "pending" and board.read().nonce(entry) is None:
         board.publish(nonce)
@@ -102,7 +102,7 @@ def every_step(root):
         board = Board(root / f"board{number}")
         shutil.copytree(start.folder, board.folder)
         status = ended(forked(killed_at, number, lambda board=board: add(board, new, "nonce-2")))
-        state = board.read()  # whatever happened
+        state = board.read()  # must work at any moment
         assert state.entries[first].state in ("verified", "superseded"), number
         board.result(state.entries[first])
         second = add(board, new, "nonce-2" if status else "nonce-3")
@@ -174,7 +174,7 @@ def at_once(root, processes, each):
 
 
 def finished_at_once(root, processes, each):
-    """Several that find the same pending ones verify each of them once."""
+    """Several processes that find the same pending submissions verify each of them once."""
     board = Board(root / "board")
     for i in range(each):
         board.add(submission.load(write(root / f"s{i}", name=f"agent {i}")))
@@ -198,6 +198,6 @@ def finished_at_once(root, processes, each):
 
 if __name__ == "__main__":
     fake_submissions.install()
-    # What a killed process has written is safe with the system; only a power cut needs the slow disk.
+    # Data written by a killed process is safe in the system; only a power cut needs the slow flush to disk.
     os.fsync = lambda file: None
     globals()[sys.argv[1]](Path(sys.argv[2]), *map(int, sys.argv[3:]))

@@ -28,7 +28,7 @@ def browser():
 
 
 class Pages:
-    """Opens pages; in the end they must have met no error and asked nobody else for anything."""
+    """Opens pages; in the end they must have met no error and made no request to other hosts."""
 
     def __init__(self, browser):
         self._browser, self._opened = browser, []
@@ -59,7 +59,7 @@ def browsing(browser):
 
 
 def until(page, expression, wait=60.0):
-    """Wait until an expression is true; Playwright's own way is to eval, which the page's rules forbid."""
+    """Wait until an expression is true; Playwright's own way uses eval, which the page's rules forbid."""
     end = time.monotonic() + wait
     while not (value := page.evaluate(expression)):
         assert time.monotonic() < end, expression
@@ -68,7 +68,7 @@ def until(page, expression, wait=60.0):
 
 
 def serious(page):
-    """Return what axe finds that is serious: rule and place."""
+    """Return the serious findings of axe: rule and place."""
     from axe_playwright_python.sync_playwright import Axe
 
     found = Axe().run(page, options={"preload": False}).response["violations"]

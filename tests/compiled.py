@@ -41,5 +41,5 @@ def load(source, device, single):
     return launch
 
 
-#: Environments as on a GPU, in the memory of the CPU.
+#: Environments as on a GPU, but in the CPU's memory.
 on_processor = partial(DeviceEnvs, device="cpu", load=load)

@@ -8,17 +8,17 @@ import gymnasium as gym
 import pytest
 from browsers import browser, browsing  # noqa: F401 (fixtures)
 
-# Numba makes many objects and no cycles of them that matter: looking for those takes a tenth of its time.
+# Numba makes many objects and hardly any cycles: searching for these takes a tenth of its time.
 gc.freeze()
 gc.set_threshold(100_000, 50, 50)
 
-# A shell that starts the tests in the background makes them, and all that they start, ignore Ctrl-C.
+# A shell that starts the tests in the background makes them, and their children, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
 def unregistered():
-    """Leave nothing of the example, before and after, so that whoever imports it next has it registered."""
+    """Forget the example, before and after, so that the next import registers it."""
 
     def forget():
         gym.registry.pop("BallOnBeam-v0", None)
@@ -34,7 +34,7 @@ def pytest_addoption(parser):
 
 
 def _fail(report, config):
-    """Turn a skip into a failure, where that is asked for; but few machines have a GPU."""
+    """Turn a skip into a failure, if requested; except for GPUs, which few machines have."""
     allowed = hasattr(report, "wasxfail") or "gpu" in getattr(report, "keywords", ())
     if report.skipped and config.getoption("--no-skips") and not allowed:
         report.outcome = "failed"

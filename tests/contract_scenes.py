@@ -1,4 +1,4 @@
-"""Scenes for tests, each with something that the package's own do not have."""
+"""Scenes for tests, each with a feature that the package's own scenes lack."""
 
 import numpy as np
 
@@ -133,7 +133,7 @@ class Trolley(Scene):
 
 
 class Functions(Scene):
-    """A scene with every function of an energy, a quotient, a tangent, and a place that is commanded."""
+    """A scene with every function of an energy, a quotient, a tangent, and a commanded place."""
 
     mass: float = parameter(1.3, "kg", above=0.0)
     size: float = parameter(1.1, "m", above=0.0)

@@ -1,9 +1,9 @@
-"""Which environments the quick tests run on: a few that together have every feature of a task's record.
+"""The environments for the quick tests: a few that together have every feature of a task's record.
 
-Tests over environments take their parameters from `covering`. Those outside the covering set are marked
-slow, so ``make test`` costs about the same however many environments there are, and ``make test-slow`` runs
-the rest. Checks of a few milliseconds run on all: they are parametrised with `TASKS` itself. Those that
-compile programs of their own, and are about the engine and not about formulas, cover the engines.
+Tests over environments take their parameters from `covering`. Those outside the covering set are marked slow,
+so ``make test`` costs about the same however many environments there are, and ``make test-slow`` runs the
+rest. Checks of a few milliseconds run on all: they are parametrised with `TASKS` itself. Those that compile
+their own programs, and test the engine rather than formulas, cover the engines.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ import pytest
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
-#: Entries of a record in which tasks differ by numbers and words only. Any other that a task has of its own
-#: is a feature.
+#: Entries of a record in which tasks differ only by numbers and words. Any other entry of a task's own is a
+#: feature.
 WORDS_AND_NUMBERS = frozenset(
     "id scene defaults interval steps action start target usable usable_ranges check check_start fastest "
     "edges observe bounds reward reached behaviour controllers reference hyperparameters goal "
     "value_iteration examples difficulty note open quantities".split()
 )
-#: What a covering set covers.
+#: The features that a covering set covers.
 Features = Callable[[type[Task]], frozenset[str]]
-#: Those that are stepped as their tasks say: without hidden parameters, imperfect sensors or actuators.
+#: Environments without hidden parameters, imperfect sensors or actuators.
 PERFECT = [env_id for env_id, kind in TASKS.items() if not kind.imperfections]
 
 
@@ -37,7 +37,7 @@ def slow(*values: Any) -> Any:
 
 @cache
 def features(kind: type[Task]) -> frozenset[str]:
-    """Return what code depends on in a task's record, in words."""
+    """Return the features of a task's record on which code depends, in words."""
     task = kind()
     formulas, form = task.formulas, task.scene._form
     own = {name for name in vars(Task) if getattr(kind, name) is not getattr(Task, name)}
@@ -54,7 +54,7 @@ def features(kind: type[Task]) -> frozenset[str]:
 
 @cache
 def engine(kind: type[Task]) -> frozenset[str]:
-    """Return what decides how a step is printed, whatever its formulas are."""
+    """Return the features that decide how a step is printed, apart from its formulas."""
     form = kind().scene._form
     return frozenset(["imperfect" if kind.imperfections else form.kind.__name__ if form else "series"])
 
@@ -66,7 +66,7 @@ def size(kind: type[Task]) -> int:
 
 
 def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:
-    """Return a covering set, chosen greedily: what adds most features, and then has fewest coordinates."""
+    """Return a covering set, chosen greedily: most new features first, then fewest coordinates."""
     left = {env_id: of(TASKS[env_id]) for env_id in ids}
     missing, found = frozenset[str]().union(*left.values()), []
     while missing:
@@ -76,7 +76,7 @@ def quick(ids: Iterable[str] = TASKS, of: Features = features) -> list[str]:
 
 
 def covering(ids: Iterable[str] = TASKS, of: Features = features) -> list[Any]:
-    """Return all ids for the parameters of a test, those outside their covering set marked slow."""
+    """Return all ids as test parameters, those outside their covering set marked slow."""
     every = list(ids)
     chosen = quick(every, of)
     return [i if i in chosen else slow(i) for i in every]

@@ -11,7 +11,7 @@ from lag_envs.envs.actions import Actions
 
 
 class Six(Switched):
-    """A chain so long that its script is cut into several functions."""
+    """A chain so long that its script is split into several functions."""
 
     id = "OwnSix-v0"
     defaults = {"bars": 6, "mass": 0.1, "length": 0.2}
@@ -20,7 +20,7 @@ class Six(Switched):
 
 
 def at_random(task, seed):
-    """Return actions without sense, those beyond their limits too."""
+    """Return random actions, including some beyond their limits."""
     rng, formulas = np.random.default_rng(seed), task.formulas
     if formulas.choices:
         space = Actions(formulas).space
@@ -30,7 +30,7 @@ def at_random(task, seed):
 
 
 def by_agent(task):
-    """Return what a controller of the task's own does that plans nothing; without one, random actions."""
+    """Return the actions of a task's own controller that does not plan; without one, random actions."""
     names = [n for n, found in controllers(task).items() if not found.plans and n not in ("zero", "random")]
     if not names:
         return at_random(task, 99)

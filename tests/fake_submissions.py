@@ -14,9 +14,9 @@ EPISODES = 20
 
 
 def write(folder, name="PPO", *, env=ENV, authors=("A. Author",), kind="learned", score=0.5, **other):
-    """Write a fake submission whose policies get about this score; other text makes other bytes.
+    """Write a fake submission whose policies get about this score; another text gives other bytes.
 
-    Two with the same text as `acts` act alike.
+    Two with the same text for `acts` act alike.
     """
     folder = Path(folder)
     folder.mkdir(parents=True)
@@ -65,7 +65,7 @@ def told(found):
 
 
 def played(found, nonce, seed, episodes):
-    """Return what is verified of the policy of a seed."""
+    """Return the verified data of the policy of a seed."""
     known = known_returns(found.env)
     bits = hashlib.sha256((found.digest + nonce).encode()).digest()
     scores = [told(found)["score"] + 0.01 * (bits[(i + seed) % 32] / 255 - 0.5) for i in range(episodes)]
@@ -116,7 +116,7 @@ class Likeness(alike.Likeness):
 
 
 def install(put=setattr):
-    """Take the place of the real ones; `put` is monkeypatch's setattr in a test."""
+    """Replace the real functions; `put` is monkeypatch's setattr in a test."""
     put(protocol, "EPISODES", EPISODES)
     for name in ("read_files", "digest_of", "about", "load"):
         put(submission, name, globals()[name])

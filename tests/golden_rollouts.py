@@ -1,8 +1,8 @@
-"""Roll-outs that are kept, so that whatever is rewritten later can be checked against them.
+"""Recorded roll-outs, to check later rewrites against.
 
-``python tests/golden_rollouts.py`` records them anew, into ``golden/rollouts.npz`` and ``runs.json``. That is
-right only where an environment is meant to change: the file is what the package did when version 0 of its
-environments was settled. Only what a user can call is used here, so a rewrite need not touch this file.
+``python tests/golden_rollouts.py`` records them again, into ``golden/rollouts.npz`` and ``runs.json``. Do
+that only if an environment is meant to change: the file holds the package's results when version 0 of its
+environments was settled. Only the public interface is used here, so a rewrite need not touch this file.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ GOLDEN, RUNS = (Path(__file__).parent / "golden" / name for name in ("rollouts.n
 
 
 class Run(NamedTuple):
-    """How a roll-out is made.
+    """The settings of a roll-out.
 
     Attributes
     ----------
     keywords : dict
-        What ``make`` or ``make_vec`` is given.
+        Arguments of ``make`` or ``make_vec``.
     steps : int
-        How many calls after the first reset; in older runs the episode in progress is finished.
+        Number of calls after the first reset; in older runs the episode in progress is finished.
     start : dict
         Options of the first reset.
     mode : str
@@ -48,21 +48,21 @@ class Run(NamedTuple):
 
     @property
     def mixed(self) -> dict[str, list[float]]:
-        """Keywords that each environment of a batch has its own value of."""
+        """Keywords with a separate value for each environment of a batch."""
         return {name: value for name, value in self.keywords.items() if isinstance(value, list)}
 
 
 def runs() -> dict[str, Run]:
-    """Return the runs that are kept, by name: the id, a slash, and what is special."""
+    """Return the recorded runs by name: the id, a slash, and the special feature."""
     return {name: Run(**run) for name, run in json.loads(RUNS.read_text()).items()}
 
 
 def planned() -> dict[str, Run]:
-    """Return what to record: runs of every task by its examples.
+    """Return the runs to record: some of every task, from its examples.
 
-    They are few and short, so that a file of all tasks stays small, and chaos does not get far. Of the tasks
-    that were recorded first it has longer ones, and batches in every mode of resetting, which is no matter of
-    tasks.
+    They are few and short, so that a file of all tasks stays small, and chaos has no time to grow. For the
+    tasks that were recorded first there are longer ones, and batches in every reset mode, which do not depend
+    on the task.
     """
     out = {}
     for env_id, task in TASKS.items():
@@ -86,7 +86,7 @@ class Roll:
     env_id : str
         The environment.
     run : Run
-        How it is made.
+        The settings of the roll-out.
     """
 
     def __init__(self, env_id: str, run: Run) -> None:
@@ -98,16 +98,16 @@ class Roll:
         self._env = self.envs.unwrapped
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Reset all, or what a mask says, and return what can be seen then."""
+        """Reset all, or those in a mask, and return everything observable."""
         observations, infos = self.envs.reset(seed=seed, options=options)
         zeros = np.zeros(self._n)
         return self._seen(observations, zeros, zeros.astype(bool), zeros.astype(bool), infos)
 
     def step(self, actions: np.ndarray) -> dict[str, Any]:
-        """Take a step with shares of the largest action, shape (n,), and return what can be seen then.
+        """Take a step with shares of the largest action, shape (n,), and return everything observable.
 
-        Where there are choices the share is one's place among them, and of several controls every other has
-        half of it, the other way.
+        For choices, the share selects one by its place in the list; of several controls, every other one gets
+        half the share, with the opposite sign.
         """
         space: Any = self.envs.single_action_space if self._mode else self.envs.action_space
         if isinstance(space, gym.spaces.Discrete):
@@ -140,19 +140,19 @@ class Roll:
 
 
 def play(env_id: str, run: Run, actions: np.ndarray) -> list[dict[str, Any]]:
-    """Roll out: what can be seen after the first reset and after each call that follows.
+    """Roll out: return everything observable after the first reset and after each later call.
 
-    What is over is reset by the next call where the environment does not do it itself; that call's row of
-    actions is left unused.
+    Finished episodes are reset by the next call, unless the environment does it itself; that call's row of
+    actions is unused.
 
     Parameters
     ----------
     env_id : str
         The environment.
     run : Run
-        How it is made.
+        The settings of the roll-out.
     actions : ndarray of int8, shape (calls, n)
-        Actions, in hundredths, beyond ±1 at times; the first row is that of the reset, and left unused.
+        Actions, in hundredths, sometimes beyond ±1; the first row belongs to the reset and is unused.
     """
     roll = Roll(env_id, run)
     seen = [roll.reset(seed=1, options=run.start or None)]
@@ -166,9 +166,9 @@ def play(env_id: str, run: Run, actions: np.ndarray) -> list[dict[str, Any]]:
 
 
 def stack(seen: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Return what was seen as arrays, the calls along the first axis."""
+    """Return the observations as arrays, with the calls along the first axis."""
     arrays = {name: np.array([s[name] for s in seen]) for name in seen[0]}
-    # Most calls end nothing: where none is told, the last observation is the one seen.
+    # Most calls end no episode: if no final observation is given, it is the one returned.
     if any("last observation" in s for s in seen):
         over = arrays["over"] > 0
         last = np.array([s.get("last observation", s["observation"]) for s in seen])
@@ -181,7 +181,7 @@ def record(chosen: dict[str, Run]) -> dict[str, np.ndarray]:
     out = {"version": np.array(lag_envs.__version__)}
     for number, (name, run) in enumerate(chosen.items()):
         rng = np.random.default_rng(number)
-        # Held for some steps, so that they move something.
+        # Held for some steps, so that they have an effect.
         given = rng.integers(-120, 121, (run.steps + 1, run.lanes)).repeat(rng.choice([1, 4]), axis=0)
         given = given[: run.steps + 1].astype(np.int8)
         arrays = {"actions": given, **stack(play(name.partition("/")[0], run, given))}
@@ -190,7 +190,7 @@ def record(chosen: dict[str, Run]) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    # With ids, those beside the others that are kept.
+    # With ids, these are added to the recorded ones.
     chosen = {
         name: run for name, run in planned().items() if name.partition("/")[0] in (sys.argv[1:] or TASKS)
     }

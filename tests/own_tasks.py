@@ -1,4 +1,4 @@
-"""Tasks as a user writes them, each with something that the package's own do not have."""
+"""Tasks as a user writes them, each with a feature that the package's own tasks lack."""
 
 import math
 
@@ -47,7 +47,7 @@ class Deliver(Task):
     draws = 2
 
     def guard(self, wanted, before, dt, xp):
-        # The winch holds the rope where it is about to run out.
+        # The winch holds the rope when it is about to run out.
         return {"pull": xp.where(before.rope < 0.3, 0.0, wanted.pull)}
 
     def observe(self, after, target, xp):
@@ -102,7 +102,7 @@ class Switched(Task):
 
 
 class Drift(Task):
-    """Nothing acts: an environment that one only looks at."""
+    """Nothing acts: an environment only for looking at."""
 
     id = "OwnDrift-v0"
     interval, steps = 0.1, 20

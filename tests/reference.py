@@ -1,6 +1,6 @@
-"""Random problems on the three scenes that have flows of their own, and what is asked of a step there.
+"""Random problems on the three scenes with dedicated flows, and the accuracy required of a step there.
 
-The exact ends are those of the report: the oracle's, of which ``test_oracle.py`` knows why they are right.
+The exact ends are those of the report, from the oracle; ``test_oracle.py`` shows why they are right.
 """
 
 from fractions import Fraction
@@ -55,10 +55,10 @@ def _moving(scene, state, control):
 
 
 def scales(scene_name, params, state, control, dt):
-    """Return the size of each state entry that "accurate to 1e-12" is relative to.
+    """Return the size to which "accurate to 1e-12" is relative, for each state entry.
 
-    Angles max(1, abs(theta), abs(theta') dt), their rates max(1, abs(theta'), sqrt(alpha^2 +
-    beta^2)^(1/2)), lengths and all else alike with the step's own displacement.
+    Angles max(1, abs(theta), abs(theta') dt), their rates max(1, abs(theta'), sqrt(alpha^2 + beta^2)^(1/2)),
+    lengths and all others likewise with the step's own displacement.
 
     Returns
     -------
@@ -84,20 +84,19 @@ def _sizes(scene_name, params, state, control, dt):
 
 
 def conditioning(scene_name, params, state, control, dt, include_params=False):
-    """Return how strongly one rounding of the initial state shows in the final state.
+    """Return by how much one rounding of the initial state is amplified in the final state.
 
     Entry j of the state is moved up and down by 2**-53 times max(abs(entry), floor), where the
     floor is 1 rad for angles (cos and sin are stored to absolute precision),
-    sqrt(hypot(alpha, beta)) for their rates, and 0 for the rest. The moves are of finite size: next
-    to the unstable equilibrium they count whole turns, where a derivative would say too much or too
-    little.
+    sqrt(hypot(alpha, beta)) for their rates, and 0 for the rest. The moves are of finite size: next to the
+    unstable equilibrium they count whole turns, where a derivative would give too much or too little.
 
     Parameters
     ----------
     scene_name, params, state, control, dt
         As for `flow`.
     include_params : bool
-        Count also one rounding of every parameter and of the control.
+        Also count one rounding of every parameter and of the control.
 
     Returns
     -------
@@ -187,9 +186,9 @@ def random_cases(kind, n, seed, variants=VARIANTS):
         'stiff': gamma dt log-uniform in [1e-2, 1e6], with drive;
         'extreme': dt log-uniform in [1e-6, 1], half the cases undamped, one thing extreme: no or
         100-fold gravity, point mass, hoop, r near 0 or R, L = 1e-8, drive 1e6, theta' = 1e4,
-        theta = pi, energy of the separatrix times 1 +- 1e-15, and their like for the incline.
+        theta = pi, energy of the separatrix times 1 +- 1e-15, and similar ones for the incline.
         There dt is halved until the body turns, in theta and in phase, by less than 200 rad, or
-        1e5 rad where the solution is an elliptic function.
+        1e5 rad if the solution is an elliptic function.
     n : int
     seed : int
     variants : sequence of (scene name, control kind)
@@ -197,8 +196,8 @@ def random_cases(kind, n, seed, variants=VARIANTS):
     Returns
     -------
     list of dict
-        Keys scene, params (the constructor's keywords, ``'control'`` among them where the scene
-        has a choice, ``'track': inf`` for the bar), control_kind, state, control, dt, label.
+        Keys scene, params (the constructor's keywords, including ``'control'`` if the scene
+        has a choice, and ``'track': inf`` for the bar), control_kind, state, control, dt, label.
     """
     draw = _Draw(np.random.default_rng(seed))
     make = {"task": _task_case, "damped": _body_case, "stiff": _body_case, "extreme": _extreme_case}
@@ -376,7 +375,7 @@ def _extreme_case(label, scene, kind, draw):
 
 
 def _turning(case):
-    """Return about how far the case turns, in units of what is worth computing."""
+    """Return roughly how far the case turns, in units of the largest turn worth computing."""
     scene, state, dt = scene_of(case["scene"], case["params"]), case["state"], case["dt"]
     _, v, c = _moving(scene, state, case["control"])
     push = abs(c.delta) + abs(c.ramp) * dt

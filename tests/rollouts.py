@@ -1,4 +1,4 @@
-"""What the tests of the environments share: ids, actions, and what an episode looks like bit for bit."""
+"""Shared parts of the environments' tests: ids, actions, and an episode's contents bit for bit."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def _plain(task):
     )
 
 
-#: Those with one action in [-1, 1] and one target at most: tests by hand know what an action means there.
+#: Those with one action in [-1, 1] and at most one target: hand-written tests know the meaning of an action.
 SINGLE = [i for i, t in TASKS.items() if _plain(t())]
 RENDERS = find_spec("pygame") is not None and find_spec("lag_envs.envs.rendering") is not None
 
 
 class AnyBar(SwingUpFree):
-    """A bar of whatever parameters its scene accepts, so that steps can be refused."""
+    """A bar with any parameters that its scene accepts, so that steps can be refused."""
 
     def check_usable(self):
         pass
@@ -42,9 +42,9 @@ def make(env_id, **options):
 
 
 def actions(steps, *shape, seed=0):
-    """Return actions of three tempers: noise, stubborn full swings, and some beyond the limits.
+    """Return actions of three kinds: noise, long full swings, and some beyond the limits.
 
-    With a space in place of a shape they are as large as its own, or of its choices.
+    Given a space instead of a shape, they match its range or its choices.
     """
     space = shape[0] if shape and isinstance(shape[0], gym.Space) else None
     if space is not None:
@@ -63,7 +63,7 @@ def actions(steps, *shape, seed=0):
 
 
 def nothing(env):
-    """Return the action 0, of the type that an environment's space has."""
+    """Return the action 0, with the type of an environment's action space."""
     return np.zeros(env.action_space.shape, env.action_space.dtype)
 
 
@@ -83,7 +83,7 @@ def one_by_one(env_id, agent, seeds, **options):
 
 
 def trace(env, given):
-    """Return what the steps return, as bytes where arrays; after an episode comes the next."""
+    """Return the results of steps, arrays as bytes; each episode is followed by the next."""
     out = []
     for action in given:
         observation, reward, terminated, truncated, _ = env.step(action)

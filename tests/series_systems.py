@@ -1,7 +1,7 @@
-"""Eight systems for the tests of the series: energies as a scene states them, and equations typed in by hand.
+"""Eight systems for the tests of the series: energies as a scene states them, and hand-written equations.
 
 The equations give mass matrix and right-hand side in plain arithmetic and a few functions, so they run on
-floats, on mpmath's numbers and on series of python-flint. Nothing of the package is used for them.
+floats, on mpmath's numbers and on series of python-flint. They use nothing of the package.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from lag_envs.scenes.base import Scene, parameter
 
 
 class System(NamedTuple):
-    """A scene, and what to hold it against.
+    """A scene, and its equations to compare with.
 
     ``motion(q, v, u, s, a, xp)`` returns mass matrix and right-hand side; s and a are the place and the
     acceleration of the prescribed coordinate. ``places`` and ``speeds`` are half widths of the harsh states
-    that are drawn around ``centre``, ``push`` those of the controls.
+    drawn around ``centre``, ``push`` those of the controls.
     """
 
     scene: Scene

@@ -1,7 +1,7 @@
-"""The recipe of CONTRIBUTING.md: a task is one file. Here that file goes through all that there is.
+"""The recipe of CONTRIBUTING.md: a task is one file. Here such a file is taken through the whole project.
 
-It has two controls and a vector target. It is not in the package, but in a folder, where it is found as it
-would be there. A scene with its task is one file as well: `toy_pendulum.py`.
+It has two controls and a vector target. It is not in the package but in a folder, where it is found as it
+would be there. A scene with its task is also one file: `toy_pendulum.py`.
 """
 
 import re
@@ -53,7 +53,7 @@ def file(tmp_path_factory):
 
 @pytest.fixture
 def task(file, tmp_path, monkeypatch):
-    """Find the file's task, as those of the package are, and return its class."""
+    """Find the file's task like those of the package, and return its class."""
     places = find(file.parent, "")
     assert places == {ID: "two_link_arm:Reach"}
     monkeypatch.syspath_prepend(str(file.parent))
@@ -67,7 +67,7 @@ def task(file, tmp_path, monkeypatch):
 
 @pytest.fixture
 def scaled(task, tmp_path, monkeypatch):
-    """Measure the scale of its scores into a file, and have it read."""
+    """Measure its score scale into a file, and have the file read."""
     monkeypatch.setattr(scale, "BATCH", 200)
     path = tmp_path / "measured.json"
     assert scale.main([ID, "--batches", "1", "--output", str(path)]) == 0
@@ -178,7 +178,7 @@ def test_training_results_board_and_pages(scaled, task, file, tmp_path, monkeypa
     audit(board, tell=findings.append)
     assert [finding.wrong for finding in findings if finding.wrong] == []
 
-    # Its page, and what README and docs say.
+    # Its page, and its entries in README and docs.
     build(data | {"environments": [shown]}, tmp_path / "site")
     assert "springs" in (tmp_path / "site" / f"{ID}.html").read_text(encoding="utf-8")
     assert f"| {ID} | Success: both joints" in docs.goals()

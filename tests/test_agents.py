@@ -118,7 +118,7 @@ def test_adapter_refuses_another_autoreset_mode():
 
 
 def test_staggered_starts():
-    """The environments then end their first episodes one after the other."""
+    """The environments then end their first episodes at different times."""
     envs = make_vec_env(ENV, 4, stagger=20, duration=0.4)
     envs.seed(1)
     first = envs.reset()
@@ -231,7 +231,7 @@ def test_scale_measures_what_is_in_use(monkeypatch, capsys, tmp_path):
     found = found["measured"]
     assert list(found) == ["random", "zero", "switching line", "reference", "optimum"]
     assert {row["episodes"] for row in found.values()} == {1000}
-    # The same starts: so little is lost by acting at intervals.
+    # The same starts: this shows how little is lost by acting at intervals.
     assert 0.0 < found["optimum"]["mean"] - found["switching line"]["mean"] < 4e-4
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("  ")[0] for line in lines] == [incline.Brake.id] * 5
@@ -258,7 +258,7 @@ def test_scale_plans_in_few_episodes(monkeypatch, capsys, tmp_path):
 
 
 def test_scale_takes_learners_into_account(monkeypatch, capsys, tmp_path):
-    """The best seed of each plays; where it is the best known and not there any more, its numbers stay."""
+    """The best seed of each plays; the best known one keeps its numbers if it no longer exists."""
     env_id, runs, before = incline.Brake.id, tmp_path / "runs", measured(incline.Brake.id)
     for seed, (push, mean) in enumerate([(-1.0, -12.0), (1.0, -2.0), (0.5, -3.0)]):
         folder = runs / env_id / "fast_ppo" / f"seed{seed}"

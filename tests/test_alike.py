@@ -1,4 +1,4 @@
-"""Policies that act alike, whatever is done to their numbers, and those that don't."""
+"""Policies that act alike, however they are disguised, and those that do not."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 BOARD = Board(ROOT / "leaderboard")
 
 
-# --- what a copy may be made to look like -------------------------------------------------------------------
+# --- disguises of a copy ------------------------------------------------------------------------------------
 
 
 def layers(arrays):
@@ -38,7 +38,7 @@ def layers(arrays):
 
 
 def noisy(arrays, rng, size, relative=False):
-    """Change every number of a network, but not what it knows of its observations."""
+    """Change every number of a network except its observation statistics."""
     return {
         name: array if name.startswith("obs_") else array + size * rng.normal(size=array.shape)
         * (np.abs(array) if relative else 1.0)
@@ -47,7 +47,7 @@ def noisy(arrays, rng, size, relative=False):
 
 
 def permuted(arrays, rng):
-    """Number the hidden units in another way."""
+    """Permute the hidden units."""
     found = dict(arrays)
     for k in [*layers(arrays)][:-1]:
         order = rng.permutation(len(found[f"bias_{k}"]))
@@ -57,7 +57,7 @@ def permuted(arrays, rng):
 
 
 def rescaled(arrays, rng):
-    """Let hidden units with ReLU put out more or less, and the next layer take it back."""
+    """Scale the outputs of hidden units with ReLU, and undo it in the next layer."""
     found = dict(arrays)
     for k in [*layers(arrays)][:-1]:
         factor = np.exp(rng.normal(size=len(found[f"bias_{k}"])))
@@ -81,7 +81,7 @@ def mirrored(arrays, rng):
 
 
 def an_ulp(arrays, rng):
-    """Change one number by as little as can be."""
+    """Change one number by as little as possible."""
     found = {name: array.astype(np.float32) for name, array in arrays.items()}
     found["weight_0"][0, 0] = np.nextafter(found["weight_0"][0, 0], np.float32(np.inf))
     return found
@@ -117,7 +117,7 @@ def table_of(submission):
 
 
 def changed(submission, change, folder, seed=0):
-    """Write a submission of which every policy was changed."""
+    """Write a submission in which every policy was changed."""
     rng = np.random.default_rng(seed)
     arrays = {s: change(policy.arrays, rng) for s, policy in submission.policies}
     given = ABOUT | {"env": submission.env, "policy": table_of(submission), "training": TRAINING}
@@ -149,7 +149,7 @@ QUICK = (
     "id", [pytest.param(i, marks=[] if i.startswith(QUICK) else pytest.mark.slow) for i in ours()]
 )
 def test_a_changed_copy_of_a_learner_is_found(id, tmp_path):
-    """The ones that react most to noise are among the quick ones."""
+    """Those that are most sensitive to noise are among the quick ones."""
     first = load(BOARD.submission(id))
     likeness, error = Likeness(first.env, "a nonce"), error_of(id)
     for name, change in changes_of(first).items():
@@ -157,7 +157,7 @@ def test_a_changed_copy_of_a_learner_is_found(id, tmp_path):
         assert copy.digest != first.digest
         found = likeness(copy, first, error)
         assert found.closeness < 0.75, (name, found)
-    # One that was changed so that it shows is another.
+    # A visibly changed one counts as different.
     far = likeness(changed(first, lambda a, rng: noisy(a, rng, 0.2), tmp_path / "far"), first, error)
     assert far.closeness > 1.0
 
@@ -166,7 +166,7 @@ def test_a_changed_copy_of_a_learner_is_found(id, tmp_path):
 @pytest.mark.parametrize("env", sorted({entry.env for entry in BOARD.read().all}))
 @pytest.mark.parametrize("nonce", ["one", "another"])
 def test_ours_are_all_different(env, nonce):
-    """And not by a hair."""
+    """And not just barely."""
     state = BOARD.read()
     neighbours = Neighbours(BOARD)
     for a in state.boards[1].values():
@@ -178,7 +178,7 @@ def test_ours_are_all_different(env, nonce):
 
 
 def test_trainings_are_different_though_all_else_is_the_same():
-    """The closest policies of our own are two of these."""
+    """The closest two policies of our own are among these."""
     submission = load(BOARD.submission(next(i for i in ours() if i.startswith(QUICK[0]))))
     check_twins(submission, "a nonce")
     tracks = Likeness(submission.env, "a nonce").tracks(submission)
@@ -206,7 +206,7 @@ def test_at_least_half_of_the_policies(tmp_path):
 
 
 def test_other_architectures_may_act_alike(tmp_path):
-    """What counts is what is done."""
+    """Only the actions count."""
     plain = linear(tmp_path / "linear", arrays={0: LINEAR | {"gain": np.array([-0.5, -0.2, -0.3, 0.4])}})
     arrays = {"weight_0": np.array([[-0.5, -0.2, -0.3, 0.4]]), "bias_0": np.zeros(1)}
     nets = {s: arrays | {"bias_0": np.full(1, 3e-3 * s)} for s in range(5)}
@@ -236,7 +236,7 @@ def test_agents_with_a_memory(tmp_path):
 
 
 def test_returns_count_too(tmp_path):
-    """Where actions differ, and it makes no difference."""
+    """Actions differ, but it makes no difference."""
     first = linear(tmp_path / "first")
     other = linear(tmp_path / "other", arrays={0: LINEAR | {"offset": np.full(1, 0.02)}})
     likeness = Likeness(first.env, "n")

@@ -1,4 +1,4 @@
-"""Forgeries by who keeps the board, with an editor: each is found, and named with its line and a remedy."""
+"""Forgeries by the board's keeper, with an editor: each is found, and named with its line and a remedy."""
 
 import gzip
 import hashlib
@@ -41,7 +41,7 @@ def commit(board, message="change"):
 
 
 def fill(board, tell=lambda: None):
-    """Let three rounds go over a board: a superseded, a withdrawn, a cloned submission and others."""
+    """Run a board through three rounds: a superseded, a withdrawn, a cloned submission and others."""
     source = board.folder.parent / "sources"
 
     def add(name, **told):
@@ -68,7 +68,7 @@ def fill(board, tell=lambda: None):
 @pytest.fixture
 def fakes(monkeypatch):
     fake_submissions.install(monkeypatch.setattr)
-    # What a release of this package knows is of another board.
+    # This package's release knows another board.
     monkeypatch.setattr(audit, "PIN", Path("nowhere") / "pin.json")
     monkeypatch.setattr(audit, "REFERENCE_EPISODES", 64)
 
@@ -92,7 +92,7 @@ def board(filled, tmp_path, fakes):
 
 
 def wrong(board, **options):
-    """Return what an audit finds, by the name of the check."""
+    """Return an audit's findings, by the name of the check."""
     found = []
     fine = audit.audit(board, tell=found.append, **options)
     texts = {finding.name: finding.wrong for finding in found if finding.wrong}
@@ -101,7 +101,7 @@ def wrong(board, **options):
 
 
 def refused(board):
-    """Return why a board is not shown; empty where it is."""
+    """Return why a board is not shown; empty if it is."""
     try:
         board_data(board)
     except BoardError as error:
@@ -117,7 +117,7 @@ def lines(board):
 
 
 def relog(board, told, chain=True):
-    """Write events as the log; with a chain made anew, as a careful forger does."""
+    """Write events as the log, with a new chain, as a careful forger would."""
     content = b""
     for event in told:
         if chain:
@@ -136,7 +136,7 @@ def entry_of(board, name="PPO"):
 
 
 def edit(board, change, note=True, name="PPO"):
-    """Change a result, and note its hash in the log."""
+    """Change a result, and log its new hash."""
     entry = entry_of(board, name)
     path = board.result_file(entry)
     result = json.loads(gzip.decompress(path.read_bytes()))
@@ -156,11 +156,11 @@ def better(result):
 
 
 def consistent(result):
-    """Let the recorded episodes tell the same as the returns."""
+    """Make the recorded episodes consistent with the returns."""
     better(result)
     for replay in result["replays"]:
         replay["return"] = 23.5 * 419.0
-        # Of equal returns the order is that of the episodes.
+        # Episodes with equal returns keep their order.
         number = {"median": 9, "best": 19, "worst": 0}[replay["label"]]
         first = audit.protocol.first_seed(result["digest"], result["nonce"], 2)
         replay["reset_seed"], replay["seed"] = first + number, 2
@@ -191,14 +191,14 @@ def test_a_result_and_its_hash_are_edited(board):
     assert re.search(r"line \d+ is not what it was in commit \w+", refused(board))
     assert "line 11 is not what followed" in wrong(board)["log"][0]
     told = lines(board)
-    relog(board, told)  # and the chain is made anew
+    relog(board, told)  # and the chain is made again
     assert "line 10 is not what it was in commit" in refused(board)
     shutil.rmtree(board.folder.parent / ".git")  # and the history is gone
     assert "has recorded other episodes than" in refused(board)
 
 
 def test_a_result_is_edited_so_that_it_agrees_with_itself(board):
-    """Then only playing it again tells."""
+    """Then only playing it again reveals it."""
     relog(board, edit(board, consistent))
     shutil.rmtree(board.folder.parent / ".git")
     assert refused(board) == ""
@@ -279,7 +279,7 @@ def test_the_log_is_edited(board, how, chain):
     told = lines(board)
     LOG[how](told)
     relog(board, told, chain)
-    if not chain:  # as an editor leaves it: other lines keep their bytes
+    if not chain:  # as after an edit: other lines keep their bytes
         kept = {json.dumps(json.loads(line)): line for line in before.splitlines()}
         board.log.write_bytes(b"".join(kept.get(json.dumps(e), json.dumps(e).encode()) + b"\n" for e in told))
     reason = refused(board)
@@ -311,7 +311,7 @@ def test_a_submission_is_changed_after_verification(board, how):
 
 
 def test_name_and_files_and_digest_are_edited(board):
-    """All that is cheap agrees again, but the episodes are others."""
+    """All cheap checks pass again, but the episodes are different ones."""
     entry = entry_of(board)
     folder, told = board.submission(entry.id), lines(board)
     toml = folder / "submission.toml"
@@ -349,7 +349,7 @@ def test_name_and_files_and_digest_are_edited(board):
 
 @needs_git
 def test_a_nonce_that_was_known_before(board):
-    """A commit that is there, and then something is added and verified with its hash."""
+    """Something is added and verified with the hash of a commit that was already there."""
     value = commit(board)
     board.add(fake_submissions.load(write(board.folder.parent / "late", "late")))
     board.publish(value, "commit")
@@ -406,14 +406,14 @@ def test_the_commit_that_is_the_nonce_must_hold_the_board(board):
 def test_a_tag_is_held_against_too(board):
     folder = board.folder.parent
     git(folder, "tag", "v1")
-    git(folder, "checkout", "--quiet", "--orphan", "clean")  # a history made anew
+    git(folder, "checkout", "--quiet", "--orphan", "clean")  # a rewritten history
     told = lines(board)
     at(told, "protocol")["scales"][ENV].update(best=100.0)
     relog(board, told)
     commit(board)
     assert "line 7 is not what it was in commit" in refused(board)
     git(folder, "tag", "--delete", "v1")
-    assert refused(board) == ""  # a history that was made anew as a whole
+    assert refused(board) == ""  # a history that was rewritten as a whole
 
 
 @needs_git
@@ -426,7 +426,7 @@ def test_an_older_checkout_is_no_forgery(board):
 
 @needs_git
 def test_boards_that_were_begun_again_before_there_was_a_chain(board):
-    """As the repository's own: that does not help who begins again later."""
+    """As in the repository itself: that does not help anybody who begins again later."""
     folder = board.folder.parent
     shutil.rmtree(folder / ".git")
     git(folder, "init", "--quiet")
@@ -465,7 +465,7 @@ def test_the_pin_of_a_release(board, tmp_path, monkeypatch):
         change(told)
         relog(board, told)
         assert reason in refused(board) and "pin" in wrong(board)
-    # Of another board it says nothing, unless it is asked for.
+    # It says nothing of another board, unless asked to.
     other = Board(tmp_path / "other")
     other.add(fake_submissions.load(write(tmp_path / "another", "another")))
     assert refused(other) == "" and "pin" in wrong(other, pin=pin)
@@ -528,9 +528,9 @@ def test_commands(board, tmp_path, capsys):
 # --- the repository's own board -----------------------------------------------------------------------------
 
 
-@pytest.mark.slow  # `make audit` tells it too, and `make check` runs both
+@pytest.mark.slow  # `make audit` covers it too, and `make check` runs both
 def test_the_repositorys_board_is_sound():
-    """What `make audit` does besides takes longer."""
+    """The other checks of `make audit` take longer."""
     found = audit.cheap(Board(ROOT / "leaderboard"))
     assert [text for finding in found.findings for text in finding.wrong] == []
     assert found.state.number in found.state.protocols

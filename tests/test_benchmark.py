@@ -1,4 +1,4 @@
-"""The command `lag-envs` and the benchmark: what they print, write and survive. No speed is judged here."""
+"""The command `lag-envs` and the benchmark: their output, files and robustness. No speed is judged here."""
 
 import dataclasses
 import json
@@ -143,7 +143,7 @@ def test_a_reader_that_leaves_is_no_error(tmp_path):
 
 
 def tiny(tmp_path, **changes):
-    """Return settings for a measurement of no length."""
+    """Return settings for a measurement of minimal length."""
     some = {"ids": (ID,), "sizes": (1, 3), "rounds": 2, "seconds": 1e-4, "cold_starts": 0}
     return Settings(**(some | {"date": "2020-02-20", "output": str(tmp_path / "speed.json")} | changes))
 
@@ -235,7 +235,7 @@ def test_breaking_off_keeps_and_writes_what_was_measured(tmp_path, capsys, monke
 def test_a_missing_core_environment_is_a_row_too(tmp_path, monkeypatch):
     monkeypatch.setattr(contestants, "PEERS", peers(broken))
     report = bench(tiny(tmp_path, sizes=(1,), output=None))
-    assert "ratio" not in row(report, ID)  # nothing of its kind to compare with
+    assert "ratio" not in row(report, ID)  # nothing comparable
     assert "ratio" in row(report, ID, "made")
 
 
@@ -285,7 +285,7 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
     assert row["id"] == ID and row["ratio"] == pytest.approx(row["back_ns"] / row["step_ns"], rel=0.02)
     printed = capsys.readouterr().out
     assert "Jacobian of a step" in printed and "Whole step backwards" in printed
-    # The loop that it is compared with takes the very steps of the scene.
+    # The reference loop takes exactly the steps of the scene.
     scene, states = CartPole(), np.array([[0.1, 0.2, 0.3, 0.4], [0.5, -0.2, 3.0, 1.0]])
     ends = [scene.simulate(x, [u], 0.02)[1].sum() for x, u in zip(states, (1.0, -2.0), strict=True)]
     steps = jacobians.compile_steps(scene, 0.02)(states, np.array([[1.0], [-2.0]]))
@@ -296,7 +296,7 @@ def test_jacobians_beside_steps(tmp_path, monkeypatch, capsys):
 def test_how_often_steps_are_divided(tmp_path, capsys):
     ids = (ID, chain.SwingUp.id, pivoted_bar.SwingUpUnknown.id)
     report = bench(tiny(tmp_path, speed=False, cold_starts=0, rounds=1, divisions=True, ids=ids))
-    one, two = report["divisions"]  # nothing of the imperfect one
+    one, two = report["divisions"]  # without the imperfect one
     assert (one["id"], one["mean"], one["most"], one["divided"]) == (ID, 1.0, 1, 0.0)
     assert two["most"] > 5 and 1.5 < two["mean"] < two["most"] and 0.5 < two["divided"] < 1.0
     assert two["fastest"] > 20.0
@@ -383,7 +383,7 @@ def test_targets(ratio, met):
 
 
 def test_who_has_a_target():
-    """Whoever is stepped by a flow of its own; the general series, where the target names it."""
+    """It applies to dedicated flows; for the general series only to the ids that the target names."""
 
     def meant(target, **changes):
         about = {"library": "lag_envs", "id": ID, "kind": target.kind, "num_envs": target.num_envs}
@@ -399,7 +399,7 @@ def test_who_has_a_target():
 
 
 def report_of(ratios):
-    """Return a report in which, at the targets' sizes, an environment is so many times as fast."""
+    """Return a report in which, at the targets' sizes, an environment is this many times as fast."""
     rows = []
     for target, ratio in zip(TARGETS, ratios, strict=True):
         rows += [made("gymnasium", "CartPole-v1", target.kind, target.num_envs, [1e7])]

@@ -1,4 +1,4 @@
-"""The board: states, locks, kills, merges, and what the page is told."""
+"""The board: states, locks, kills, merges, and the page's data."""
 
 import hashlib
 import json
@@ -42,7 +42,7 @@ def board(tmp_path):
 
 
 def add(board, name="PPO", nonce=None, **told):
-    """Add a submission, with a nonce verify it too, and return its id."""
+    """Add a submission, with a nonce also verify it, and return its id."""
     folder = board.folder.parent / f"{len(list(board.folder.parent.iterdir()))}"
     id = board.add(fake_submissions.load(write(folder, name, **told))).id
     if nonce:
@@ -128,7 +128,7 @@ def test_rejected_with_a_reason_and_may_be_added_again(board):
     board.add(fake_submissions.load(board.submission(id)))
     assert states(board) == {id: "pending"}
     board.publish("better-luck")
-    finish(board)  # with the nonce of the first time, and it ends as it did then
+    finish(board)  # with the nonce of the first time, and the same outcome as then
     assert board.read().entry(id) == entry
 
 
@@ -268,7 +268,7 @@ def test_the_first_is_who_was_added_first_whoever_is_verified_first(board, monke
 def test_better_luck_is_not_had_by_submitting_the_same_again(board):
     first = add(board, nonce="1", acts="x")
     again = add(board, nonce="2", acts="x", score=0.51)
-    assert states(board) == {first: "verified", again: "verified"}  # it does not take its place
+    assert states(board) == {first: "verified", again: "verified"}  # it does not replace the first
     board.withdraw(first, "bad luck")
     third = add(board, nonce="3", acts="x", score=0.52)
     assert states(board) == {first: "withdrawn", again: "verified", third: "verified"}
@@ -310,7 +310,7 @@ def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):
     before, kept = board_data(board, "today"), result.read_bytes()
     assert board.open() == 2
     assert states(board) == {old: "pending", waiting: "pending"}
-    finish(board)  # the nonces that there are were known before
+    finish(board)  # the existing nonces were known before
     assert states(board) == {old: "pending", waiting: "pending"}
     board.publish("2")
     finish(board)
@@ -321,7 +321,7 @@ def test_a_new_protocol_verifies_anew_what_is_there_and_freezes_the_old(board):
     frozen = before["environments"][0]
     assert found[ENV, 1] == frozen | {"frozen": True, "other": found[ENV, 1]["other"]}
     assert {row["id"] for row in found[ENV, 2]["rows"]} == {old, waiting} and not found[ENV, 2]["frozen"]
-    board.add(fake_submissions.load(board.submission(gone)))  # and may come back, with luck of its own
+    board.add(fake_submissions.load(board.submission(gone)))  # and may come back, with new episodes
     assert states(board)[gone] == "pending"
     new = add(board, score=0.9)  # same name and authors
     board.publish("3")
@@ -392,7 +392,7 @@ def test_other_rules_need_another_protocol(board, monkeypatch):
     monkeypatch.setattr(protocol, "LEARNED_POLICIES", 7)
     with pytest.raises(BoardError, match="add to a board of protocol 1: learned_policies differ"):
         add(board, "TQC")
-    assert len(board_data(board)["environments"][0]["rows"]) == 1  # what is there can be shown
+    assert len(board_data(board)["environments"][0]["rows"]) == 1  # existing results can be shown
     board.open()
     with pytest.raises(BoardError, match="published"):
         board.publish("1")
@@ -400,7 +400,7 @@ def test_other_rules_need_another_protocol(board, monkeypatch):
 
 
 def test_a_log_from_before_there_were_protocols_in_it(board):
-    """It says late what protocol 1 was; nothing is verified anew for that."""
+    """The log states protocol 1 late; this causes no new verification."""
     id = add(board, nonce="1")
     lines = [json.loads(line) for line in board.log.read_text().splitlines()][1:]
     old = "".join(json.dumps({k: v for k, v in line.items() if k != "prev"}) + "\n" for line in lines)
@@ -532,7 +532,7 @@ def ids(board):
 
 
 def chained(*events):
-    """Return a log of events, each with the hash of what is before it."""
+    """Return a log of events, each with the hash of the log before it."""
     log = b""
     for event in events:
         event = event | {"prev": hashlib.sha256(log).hexdigest()}
@@ -541,7 +541,7 @@ def chained(*events):
 
 
 def rewritten(board, change):
-    """Let a function change the events of a board, and make the chain anew."""
+    """Let a function change a board's events, and chain them again."""
     told = [json.loads(line) for line in board.log.read_bytes().splitlines()]
     change(told)
     board.log.write_bytes(chained(*({k: v for k, v in event.items() if k != "prev"} for event in told)))
@@ -585,7 +585,7 @@ def test_times_grow_even_if_the_clock_is_set_back(board):
 
 
 def test_two_clones_that_both_added(board, tmp_path):
-    """Git's merge is a conflict; whoever comes second takes the other's log and adds again."""
+    """Git's merge is a conflict; the second to push takes the other's log and adds again."""
     add(board, nonce="1")
     mine, theirs = tmp_path / "mine", tmp_path / "theirs"
     for clone, name in ((mine, "TQC"), (theirs, "SAC")):
@@ -616,7 +616,7 @@ def test_a_full_disk_leaves_the_log_as_it_was(board, monkeypatch):
 
 
 def test_a_log_that_is_replaced_while_one_waits(board):
-    """As version control does: who waits for the lock writes to the new file."""
+    """As version control may do: a process that waits for the lock writes to the new file."""
     add(board)
     waiting = threading.Thread(target=board.publish, args=("n",))
     with board.change():
@@ -656,7 +656,7 @@ def test_processes(task, tmp_path):
 
 
 def outcome(folder):
-    """Work of a kind that processes are given."""
+    """A job that processes are given."""
     if folder.name == "dies":
         os._exit(3)
     if folder.name == "refused":
@@ -671,7 +671,7 @@ def test_map_submissions(tmp_path, jobs):
         folder.mkdir()
         (folder / "submission.toml").write_text(folder.name)
     found = {folder.name: result for folder, result in map_submissions(outcome, folders, jobs)}
-    assert [found[name] for name in "ab"] == ["a", "b"]  # whatever becomes of others
+    assert [found[name] for name in "ab"] == ["a", "b"]  # whatever happens to the others
     assert isinstance(found["refused"], Refused) and str(found["refused"]) == "no"
     if jobs > 1:
         assert type(found["dies"]).__name__ == "ProcessExpired"
@@ -707,7 +707,7 @@ def test_only_plain_small_files_travel(tmp_path):
     assert packed(tmp_path / "none") is None
 
 
-# --- what the page is told ---
+# --- the page's data ---
 
 
 def test_board_data(board):
@@ -810,7 +810,7 @@ def test_only_plain_files_are_opened(board, place, what):
 def test_coarse_value_functions():
     from agents.board_values import coarse
 
-    value = coarse("PivotedBar-v0", None)  # that of the bar without a track
+    value = coarse("PivotedBar-v0", None)  # of the bar without a track
     theta, theta_dot = value["axes"]
     assert (theta["label"], theta_dot["label"], theta["low"]) == ("theta", "theta_dot", 0.0)
     assert len(value["values"]) == theta["n"] and {len(row) for row in value["values"]} == {theta_dot["n"]}

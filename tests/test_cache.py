@@ -1,4 +1,4 @@
-"""The cache of compiled code: whatever becomes of its files, functions go on and are right."""
+"""The cache of compiled code: whatever happens to its files, functions keep working correctly."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def double(x):
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
-    """Give each test a cache of its own, and the one warning of a process."""
+    """Give each test a cache of its own, and let each process warn once."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "compiled"))
     monkeypatch.setattr(cache, "_warned", False)
     return cache.folder()
 
 
 def hits(key="some source", value=1.5):
-    """Call the function through a dispatcher of its own; return how often that found it in the cache."""
+    """Call the function through a new dispatcher; return how often it was found in the cache."""
     function = cache.jit(double, key)
     assert function(value) == 2 * value
     return sum(function.stats.cache_hits.values())
@@ -107,7 +107,7 @@ def test_a_whole_file_of_something_else_is_not_believed(place):
 
 
 def test_a_file_that_numba_cannot_read_is_dropped(place):
-    # As another build of Numba with the same number might leave it.
+    # As another build of Numba with the same version might leave it.
     hits()
     (path,) = files(place)
     key = path.read_bytes()[len(cache._MAGIC) : len(cache._MAGIC) + 32]
@@ -152,7 +152,7 @@ def test_without_a_folder_that_can_be_written_to(kind, tmp_path, monkeypatch, ca
     if kind == "no permission":
         parent.mkdir(mode=0o500)
         if os.access(parent, os.W_OK):
-            parent = Path("/proc/self")  # nor may the administrator write here
+            parent = Path("/proc/self")  # not even the administrator may write here
             if not parent.is_dir():
                 pytest.skip("an administrator may write everywhere here")
     else:
@@ -193,14 +193,14 @@ def test_its_size_is_bounded_and_what_is_used_stays(place, monkeypatch):
     monkeypatch.setattr(cache, "LIMIT", 3 * size + size // 2)
     for name in "12":
         hits(name)
-    for entry in cache.entries(place):  # all a year old; what is used again is young
+    for entry in cache.entries(place):  # all a year old; using one makes it young
         os.utime(entry.path, (0, time.time() - 3e7))
     assert hits("0") == 1
     for name in "34":
         hits(name)
     assert sum(entry.size for entry in cache.entries(place)) <= cache.LIMIT
     assert [hits(name) for name in "0341"] == [1, 1, 1, 0]
-    # What a killed process has left behind counts, and goes like the rest.
+    # Left-overs of a killed process count, and are removed like the rest.
     left = place / f"new-12345{cache._SUFFIX}"
     left.write_bytes(bytes(size))
     os.utime(left, (0, 0))
@@ -209,7 +209,7 @@ def test_its_size_is_bounded_and_what_is_used_stays(place, monkeypatch):
 
 
 def test_processes_that_race(place):
-    # All compile and write the same file, read it again and again, and damage it in between.
+    # All compile and write the same file, read it repeatedly, and damage it in between.
     code = """
 import os, random, sys, warnings
 warnings.simplefilter("ignore")
@@ -267,11 +267,11 @@ def test_environments_step_on_whatever_is_left_of_their_code(place):
     bits, compiled, silence = step()
     assert (compiled, silence) == ("True", "")
     assert len(files(place)) >= 4
-    # A warm start need not make the compiler ready, which would be most of it.
+    # A warm start need not initialise the compiler, which would take most of its time.
     assert step() == (bits, "False", "")
     rng = random.Random(1)
     for path in files(place):
-        if not path.name.startswith("flow"):  # what is read whole is linked with what is compiled anew
+        if not path.name.startswith("flow"):  # entries that are read whole are linked with new code
             flipped(rng.randrange(path.stat().st_size))(path)
     again, compiled, told = step()
     assert (again, compiled) == (bits, "True")

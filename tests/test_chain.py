@@ -19,7 +19,7 @@ from lag_envs.controllers.tracking import Tracking, follow, recorded, search
 from lag_envs.evaluation.rollout import Rollout, play, record
 from lag_envs.tasks import chain, pivoted_bar
 
-# They share their formulas; each has programs of its own, which compile for seconds.
+# They share their formulas; each has its own programs, which compile for seconds.
 SWING_UPS = (chain.SwingUp, slow(chain.SwingUpWeak), slow(chain.SwingUpTriple))
 each_swing_up = pytest.mark.parametrize("kind", SWING_UPS, ids=lambda kind: kind.id)
 SEEDS = range(3_600_000_000, 3_600_000_050)
@@ -42,14 +42,14 @@ def returns_from(kind, state, agent):
 
 @each_swing_up
 def test_spinning_does_not_pay(kind):
-    """A chain that spins stretched out earns 35/128 a step, the mean of h⁴; it must not be worth learning."""
+    """A chain that spins stretched out earns 35/128 a step, the mean of h⁴; learning that must not pay."""
     bars = kind().scene.bars
     total = returns_from(kind, [0.0, 0.0, *[0.0, 30.0] * bars], Constant(0.0))
     assert total < 150.0 < 0.4 * play(kind.id, make_controller(kind.id, "plan + TVLQR"), SEEDS).mean()
 
 
 def test_one_bar_up_and_one_down_does_not_pay():
-    """Feedback holds the upper bar up with the other hanging, for whoever wants a sixteenth of a step."""
+    """Feedback holds the upper bar up with the other hanging, a way to earn a sixteenth of a step."""
     task = chain.SwingUp()
     rest = [0.0, 0.0, math.pi, 0.0, 0.0, 0.0]
     _, gain = time_varying(task, np.array([rest]), np.empty(0), rest, task.plans.weights, task.plans.effort)
@@ -102,7 +102,7 @@ def test_balancing_needs_a_track_and_an_upright_start():
 
 @pytest.mark.slow
 def test_feedback_balances():
-    # The means over many more episodes are 344 and 376, those of doing nothing 14.
+    # The means over many more episodes are 344 and 376; that of doing nothing is 14.
     means = {name: play(chain.Balance.id, make_controller(chain.Balance.id, name), SEEDS).mean()
              for name in ("LQR", "linear feedback", "zero")}  # fmt: skip
     assert means["LQR"] > 250.0 and means["linear feedback"] > 280.0 and means["zero"] < 30.0
@@ -137,14 +137,14 @@ def test_mirror_images():
 
 
 def test_feedback_along_a_plan_ends_as_feedback_at_rest():
-    """Along a plan that stands still, the feedback is the regulator's; and it is stable."""
+    """Along a stationary plan, the feedback is the regulator's; and it is stable."""
     task = chain.SwingUp()
     plans, n = task.plans, 40
     agent = follow(task, np.tile(plans.rest, (n + 1, 1)), np.zeros(n), plans)
     np.testing.assert_allclose(agent.gains, np.tile(agent.hold, (n, 1)), rtol=1e-6)
     a, b = task.scene.jacobian(plans.rest, [0.0], task.dt)
     assert np.abs(np.linalg.eigvals(a - task.largest * b @ agent.hold[None])).max() < 1.0
-    # A prototype's gains, by the same weights on an integrator of its own: for s, s' and for each bar.
+    # A prototype's gains, from the same weights on its own integrator: for s, s' and for each bar.
     gains = dict(zip(task.scene.state_names, task.largest * agent.hold, strict=True))
     assert [gains["theta_1"], gains["theta_2"]] == pytest.approx([182.3, -293.6], rel=0.01)
 
@@ -221,7 +221,7 @@ def test_tasks_without_kicks():
 
 
 def test_mpc_for_any_task():
-    """It balances a bar, planning in every step, without a word on how."""
+    """It balances a bar, planning in every step, without being told how."""
     task = pivoted_bar.Balance(duration=1.0)
     agent = MPC(task, horizon=25, iterations=1, guesses=4, budget=2_000)
     returns = play(pivoted_bar.Balance.id, agent, SEEDS[:4], duration=1.0)

@@ -38,7 +38,7 @@ def window(monkeypatch):
 
 
 def told(capsys, *arguments):
-    """Run the command, which fails; return what it says."""
+    """Run the command, which fails; return its message."""
     assert cli.main(arguments) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error and error.startswith("lag-envs: error: ")
@@ -65,7 +65,7 @@ def test_every_help_has_examples_of_its_own_command():
 
 
 def test_examples_parse():
-    """Each line of an example is one that the command takes."""
+    """Each line of an example is one that the command accepts."""
     whole, count = cli.parser(), 0
     for parser in dict(parsers(whole, "lag-envs")).values():
         for line in (parser.epilog or "").replace("\\\n", "").splitlines():
@@ -283,7 +283,7 @@ def test_a_gamepad_may_come_and_go(window, monkeypatch, capsys):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """A folder to write modules into, which are forgotten then."""
+    """A folder to write modules into, which are forgotten afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     before = set(sys.modules), set(gym.registry)
@@ -329,7 +329,7 @@ def test_new_says_what_is_wrong(elsewhere, capsys):
 
 
 def completed(script, *words):
-    """Return what bash offers for the last of the words."""
+    """Return bash's completions for the last word."""
     line = " ".join(words)
     ask = (
         f"{script}\nCOMP_WORDS=({' '.join(repr(word) for word in words)}); COMP_CWORD={len(words) - 1}; "
@@ -361,7 +361,7 @@ def test_other_shells_and_what_is_missing(capsys, monkeypatch):
 
 
 def test_the_core_alone_lists(tmp_path):
-    """What shows text asks for no extra."""
+    """Commands that only print text need no extra."""
     script = (
         "import sys\nfrom lag_envs import cli\n"
         "assert cli.main(['list']) == cli.main(['info', 'PivotedBar-v0']) == 0\n"

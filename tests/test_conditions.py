@@ -1,4 +1,4 @@
-"""The conditions of an evaluation: which there are, what they change, and whom they suit."""
+"""The conditions of an evaluation: their list, their changes, and the agents they suit."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The contract of a scene: how a class is made, what it declares, and what follows."""
+"""The contract of a scene: how a class is made, its declarations, and their consequences."""
 
 import copy
 import dataclasses
@@ -90,7 +90,7 @@ def test_class_is_a_frozen_dataclass_with_and_without_the_decorator(decorate):
 
 
 def test_other_ways_of_dataclasses():
-    """Slots, positional fields, an __init__ of one's own, an annotation that says it is none."""
+    """Slots, positional fields, a custom __init__, an annotation that makes no field."""
     from typing import ClassVar
 
     @dataclasses.dataclass(frozen=True, kw_only=True, slots=True)
@@ -390,11 +390,11 @@ def test_free_place_may_be_left_out():
     assert A.shape == (3, 3) and B.shape == (3, 0)
 
 
-# --- what follows ------------------------------------------------------------------------------------------
+# --- consequences ------------------------------------------------------------------------------------------
 
 
 def test_parameter_that_is_zero_leaves_no_code_and_another_value_gives_the_same():
-    """In a denominator or a function it is put in at once; elsewhere code leaves out what it multiplies."""
+    """In a denominator or a function it is inserted at once; elsewhere code leaves out its products."""
     damped = RotaryPendulum(damping=0.1)
     assert damped.mechanics.key == RotaryPendulum(damping=0.2, mass=3.0).mechanics.key
     assert RotaryPendulum()._code(0.02) is not damped._code(0.02)
@@ -594,7 +594,7 @@ def test_smooth_friction_is_what_it_says():
 
 
 def test_chains_are_alike_in_any_frame():
-    """Swinging on a support that is accelerated is swinging in a tilted field."""
+    """Swinging on an accelerated support is swinging in a tilted field."""
     chain, generator = Chain(bars=3, gravity=3.0), np.random.default_rng(6)
     lean, field = math.atan2(4.0, 3.0), Chain(bars=3, gravity=5.0)
     for _ in range(10):
@@ -714,7 +714,7 @@ def test_expressions_that_are_no_energy(potential, words):
 def test_copies_are_the_same(scene):
     state = np.linspace(0.1, 0.9, len(scene.state_names))
     control = np.linspace(0.5, 1.0, len(scene.control_names))
-    expected = scene.acceleration(state, control)  # fills what is cached
+    expected = scene.acceleration(state, control)  # fills the caches
     copies = [
         pickle.loads(pickle.dumps(scene)),
         copy.copy(scene),
@@ -727,7 +727,7 @@ def test_copies_are_the_same(scene):
 
 
 def test_class_that_no_module_has_goes_by_value():
-    """As classes of `__main__` and of notebooks do: cloudpickle, in another process; used before or not."""
+    """As with classes of `__main__` and of notebooks: cloudpickle, in another process; used before or not."""
     sent = []
     for decorate, used in itertools.product((False, True), repeat=2):
         cls = cart(decorate)

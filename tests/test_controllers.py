@@ -36,7 +36,7 @@ INCLINE, BRAKE = incline.Tilt.id, incline.Brake.id
 SHELL, PUMP, DAMPING = (getattr(cylinder_in_cylinder, name).id for name in ("Tilt", "Pump", "Damping"))
 
 
-# --- what they reach: mean returns over 1,000 episodes, as the agents' results have them ---
+# --- performance: mean returns over 1,000 episodes, as in the agents' results ---
 
 KEPT = json.loads((Path(__file__).parents[1] / "agents" / "results" / "summary.json").read_text())["envs"]
 ALL = [(env_id, name, found) for env_id in KEPT for name, found in TASKS[env_id].controllers.items()]
@@ -94,12 +94,12 @@ def test_controller_takes_parameters_from_the_task(env_id, name, least, options)
     assert play(env_id, agent, range(SEED, SEED + 32), **options).mean() > least
 
 
-# --- how they are asked ---
+# --- interface ---
 
 
 @pytest.fixture(scope="module")
 def observations():
-    """Return a batch of observations of an environment, none of them alike."""
+    """Return a batch of observations of an environment, all different."""
 
     def make(env_id, n):
         rng = np.random.default_rng(0)
@@ -153,7 +153,7 @@ def test_plans_are_kept_outside(observations):
     _, other = agent.predict(second)  # another episode in between
     follow, later = agent.predict(first, state)
     np.testing.assert_array_equal(follow, agent.predict(first, state)[0])
-    # Episodes that start anew are planned anew, the others go on.
+    # New episodes are planned again, the others go on.
     _, mixed = agent.predict(np.stack([first[0], second[1]]), later, np.array([False, True]))
     assert mixed.step.tolist() == [3, 1]
     np.testing.assert_array_equal(mixed.actions[0], state.actions[0])
@@ -161,7 +161,7 @@ def test_plans_are_kept_outside(observations):
     # One observation alone.
     action, state = agent.predict(first[0])
     assert action.shape == (1,)
-    # Beyond the plan the guess goes on.
+    # Beyond the plan, the guess takes over.
     for _ in range(13):
         action, state = agent.predict(first[0], state)
     np.testing.assert_array_equal(action, TiltLQR(task).predict(first[0])[0])
@@ -258,8 +258,8 @@ def controller():
 
 def test_controller_swings_up_and_holds(controller):
     returns = play(BAR, controller, fresh_seeds(100))
-    assert returns[:20].mean() > 417.0  # what it is known to reach
-    assert returns.min() > 410.0  # none needs one swing more, or falls
+    assert returns[:20].mean() > 417.0  # its known performance
+    assert returns.min() > 410.0  # none needs an extra swing, or falls
     assert score(BAR, returns.mean()) > 0.99
 
 
@@ -274,7 +274,7 @@ def test_controller_hands_over_with_hysteresis(controller):
     assert holds(0.1, False) and holds(0.1, True)
     assert not holds(between, False) and holds(between, True)
     assert not holds(np.pi, True)
-    # An episode's start wipes out what was before.
+    # An episode's start erases the memory.
     assert not controller.predict(observation(between), np.array(True), np.array([True]))[1]
 
 
@@ -307,7 +307,7 @@ def test_agents_without_knowledge():
 
 
 def test_look_ahead_finds_the_best_action_of_a_step():
-    """Nearly what the best of a thousand actions gets, here with a best one in between."""
+    """Nearly as good as the best of a thousand actions, here with a best one in between."""
     task, rng = make_task(SHELL), np.random.default_rng(0)
 
     def value(states, targets, taken):

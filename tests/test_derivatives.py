@@ -1,4 +1,4 @@
-"""Derivatives by parameters, and backwards, against differences in 40-digit arithmetic."""
+"""Derivatives with respect to parameters, and backwards, against differences in 40-digit arithmetic."""
 
 import math
 import zlib
@@ -57,7 +57,7 @@ def test_jacobian_by_all_parameters(env_id):
     check_directions(scene, state, control, task.dt, rng.uniform(-1.0, 1.0, (1, width)))
 
 
-#: Parameters that are 0: their terms leave no code in the step, or they stand in a function.
+#: Parameters that are 0: their terms leave no code in the step, or they are arguments of a function.
 ZERO = {
     "damping": (PivotedBar(damping=0.0), [0.1, 0.2, 2.0, -3.0], [1.0], "damping"),
     "friction": (CartPole(friction=0.0), [0.1, 0.2, 2.0, -3.0], [1.0], "friction"),
@@ -91,7 +91,7 @@ def test_rows_and_columns_by_parameters():
 
 
 class Spring(Scene):
-    """A spring whose softness stands in a denominator."""
+    """A spring whose softness is in a denominator."""
 
     softness: float = parameter(0.5, "m/N", least=0.0)
     mass: float = parameter(1.0, "kg", above=0.0)
@@ -172,7 +172,7 @@ def exact_results(task, state, action, target, parameters):
 
 
 def starts(task, rng, n):
-    """Return states of episodes, the last ones at the edge of where guards act, and actions."""
+    """Return states of episodes, the last ones where guards begin to act, and actions."""
     model = Model(task)
     centre = np.array([task.formulas.starts[name][0] for name in task.scene.state_names])
     states = np.tile(centre, (n, 1)) + 0.2 * rng.uniform(-1.0, 1.0, (n, len(centre)))
@@ -190,7 +190,7 @@ def starts(task, rng, n):
             if ended[0]:
                 break
             states[i] = after[0]
-    # A guard leads exactly to where it begins to act: there two derivatives meet.
+    # A guard leads exactly to the edge where it begins to act: there, two derivatives meet.
     return model, states + 1e-3 * rng.uniform(-1.0, 1.0, states.shape), actions, given
 
 

@@ -1,4 +1,4 @@
-"""What the documentation says is what the code does: headings, tables, figures, links."""
+"""The documentation agrees with the code: headings, tables, figures, links."""
 
 import ast
 import dataclasses
@@ -62,7 +62,7 @@ def plain(text):
 
 
 def agrees(stated, value):
-    """Tell whether a stated number is the value, rounded to what is printed."""
+    """Tell whether a stated number is the value, rounded to the printed digits."""
     digits = len(stated.partition(".")[2])
     return abs(float(stated) - value) <= 0.5001 * 10.0**-digits + 1e-6 * abs(value)
 
@@ -72,7 +72,7 @@ def agrees(stated, value):
 
 @pytest.fixture(scope="module")
 def board():
-    """What the leaderboard shows."""
+    """The leaderboard's data."""
     return board_data(Board(ROOT / "leaderboard"))
 
 
@@ -207,7 +207,7 @@ def test_equations(env_id, page):
         for name, value in scene.acceleration(state, [0.7] * len(scene.control_names)).items()
     }
     values = dict(zip(scene.state_names, state, strict=True)) | dict.fromkeys(scene.control_names, 0.7)
-    if "w" in values:  # the momentum's speed stands for the place's rate
+    if "w" in values:  # the momentum's speed replaces the place's rate
         values["x_dot"] = values["w"] - scene.radius * values["phi_dot"]
     values |= {"sin": math.sin, "cos": math.cos, "arctan": math.atan, "phi_ddot": 0.0}
     if len(free) == 1:
@@ -279,8 +279,9 @@ def test_certified_speed(env_id, page):
 def test_measured_error(env_id):
     """A step errs by less than 1e-15 of the state's size: README says so, as the report claims.
 
-    Where several bars whip, a step is divided, and it makes much of a rounding: it errs by that many times as
-    much. Here are some steps of an episode of random actions; the report's tests take all of them.
+    Where several bars whip, a step is divided, and the motion amplifies roundings: the error may be larger by
+    that factor. This test takes some steps of an episode of random actions; the report's tests take all of
+    them.
     """
     env = make(env_id)
     limit = f"{LARGEST_STEP:g}"
@@ -304,18 +305,18 @@ def test_measured_error(env_id):
 
 
 def scale(env_id):
-    """Return what `python -m agents.scale` measured, by policy."""
+    """Return the results of `python -m agents.scale`, by policy."""
     return measured(env_id)["measured"]
 
 
 @pytest.mark.parametrize("env_id", have("returns"))
 def test_scale_is_what_was_measured(env_id):
-    """It was set once; what was measured since lies within the errors of both, or it would mislead."""
+    """The scale was set once; later measurements lie within the errors of both, or it would mislead."""
     known, found = known_returns(env_id), scale(env_id)
     best = found[known.policy]
     assert known.error == pytest.approx(best["error"], rel=0.2)
     assert abs(known.best - best["mean"]) <= 3.0 * known.error
-    # What counts as random was set from fewer episodes.
+    # The score of random actions was set from fewer episodes.
     assert abs(known.random - found["random"]["mean"]) < 5e-3 * (known.best - known.random)
     if found_reference := reference(env_id):
         mean, error, episodes = found_reference[1:]
@@ -398,7 +399,7 @@ def test_links(file):
 
 @pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md"])
 def test_make_targets(file):
-    """Every ``make target`` that is named exists."""
+    """Every ``make target`` that is mentioned exists."""
     text = (ROOT / file).read_text(encoding="utf-8")
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set(re.findall(r"`make ([a-z][a-z-]*)", text)) | set(
@@ -408,7 +409,7 @@ def test_make_targets(file):
 
 
 def test_generated_parts_are_as_generated():
-    """Pages and README's tables follow from the JSON files beside them, and from the records."""
+    """Pages and README's tables are generated from the JSON files beside them, and from the records."""
     for path, text in generated(ROOT).items():
         assert path.read_text(encoding="utf-8") == text, (
             f"{path.name}: `python -m lag_envs.report.docs` writes it anew"
@@ -418,7 +419,7 @@ def test_generated_parts_are_as_generated():
 
 
 def test_speeds():
-    """A table with all ids at four sizes; what misses its aim says so, and README claims no more."""
+    """A table with all ids at four sizes; it marks missed targets, and README claims no more."""
     speed = json.loads((ROOT / "docs" / "speed.json").read_text(encoding="utf-8"))
     assert speed["complete"]
     page = (ROOT / "docs" / "speed.md").read_text(encoding="utf-8")
@@ -446,7 +447,7 @@ def test_speeds():
 
 
 def test_numbers_in_the_prose():
-    """What pages say of the code's own numbers is so."""
+    """Statements on pages about the code's own numbers are true."""
     weight = make(pivoted_bar.SwingUpFree.id).scene._constants()["alpha"]
     doubling = math.log(2.0) / math.sqrt(weight)
     bar, brake = PivotedBar(), CylinderInCylinder(control="damping")

@@ -1,4 +1,4 @@
-"""The documentation's site: it builds, asks no other host for anything, and none of its links is broken."""
+"""The documentation's site: it builds, makes no request to other hosts, and has no broken links."""
 
 import os
 import re
@@ -25,14 +25,14 @@ NAMED = {"canonical", "next", "prev", "alternate"}
 pytestmark = [
     pytest.mark.slow,  # it builds the whole site
     pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM"),
-    # MkDocs and its plugins are others' code.
+    # MkDocs and its plugins are third-party code.
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 
 
 class Page(HTMLParser):
-    """What a page loads, what it links to, and its anchors."""
+    """The resources that a page loads, its links, and its anchors."""
 
     def __init__(self, text):
         super().__init__()
@@ -63,7 +63,7 @@ def site(tmp_path_factory):
 @pytest.fixture(scope="module")
 def pages(site):
     found = {path.relative_to(site).as_posix(): path for path in site.rglob("*.html")}
-    del found["404.html"]  # its addresses are the host's
+    del found["404.html"]  # its addresses depend on the host
     return {name: Page(path.read_text("utf-8")) for name, path in found.items()}
 
 
@@ -75,7 +75,7 @@ def test_every_page_is_there(site, pages):
     )
     scenes = (site / "scenes.html").read_text("utf-8")
     assert all(f'id="{kind.__name__.lower()}"' in scenes and "<math" in scenes for kind in SCENES)
-    # Most of what is public has a docstring, and those stand in the reference.
+    # Most public objects have a docstring, and these are in the reference.
     reference = (site / "api" / "tasks.html").read_text("utf-8")
     assert "Return the reward of a step of" in reference and "numbers by name, in order" in reference
 
@@ -115,7 +115,7 @@ def test_links_lead_somewhere(site, pages):
 
 
 def test_what_is_bundled_is_noticed(site):
-    """Each script and style of others is covered by NOTICE.md."""
+    """NOTICE.md covers each third-party script and style."""
     notice = (ROOT / "NOTICE.md").read_text("utf-8")
     ours = {"docs.css"}
     for path in [*site.rglob("*.js"), *site.rglob("*.css")]:
@@ -129,7 +129,7 @@ def test_what_is_bundled_is_noticed(site):
 
 
 def test_formulas_are_whole(site):
-    """Each element has the number of parts that it asks for, and each formula carries its LaTeX."""
+    """Each element has the required number of parts, and each formula includes its LaTeX."""
     parts = {"msup": 2, "msub": 2, "mfrac": 2, "mover": 2, "msubsup": 3}
     found = []
     for name in ("scenes.html", *(f"environments/{env_id}.html" for env_id in TASKS)):
@@ -157,7 +157,7 @@ def test_pages_are_published_only_when_switched_on():
 
 
 def test_in_a_browser(site, browser):
-    """No page asks for anything beyond its folder, search works offline, and pages fit a narrow screen."""
+    """No page requests anything outside its folder, search works offline, and pages fit a narrow screen."""
     asked = []
     page = browser.new_page(viewport={"width": 360, "height": 800})
     page.on("request", lambda r: asked.append(r.url) if not r.url.startswith(("file:", "data:")) else None)

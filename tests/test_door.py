@@ -1,4 +1,4 @@
-"""What a scene may not do is refused when its class is used, by name and with the remedy."""
+"""A scene's mistakes are refused when its class is used, by name and with the remedy."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from lag_envs.scenes.shapes import Circle
 
 
 class Good(Scene):
-    """A cart on a spring, from which each mistake below differs in one thing."""
+    """A cart on a spring; each mistake below changes one thing in it."""
 
     mass: float = parameter(1.0, "kg", above=0.0)
     spring: float = parameter(2.0, "N/m", least=0.0)
@@ -50,9 +50,9 @@ def mistake(formula, *words):
     Parameters
     ----------
     formula : str
-        What the error must name behind the class's name.
+        The name in the error, after the class's name.
     words : str
-        What it must say besides.
+        Further text in the error.
     """
 
     def add(make):
@@ -75,7 +75,7 @@ def kinetic(formula):
     return changed("kinetic", lambda self, q, v, xp: formula(self, q, v, xp))
 
 
-# --- numbers that cannot be followed -----------------------------------------------------------------------
+# --- numbers that cannot be traced -------------------------------------------------------------------------
 
 
 @mistake("potential", "math", "functions of xp")
@@ -326,7 +326,7 @@ def chance():
     return potential(lambda self, q, xp: random.random() * q.x**2)
 
 
-# --- energies that are none --------------------------------------------------------------------------------
+# --- invalid energies --------------------------------------------------------------------------------------
 
 
 @mistake("kinetic", "degree 3", "two at most")
@@ -825,7 +825,7 @@ def test_there_are_many_kinds_of_mistakes():
 
 
 def test_what_is_refused_is_a_type_error_and_a_value_error():
-    """Whoever catches one of them catches all."""
+    """Catching one of them catches all."""
     assert issubclass(FormulaError, TypeError) and issubclass(FormulaError, ValueError)
 
 
@@ -869,7 +869,7 @@ def test_bad_state_or_control(call, state, control, words):
 
 @pytest.mark.parametrize("gap", [1e-6, 1e-9, 1e-12])
 def test_a_mass_that_cancels_is_not_singular(gap, monkeypatch):
-    """R² - 2Rr + r² rounds to 0, or below, where r is near R; it does so in the first scene of a process."""
+    """R² - 2Rr + r² rounds to 0, or below, for r near R; it does so in the first scene of a process."""
     monkeypatch.setattr(door, "_admitted", weakref.WeakKeyDictionary())
     shell = CylinderInCylinder(shell_radius=0.5, radius=0.5 - gap)
     acceleration = -9.81 * math.sin(0.1) / (1.5 * shell.arm)

@@ -1,4 +1,4 @@
-"""Driving in the page: the page's step against Python's, bit for bit, and how it behaves in a browser."""
+"""Driving in the page: the page's step against Python's, bit for bit, and its behaviour in a browser."""
 
 import json
 import struct
@@ -26,14 +26,14 @@ from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pendulum, pivot
 from tests import board_pages
 
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
-#: Environments that the tests by hand drive.
+#: Environments for the hand-written tests.
 BARE = (
     pivoted_bar.SwingUp.id,
     pivoted_bar.Balance.id,
     incline.Tilt.id,
     cylinder_in_cylinder.Tilt.id,
 )
-#: Plays actions in the page and returns the bits of all that comes out.
+#: Plays actions in the page and returns the bits of all results.
 ROLLOUT = """async ([program, code, episodes]) => {
     const drive = await lagEnvs.load(program);
     const made = await lagEnvs.load(code);
@@ -57,7 +57,7 @@ def hex_of(x):
 
 
 def rollout(task, seed, actions, env=None):
-    """Return what `ROLLOUT` does, and the actions that were used."""
+    """Return the result of `ROLLOUT`, and the actions."""
     env = env or Unfused(task)
     env.reset(seed)
 
@@ -101,7 +101,7 @@ def files(folder, name):
 
 
 def check_bits(page, folder, task, name, episodes):
-    """Hold the page's episodes against Python's, `episodes` being (seed, actions) each."""
+    """Compare the page's episodes with Python's, for `episodes` of (seed, actions)."""
     env = Unfused(task)
     for seed, actions in episodes:
         told, used = rollout(task, seed, actions, env)
@@ -189,7 +189,7 @@ def link_of(page):
 
 
 def test_by_keys_alone(drive, capsys):
-    """Tab, arrows, Space, R and N; what was driven is true for the command."""
+    """Tab, arrows, Space, R and N; the command confirms the drive."""
     page = drive(incline.Tilt.id, hash="#seed=12")
     assert "Space starts" in message(page)
     page.focus("main")
@@ -227,7 +227,7 @@ def test_by_keys_alone(drive, capsys):
 
 @pytest.fixture(scope="module")
 def link():
-    """Return what a link of a drive holds that ends before its ten seconds."""
+    """Return the contents of a drive's link that ends before its ten seconds."""
     task = TASKS[incline.Tilt.id]()
     env = Unfused(task)
     env.reset(77)
@@ -243,13 +243,13 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
     page = drive(link.id, replay.write_link(link))
     until(page, "document.querySelector('.verdict').textContent.startsWith('The link is true')")
     assert page.evaluate("document.querySelector('.drive-controls select option:checked') !== null")
-    # Watching it leads to the same return; it is the ghost of whoever drives.
+    # Watching it leads to the same return; it is the driver's ghost.
     assert page.evaluate("[...document.querySelectorAll('.drive-controls select')][1].value") == "link:0"
     page.select_option(".drive-controls select >> nth=0", "1")
     page.click(".rerun")
     until(page, "document.querySelector('.message').textContent.includes('R: again')")
     assert float(reading(page, "Return").replace("−", "-")) == pytest.approx(link.claimed, abs=6e-3)
-    # Its last bit changed, it is false; so it is with one key more.
+    # With its last bit changed, it is false; and so it is with one key more.
     longer = replay.pack([*replay.unpack(link.keys, 1), (0,)])
     for changed in ({"claimed": np.nextafter(link.claimed, np.inf)}, {"keys": longer}):
         page = drive(link.id, replay.write_link(link._replace(**changed)))
@@ -257,7 +257,7 @@ def test_a_link_is_recomputed_in_the_page(drive, link):
         assert verdict(page).startswith("The link is false")
 
 
-#: Links that no drive makes: the whole of one, or what is changed in one; and what the page says.
+#: Invalid links, whole or as changes of a valid one; and the page's messages.
 IMPOSSIBLE = [
     ({"step": "00000000"}, "another version"),
     ("#drive=1~x", "damaged"),
@@ -354,7 +354,7 @@ def test_a_changed_machine_is_not_scored(drive):
 
 @pytest.fixture(scope="module")
 def owned(tmp_path_factory):
-    """Pages of users' tasks, of records that nobody knows."""
+    """Pages of users' tasks, from records of any kind."""
     folder = tmp_path_factory.mktemp("owned")
     with pytest.MonkeyPatch.context() as patch:
         for task in OWN:
@@ -522,7 +522,7 @@ def made(id, table, arrays):
 
 
 def covering_architectures():
-    """Yield all policies; but the first of each architecture, those of listed actions apart, are slow."""
+    """Yield all policies; all but the first of each architecture are slow, as are those of listed actions."""
     seen = set()
     for name, id, table, arrays in POLICIES:
         kind = table["architecture"], id in (LISTED, LISTS)
@@ -559,7 +559,7 @@ def test_agents_act_in_the_page_as_in_python(browsing, bare, monkeypatch, name, 
         wanted, memory = python.predict(seen, memory, np.array([i == 0]))
         off.append(np.abs(wanted[0] - action).max())
         env.step(np.reshape(action, wanted[0].shape).astype(wanted.dtype))
-    # Where two actions are worth the same to rounding, either may be chosen.
+    # If two actions are worth the same to rounding, either may be chosen.
     assert np.mean(np.array(off) < 2e-5) >= (0.9 if name == "values" else 1.0), max(off)
 
 
@@ -607,7 +607,7 @@ def test_ghosts_run_beside(drive, haunted):
 @pytest.mark.slow
 @pytest.mark.parametrize("id", ["PivotedBar-v0", incline.Brake.id, cylinder_in_cylinder.Tilt.id])
 def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
-    """In one of three drives at least, for others may be at work; a ghost beside looks a step ahead."""
+    """In at least one of three drives, for the machine may be busy; a ghost beside it looks a step ahead."""
     data = board_pages.data((id,), board_pages.AGENTS[:1])
     table = {"architecture": "table", "axes": ["theta - target", "theta_dot"], "kind": "value"}
     ghost = id == cylinder_in_cylinder.Tilt.id
@@ -619,14 +619,14 @@ def test_a_frame_takes_eight_milliseconds_at_most(drive, bare, id, tmp_path):
 
 
 def frames(page, ghost):
-    """Return what each frame takes while keys are pressed, the processor throttled four times [ms]."""
+    """Return the time of each frame while keys are pressed, with the processor throttled four times [ms]."""
     if ghost:
         page.select_option(".drive-controls select >> nth=1", "live:0")
     cdp = page.context.new_cdp_session(page)
     cdp.send("Emulation.setCPUThrottlingRate", {"rate": 4})
     page.focus(".stage")
     page.keyboard.press("Space")
-    page.wait_for_timeout(500)  # what the first frames compile is not theirs alone
+    page.wait_for_timeout(500)  # the first frames also compile
     page.context.browser.start_tracing(page=page, categories=["devtools.timeline"])
     for i in range(8):
         key = ("ArrowLeft", "ArrowRight")[i % 2]
@@ -634,7 +634,7 @@ def frames(page, ghost):
         page.wait_for_timeout(400)
         page.keyboard.up(key)
     events = json.loads(page.context.browser.stop_tracing())["traceEvents"]
-    # The main thread's own time: the machine may have other things to do.
+    # The main thread's own time: the machine may be busy otherwise.
     took = np.array([e["tdur"] / 1e3 for e in events if e["name"] == "FireAnimationFrame" and "tdur" in e])
     print(len(took), np.quantile(took, [0.5, 0.95, 1.0]))
     assert len(took) > 30

@@ -1,7 +1,7 @@
-"""Elementary functions from plain arithmetic, and the writing of recorded operations that they rest on.
+"""Elementary functions from plain arithmetic, and the code generated from recorded operations.
 
-Each formula is recorded once. What is tested is the machine code on vectors of 8 and on single numbers, and
-the same operations on Python's floats, fused and unfused.
+Each formula is recorded once. The tests cover the machine code on vectors of 8 and on single numbers, and the
+same operations on Python's floats, fused and unfused.
 """
 
 import math
@@ -93,14 +93,14 @@ def compiled(function, fused, width):
 
 
 def interpreted(function, fused, x):
-    """Return what Python's floats give, (n, results)."""
+    """Return the results with Python's floats, (n, results)."""
     operations, results = recorded(function, fused)
     known = [evaluate(operations, {"x": value}) for value in x.tolist()]
     return np.array([[values[name] for name in results] for values in known])
 
 
 def assert_same_bits(a, b):
-    """Compare bit for bit, signs of zeros included; what is not a number has no sign."""
+    """Compare bit for bit, including signs of zeros; NaN has no sign."""
     np.testing.assert_array_equal(a, b)
     number = ~np.isnan(a)
     np.testing.assert_array_equal(np.signbit(a)[number], np.signbit(b)[number])
@@ -112,7 +112,7 @@ def neighbours(values, reach):
 
 
 def points(function, n, seed=0):
-    """Return arguments where the function is hard: about ``n`` of each kind."""
+    """Return arguments that are hard for the function: about ``n`` of each kind."""
     rng = np.random.default_rng(seed)
     small = 10.0 ** rng.uniform(-320.0, 0.0, n // 2) * rng.choice([-1.0, 1.0], n // 2)
     if function in ("sincos", "tan"):
@@ -177,7 +177,7 @@ def points(function, n, seed=0):
 
 
 def error(value, exact):
-    """Return the error in units in the last place of the exact value, subnormal numbers' at least."""
+    """Return the error in units in the last place of the exact value, at least those of subnormals."""
     if not math.isfinite(value):
         return 0.0 if abs(exact) >= mpmath.mpf(2) ** 1024 * (1 - mpmath.mpf(2) ** -54) else math.inf
     place = max(mpmath.frexp(exact)[1] - 53, -1074) if exact else -1074
@@ -376,7 +376,7 @@ def test_code_for_every_processor_calls_nothing_and_fuses_only_what_is_recorded(
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
     machine = binding.Target.from_triple(target).create_target_machine(features=features, opt=3)
-    for fused in (False, True) if features else (False,):  # without features: a processor without fma
+    for fused in (False, True) if features else (False,):  # no features: a processor without fma
         module = ir.Module()
         module.triple = target
         pointer = ir.VectorType(ir.DoubleType(), 8).as_pointer()
@@ -427,7 +427,7 @@ def test_trace_of_plain_arithmetic():
     known = evaluate(operations, {"x": 0.7})
     exact = [f(0.7) for f in (math.sin, math.cos, math.tan, math.exp, math.log, math.atan, math.tanh)]
     np.testing.assert_allclose([known[result] for result in results], exact, rtol=5e-16)
-    # Nothing is recorded for constants, and what is known to be zero stays so.
+    # Nothing is recorded for constants, and known zeros stay zero.
     assert (trace.sin(0.0), trace.exp(0.0), trace.log(0.0), trace.atan(1.0)) == (
         0.0,
         1.0,

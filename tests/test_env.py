@@ -77,7 +77,7 @@ IMPOSSIBLE = {
 # --- checkers and registration ---
 
 
-#: What checkers dislike of spaces, even Gymnasium's own.
+#: Checkers' complaints about spaces, even Gymnasium's own.
 unusual_spaces = pytest.mark.filterwarnings(
     "ignore:.*(recommend (using|you to use) a symmetric|observation space (min|max)imum value is):UserWarning"
 )
@@ -98,7 +98,7 @@ def test_stable_baselines_checker(env_id):
 
 @each_id
 def test_made_with_all_wrappers(env_id):
-    env = gym.make(env_id)  # PassiveEnvChecker warns of what it dislikes
+    env = gym.make(env_id)  # PassiveEnvChecker may warn
     env.reset(seed=1)
     trace(env, actions(300, env.action_space))
     env.close()
@@ -159,7 +159,7 @@ def test_spec_names_the_steps_of_an_episode(env_id, options, copied):
 def test_episodes_of_remade_environments_are_as_long():
     spec = gym.make("PivotedBar-v0", dt=0.005, duration=1.0).spec
     assert steps_until_truncated(gym.make(EnvSpec.from_json(spec.to_json()))) == 200
-    # A spec's steps are a limit. Where the step is changed, Gymnasium is told to leave it out.
+    # A spec's steps are a limit. If the interval is changed, Gymnasium is told to leave it out.
     spec = gym.make("PivotedBar-v0", duration=1.0).spec
     assert steps_until_truncated(gym.make(spec, dt=0.005)) == 50
     assert steps_until_truncated(gym.make(spec, dt=0.005, max_episode_steps=-1)) == 200
@@ -733,7 +733,7 @@ def test_making_again_derives_nothing(env_id, monkeypatch):
 
 
 def test_formulas_are_recorded_once_for_all_numbers(monkeypatch):
-    # It is most of what making an environment takes.
+    # This takes most of the time of making an environment.
     recorded = []
     record = Program._record
 

@@ -1,4 +1,4 @@
-"""What is derived is Lagrange's: checked against SymPy's derivatives in 40 digits, at random points."""
+"""The derived equations are Lagrange's: checked against SymPy's derivatives in 40 digits, at random."""
 
 import dataclasses
 import functools
@@ -47,7 +47,7 @@ scenes = pytest.mark.parametrize(
 
 
 def complete(case):
-    """Return a scene none of whose parameters is zero, so that all its terms are there."""
+    """Return a scene with no parameter zero, so that all its terms are present."""
     scene, keywords = case
     made = scene(**keywords)
     zero = [f.name for f in dataclasses.fields(made) if "unit" in f.metadata and getattr(made, f.name) == 0.0]
@@ -113,7 +113,7 @@ class Lagrange:
         return [x for part in (point.q, point.v, point.a, point.u, point.p) for x in part.values()]
 
     def residual(self, coordinate, point):
-        """Return what Lagrange's equation leaves for a coordinate, and the largest of its terms."""
+        """Return the residual of Lagrange's equation for a coordinate, and the largest of its terms."""
         terms = [f(*self.numbers(point)) for f in self.terms[coordinate]]
         return mpmath.fsum(terms), max([*map(abs, terms), mpmath.mpf("1e-3")])
 
@@ -213,7 +213,7 @@ def test_linearisation_is_the_derivative(case):
 
 
 def test_held_rate_carries_what_stays_continuous():
-    """M (w - v) = Σ G ṡ, and w' by differences of w along the motion that the accelerations give."""
+    """M (w - v) = Σ G ṡ, and w' by differences of w along the motion with these accelerations."""
     scene = contract_scenes.Trolley()
     assert scene.state_names == ("s", "h", "alpha", "w_alpha", "beta", "w_beta")
     generator = np.random.default_rng(6)
@@ -287,7 +287,7 @@ FORMS = {
 
 @pytest.mark.parametrize("case", PACKAGE, ids=IDS[: len(PACKAGE)])
 def test_normal_form_is_the_derived_equation(case):
-    """What the exact flows step is Lagrange's equation, as is what the general series steps."""
+    """The exact flows step Lagrange's equation, and so does the general series."""
     scene = complete(case)
     form, mechanics = scene._form, scene.mechanics
     key = "-".join([type(scene).__name__, *(str(v) for v in case[1].values() if v is not None)])

@@ -29,7 +29,7 @@ def test_what_is_expected_is_what_is_seen():
 
 
 def test_errors_are_as_large_as_the_filter_believes():
-    """Errors weighed by the covariance are distributed as χ² with a degree of freedom for each entry."""
+    """Errors normalised by the covariance are distributed as χ² with a degree of freedom for each entry."""
     options = {"observation_noise": NOISE, "track": math.inf}
     task = make_task(ENV, **options)
     agent = Filtered(task, constant(task, action=0.3))
@@ -38,7 +38,7 @@ def test_errors_are_as_large_as_the_filter_believes():
     for t, _ in enumerate(rollout):
         if t in (5, 40, 120):
             known = rollout.memory
-            moved, spread = agent._move(known)  # from before the step to where the episodes are now
+            moved, spread = agent._move(known)  # from before the step to the present
             off = rollout.state - moved
             weighed.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off).mean())
         if t == 120:

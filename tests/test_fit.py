@@ -1,4 +1,4 @@
-"""Parameters from recordings that were made elsewhere: by SciPy's DOP853 on equations written by hand."""
+"""Parameters from independent recordings: by SciPy's DOP853 on hand-written equations."""
 
 import math
 import warnings
@@ -36,7 +36,7 @@ def cart(y, force, p, g=9.8):
 
 
 def motion(rates, parameters, start, controls, dt=DT):
-    """Return the states under controls that are held, shape (steps + 1, n_state)."""
+    """Return the states under held controls, shape (steps + 1, n_state)."""
     states = [np.array(start)]
     for u in controls:
         found = solve_ivp(
@@ -102,7 +102,7 @@ def test_two_coordinates_of_which_only_the_places_are_measured():
     found = CartPole().fit([(data, forces, 0.02)], list(CART))
     assert agrees(found, CART)
     assert list(found.noise) == ["x", "theta"]
-    # Rates that nobody measured are inferred.
+    # Rates that were not measured are inferred.
     assert np.abs(found.simulated[0] - states).max(axis=0)[[1, 3]] == pytest.approx([0.0, 0.0], abs=0.2)
     assert np.isnan(found.residuals[0][:, 1]).all() and np.isnan(found.residuals[0][42]).all()
 
@@ -186,7 +186,7 @@ def test_what_follows_from_a_free_parameter_goes_on_following():
 
 
 def coverage(sets):
-    """Return how often each interval has the truth in it, over data sets that differ in their noise."""
+    """Return how often each interval contains the truth, over data sets that differ in their noise."""
     states, torques = swings(60)
     inside = dict.fromkeys(ROD, 0)
     for seed in range(sets):
@@ -217,7 +217,7 @@ def test_level_and_known_noise():
     assert wide.noise == noise and wide.estimates == narrow.estimates
     (low, high), (inner_low, inner_high) = wide.intervals["length"], narrow.intervals["length"]
     assert low < inner_low < inner_high < high
-    # Normal quantiles, in the logarithm of what is positive.
+    # Normal quantiles, in the logarithm of positive parameters.
     ratio = math.log(high / low) / math.log(inner_high / inner_low)
     assert ratio == pytest.approx(2.5758 / 0.67449, rel=1e-4)
     assert wide.errors["length"] == pytest.approx(
@@ -225,7 +225,7 @@ def test_level_and_known_noise():
     )
 
 
-# --- what the data do not say ---
+# --- undetermined parameters ---
 
 
 def test_undetermined_together():
@@ -237,18 +237,18 @@ def test_undetermined_together():
         Pendulum().fit([(noisy(free, 0.01, 1), None, DT)], ["mass", "length", "damping"])
     assert "hold" in str(e.value) or "held" in str(e.value)
     both = [(noisy(free, 0.01, 1), None, DT), (noisy(states, 0.01, 2), torques, DT)]
-    assert agrees(Pendulum().fit(both, list(ROD)), ROD)  # a recording under torques tells them apart
+    assert agrees(Pendulum().fit(both, list(ROD)), ROD)  # a recording under torques distinguishes them
 
 
 def test_undetermined_alone():
-    """All rods fall alike, but for the damping, which is next to nothing."""
+    """All rods fall alike, except for the damping, which is tiny."""
     free = motion(rod, ROD | {"damping": 0.0}, [2.0, 0.0], np.zeros(40))
     with pytest.raises(ValueError, match="do not determine mass, which has no effect of its own"):
         Pendulum(damping=1e-14).fit([(noisy(free, 0.01, 1), None, DT)], ["length", "mass"])
 
 
 def test_hardly_determined():
-    """A rod that falls freely shows its mass by its damping alone."""
+    """A rod that falls freely reveals its mass only by its damping."""
     free = motion(rod, ROD, [3.0, 0.0], np.zeros(12))
     with pytest.warns(FitWarning, match="the data hardly determine mass"):
         found = Pendulum(damping=ROD["damping"]).fit([(noisy(free, 0.03, 2), None, DT)], ["length", "mass"])
@@ -278,7 +278,7 @@ def test_a_model_that_does_not_follow():
     assert any("residuals of theta are not independent" in text for text in texts)
 
 
-# --- what is shown ---
+# --- display ---
 
 
 def test_table_and_picture(tmp_path):

@@ -1,6 +1,6 @@
-"""What the environments do against what they did when version 0 was settled: see golden_rollouts.py.
+"""The environments' behaviour against that of the settled version 0: see golden_rollouts.py.
 
-Only what a user can call is used, so that this holds whatever the package is made of.
+Only the public interface is used, so that this holds for any implementation.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ IDS = dict.fromkeys(name.partition("/")[0] for name in RUNS)
 def each(ids):
     """Return the runs of some ids as parameters.
 
-    Quick are single environments of a covering set, and one run of every id; a batch has the bits of single
-    ones (test_vector.py), and programs of its own to compile.
+    Quick runs are single environments of a covering set, and one run of every id; a batch has the bits of
+    single environments (test_vector.py), and its own programs to compile.
     """
     chosen, found = quick(ids), []
     for name, run in RUNS.items():
@@ -34,7 +34,7 @@ def each(ids):
 
 
 each_run = each(IDS)
-#: A step of the others depends on more than the state and the action.
+#: In the others, a step depends on more than the state and the action.
 each_perfect_run = each([env_id for env_id in IDS if env_id in PERFECT])
 TOLERANCE = 1e-12
 
@@ -80,7 +80,7 @@ def test_the_file_holds_every_run():
 
 @each_run
 def test_whole_run(name):
-    # From its seed and actions alone. The motion makes up to 2,000 of a rounding on the way.
+    # From its seed and actions alone. The motion amplifies a rounding up to 2,000 times on the way.
     golden = arrays(name)
     mine = stack(play(name.partition("/")[0], RUNS[name], golden["actions"]))
     assert mine.keys() == golden.keys() - {"actions"}
@@ -90,17 +90,17 @@ def test_whole_run(name):
 
 @each_perfect_run
 def test_each_step(name):
-    # From the state that was kept, so that nothing can add up or be amplified.
+    # From the recorded state, so that nothing can add up or be amplified.
     golden, run, env_id = arrays(name), RUNS[name], name.partition("/")[0]
     keywords = {key: value for key, value in run.keywords.items() if key != "diagnostics"}
     roll = Roll(env_id, Run(keywords, run.steps, mode=run.mode and "Disabled"))
     before, after = golden["over"][:-1] > 0, golden["over"][1:] > 0
-    # Where the call was a reset there is no step to take again; a batch without autoreset is reset by a mask.
+    # A reset has no step to repeat; a batch without autoreset is reset by a mask.
     reset = before.any(axis=1) if run.mode in ("", "Disabled") else np.zeros(len(before), bool)
     stepped = ~before & ~reset[:, None]
     restarted = after & (run.mode == "SameStep")
-    # Lanes without a step to take again stand where all began. What a limit has clipped may lie beyond it by
-    # a rounding; a start there would be refused.
+    # Lanes without a step to repeat stay where all began. A clipped entry may lie beyond its limit by a
+    # rounding; a start there would be refused.
     starts = np.where(stepped[..., None], golden["state"][:-1] * (1.0 - 1e-15), golden["state"][0])
     steps = []
     for t, start in enumerate(starts):
@@ -113,7 +113,7 @@ def test_each_step(name):
         steps.append(roll.step((golden["actions"][t + 1] / 100.0).astype(np.float32)))
     mine = stack(steps)
     state, wanted = mine["state"], golden["state"][1:]
-    if TASKS[env_id].draws:  # kicks are drawn anew: they hit few, and the last rate only
+    if TASKS[env_id].draws:  # kicks are drawn differently: they hit few, and only the last rate
         kicked = np.abs(state[..., -1] - wanted[..., -1]) > 1e-6
         alike = ~kicked[stepped & ~restarted]
         assert np.count_nonzero(~alike) <= max(3, 0.1 * alike.size)

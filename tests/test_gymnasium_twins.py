@@ -1,4 +1,4 @@
-"""Environments that are Gymnasium's with exact motion: spaces, rewards, endings, and policies in both."""
+"""Gymnasium's environments with exact motion: spaces, rewards, endings, and policies in both."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_steps_pay_and_end_as_gymnasiums(env_id, peer_id):
 
 @each_pair
 def test_one_policy_in_both(env_id, peer_id, capsys):
-    """A controller runs unchanged in both, and returns what it does there."""
+    """A controller runs unchanged in both, with the same return."""
     agent = make_controller(env_id, TASKS[env_id].reference)
     found = {name: energy.returns(name, agent, 40) for name in (peer_id, env_id)}
     with capsys.disabled():

@@ -1,4 +1,4 @@
-"""Whatever is given to an environment: it works, or an error names it. Nothing leads out of the spaces."""
+"""Any input to an environment works, or an error names it. No result leaves the spaces."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from lag_envs.envs.single import check_seed, key_of
 from lag_envs.scenes import CylinderInCylinder, PivotedBar
 from lag_envs.tasks import TASKS, cylinder_in_cylinder, incline, pivoted_bar
 
-#: Those that promise to work wherever in their ranges all parameters lie.
+#: Those that promise to work for all parameters within their ranges.
 PROMISED = [i for i in IDS if any(math.isfinite(low) for low, _ in TASKS[i]().usable_ranges().values())]
 each_id = pytest.mark.parametrize("env_id", covering(PROMISED))
-#: Where parameters are drawn, ranges hold for the drawn ones.
+#: For drawn parameters, the ranges apply to the drawn values.
 each_perfect = pytest.mark.parametrize("env_id", covering(i for i in PROMISED if i in PERFECT))
 
 MASKED = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
-#: No number, and no number for each of three environments.
+#: Invalid numbers, and invalid sequences of a number for each of three environments.
 NO_NUMBERS = [
     "1", "nan", "", b"1", True, np.True_, 1j, math.nan, -math.inf, 10**400, -(10**400), [], [1.0],
     [1.0, "a", 2.0], [[1.0], [2.0], [3.0]], [1.0, [2.0], 3.0], {}, {"a": 1}, {1.0}, object(), float,
@@ -55,7 +55,7 @@ def tells(message, name, value):
     return name in message and any(start in message for start in starts)
 
 
-# --- what is no number ---
+# --- invalid numbers ---
 
 
 @each_id
@@ -244,7 +244,7 @@ def usable(env_id, keywords):
 
 
 def assert_works(env, seed, steps=25, start=None):
-    """Step with full swings to and fro; all that comes back is finite and in its space."""
+    """Step with full swings to and fro; all results are finite and in their spaces."""
     observation, _ = env.reset(seed=seed, options=start)
     for i in range(steps):
         assert np.isfinite(observation).all()
@@ -260,7 +260,7 @@ def assert_works(env, seed, steps=25, start=None):
 def numbers(low, high):
     """Return a strategy for a parameter: in its range, at its ends and just beyond, and anything else.
 
-    Nothing that vanishes: each set of constants that are zero is code of its own, and would be compiled.
+    Never zero: each set of zero constants has its own code, which would have to be compiled.
     """
     small = max(low, 1e-9 * high, 1e-12)
     inside = st.floats(math.log(small), math.log(high)).map(math.exp).filter(lambda x: low <= x <= high)
@@ -325,7 +325,7 @@ def corners(env_id):
         if "shell_radius" in keywords:  # the smallest shell has room for one radius, the largest for less
             big = max(keywords["shell_radius"], 2e-9)
             keywords |= {"shell_radius": big, "radius": min(keywords["radius"], 0.9999 * big)}
-        # The longest step, where the longest of all is too long.
+        # The longest allowed step, if the range's longest is too long.
         short = next(
             dt for dt in (keywords["dt"], 1e-2, 1e-4, 1e-6, 0.0) if usable(env_id, keywords | {"dt": dt})
         )
@@ -372,7 +372,7 @@ def test_outside_its_range_each_is_named(env_id):
 
 
 def test_spaces_of_episodes_without_an_end():
-    # Nothing pulls on a level slope: no speed is gained, however long.
+    # Nothing pulls on a level slope: no speed is gained, however long the episode.
     for options in ({"tilt": 0.0}, {"gravity": 0.0}):
         env = make(incline.Brake.id, duration=math.inf, **options)
         assert np.isfinite(env.observation_space.high).all()

@@ -1,4 +1,4 @@
-"""What a notebook shows of scenes and environments: whole, escaped, and from nowhere else."""
+"""The HTML of scenes and environments in a notebook: complete, escaped, and self-contained."""
 
 import re
 from html import unescape
@@ -14,7 +14,7 @@ from lag_envs.tasks import incline
 
 
 class Checked(HTMLParser):
-    """Notes what a text is made of, and fails where elements do not close."""
+    """Notes a text's elements, and fails if elements are not closed."""
 
     def __init__(self, text):
         super().__init__()
@@ -56,7 +56,7 @@ def test_equations_are_those_of_the_scene():
         controls = {"torque": "N m"}
 
         def kinetic(self, q, v, xp):
-            # Written so that a square of a sine has to go.
+            # Written such that a square of a sine has to be eliminated.
             return (
                 0.5 * self.mass * self.length**2 * v.theta**2 * (xp.cos(q.theta) ** 2 + xp.sin(q.theta) ** 2)
             )

@@ -42,7 +42,7 @@ ALL = {
 
 
 def played(env_id: str, n: int, steps: int, mode: str = "NextStep", **keywords):
-    """Assert that a batch does what single environments do, bit for bit; return what was seen."""
+    """Assert that a batch equals single environments, bit for bit; return the observations."""
     envs = gym.make_vec(env_id, num_envs=n, autoreset_mode=mode, **keywords)
     alone = [gym.make(env_id, **keywords) for _ in range(n)]
     seen = [envs.reset(seed=5)[0]]
@@ -151,7 +151,7 @@ def test_what_is_off_leaves_everything_as_it_is():
 
 
 def test_perfect_programs_print_what_they_printed_without_the_module(monkeypatch):
-    # Not a line of their own is left: no row, no constant, no key.
+    # No line of imperfections is left: no row, no constant, no key.
     import lag_envs.envs.lines as module
 
     printed: list[str] = []
@@ -231,7 +231,7 @@ def test_an_environment_has_the_bits_of_one_made_with_the_drawn_values():
         assert drawn.unwrapped.drawn_task.scene.inertia == pytest.approx(
             0.2 * values["com_distance"] ** 2 / 3, rel=1e-15
         )
-        # Both programs call the scalar step where noise is asked for, which changes nothing else.
+        # With noise, both programs call the scalar step, which changes nothing else.
         made = gym.make(ID, **values)
         made.reset(seed=seed)
         for t in range(100):
@@ -259,7 +259,7 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
     task, state = own.task, own.state
     formulas, k = task.formulas, constants_of(task)
     spread = action_delay if isinstance(action_delay, tuple) else (action_delay, action_delay)
-    arrivals, pieces = [(0.0, 0.0)], []  # (when, which control); (when, state, control) of what was simulated
+    arrivals, pieces = [(0.0, 0.0)], []  # (when, which control); (when, state, control) of simulated pieces
     rng = np.random.default_rng(1)
     for n in range(60):
         action = rng.uniform(-1, 1, 1).astype(np.float32) if n % 3 else np.ones(1, np.float32)
@@ -267,7 +267,7 @@ def test_delays_against_pieces_of_simulate(action_delay, observation_delay):
         arrivals.append((n * dt + late, 5.0 * float(action[0])))
         observation, reward, *_ = env.step(action)
         shown.append(observation)
-        # A command that comes after one that was sent later changes nothing.
+        # A command that arrives after a later one has no effect.
         came = [i for i, (t, _) in enumerate(arrivals) if n * dt + 1e-12 < t < (n + 1) * dt - 1e-12]
         news = [arrivals[i][0] for i in came if not any(t <= arrivals[i][0] for t, _ in arrivals[i + 1 :])]
         switches = sorted([n * dt, *news])
@@ -360,7 +360,7 @@ def test_spaces_hold_all_that_may_be_drawn():
 
 
 def test_what_the_space_cannot_hold_is_clipped_in_the_observation():
-    class Narrow(TASKS["PivotedBar-v0"]):  # its bound is proved for a motion that nothing pushes
+    class Narrow(TASKS["PivotedBar-v0"]):  # its bound is proved for a motion without pushes
         def bounds(self):
             return {**super().bounds(), "theta_dot/8": 0.2}
 
@@ -419,7 +419,7 @@ def test_a_slow_sensor_holds_its_readings():
         assert not np.array_equal(seen[i], seen[i + 3])
 
 
-# --- what is refused ----------------------------------------------------------------------------------------
+# --- refusals -----------------------------------------------------------------------------------------------
 
 REFUSED = [
     ({"randomize": 3}, "randomize must map parameters to ranges"),

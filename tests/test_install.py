@@ -1,4 +1,4 @@
-"""The core stands alone: what it installs, and what importing it loads."""
+"""The core stands alone: its dependencies, and the modules that importing it loads."""
 
 import json
 import os
@@ -37,7 +37,7 @@ INSTALLED = f"""
 import importlib.util, json
 print(json.dumps([name for name in {OPTIONAL} if importlib.util.find_spec(name)]))
 """
-#: The example by its module's name: native vectors equal workers that are started anew.
+#: The example by its module's name: native vectors equal freshly started workers.
 OWN = """
 import json
 import gymnasium as gym
@@ -70,7 +70,7 @@ def run(*command, cwd):
     return done.stdout
 
 
-# Numba looks for SciPy when it is imported, so a step may load it, an import of the package may not.
+# Numba looks for SciPy when it is imported, so a step may load it, but importing the package may not.
 @pytest.mark.parametrize(
     ("script", "allowed"), [("import lag_envs", set()), (STEP, {"scipy"})], ids=["import", "step"]
 )
@@ -82,7 +82,7 @@ def test_optional_packages_are_not_loaded(script, allowed, tmp_path):
 @pytest.mark.slow
 def test_core_alone_can_be_installed_and_stepped(tmp_path):
     home = tmp_path / "venv"
-    venv.create(home)  # without pip, which takes seconds to install: ours installs from outside
+    venv.create(home)  # without pip, which takes seconds to install: the outer one installs into it
     python = home / ("Scripts" if sys.platform == "win32" else "bin") / "python"
     pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
     try:
@@ -94,12 +94,12 @@ def test_core_alone_can_be_installed_and_stepped(tmp_path):
     # -I keeps the surrounding environment's PYTHONPATH out.
     assert json.loads(run(python, "-I", "-W", "error", "-c", STEP + INSTALLED, cwd=tmp_path)) == []
     assert "bench" in run(python.with_name("lag-envs"), "--help", cwd=tmp_path)
-    # A file of one's own is all that an environment takes, also in worker processes that are spawned.
+    # A file of one's own makes an environment, also in spawned worker processes.
     example = (ROOT / "examples" / "ball_on_beam.py").read_text(encoding="utf-8")
     (tmp_path / "ball_on_beam.py").write_text(example, encoding="utf-8")
     (tmp_path / "use_it.py").write_text(OWN, encoding="utf-8")
     assert json.loads(run(python, "use_it.py", cwd=tmp_path)) == [True, True]
-    # What is for other libraries is in the wheel, and says what it needs.
+    # Parts for other libraries are in the wheel, and state their requirements.
     assert "lag_envs.sb3.ScaledReward" in run(
         python.with_name("lag-envs"), "hyperparams", "ppo", cwd=tmp_path
     )
@@ -114,7 +114,7 @@ def test_one_distribution_brings_pygame():
 
 
 def test_no_skips_fails_what_is_skipped(tmp_path):
-    """What `make test-slow` stands on: nothing is left out in silence."""
+    """The basis of `make test-slow`: nothing is skipped silently."""
     (tmp_path / "test_it.py").write_text(
         "import pytest\n\ndef test_a(): pytest.skip('a')\n\n"
         "@pytest.mark.skipif(True, reason='b')\ndef test_b(): pass\n\ndef test_c(): pass\n"
@@ -136,7 +136,7 @@ def test_no_skips_fails_what_is_skipped(tmp_path):
     "version", re.findall(r":: Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text()), ids=str
 )
 def test_every_dependency_has_wheels(version, tmp_path):
-    """For each Python that we name; rliable is Python alone and has no wheel for any."""
+    """For each Python that we name; rliable is pure Python and has no wheel for any."""
     pins = [p for p in (ROOT / "constraints.txt").read_text().split() if "==" in p and "rliable" not in p]
     options = ["--only-binary=:all:", "--no-deps", "--target", tmp_path, "--python-version", version]
     run(sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", *options, *pins, cwd=tmp_path)

@@ -43,7 +43,7 @@ CASES = {
 def exact_step(scene, state, control, dt, moved=None):
     """Return the state after a step in 36 digits, by the report's oracle, which shares no code with the step.
 
-    Parameters that are `moved` have other values than the scene's, numbers of mpmath.
+    Parameters in `moved` have other values than the scene's, as numbers of mpmath.
     """
     exact = {name: sympy.Rational(*to_rational(value._mpf_)) for name, value in (moved or {}).items()}
     return mpmath.matrix(Oracle(scene, exact).once(state, control, dt, 36))
@@ -96,7 +96,7 @@ def oracle(case):
     ],
 )
 def test_exact_flows(kind, n):
-    """Each scene and control, with drag from gamma dt = 0 to 1e6: also where the control is the drag."""
+    """Each scene and control, with drag from gamma dt = 0 to 1e6: also with the drag as control."""
     for case in random_cases(kind, n, 41 + n):
         scene = getattr(scenes, case["scene"])(**case["params"])
         found = np.concatenate(scene.jacobian(case["state"], case["control"], case["dt"]), axis=1)
@@ -105,7 +105,7 @@ def test_exact_flows(kind, n):
         assert (np.abs(found - expected) <= 1e-12 * size).all(), case
 
 
-#: Slow manifold and boundary layer, with a field that the control makes, or that is nothing beside the push.
+#: Slow manifold and boundary layer, with a field from the control, or one that is negligible beside the push.
 HEAVY = {
     "support at rest": ("PivotedBar", {"damping": 40.0}, [0.1, 0.0, 2.0, -30.0], 0.0, 0.02),
     "support driven": ("PivotedBar", {"damping": 4e3}, [0.1, 0.0, 2.0, 3.0], 9.0, 0.05),
@@ -123,7 +123,7 @@ HEAVY = {
 }
 
 
-#: Those that take seconds, of compiling or of exact arithmetic.
+#: Those that take seconds to compile or in exact arithmetic.
 LONG = ("support driven", "shell turns without gravity", "the control is the drag")
 
 
@@ -180,7 +180,7 @@ def test_step_that_is_refused():
         def kinetic(self, q, v, xp):
             return self.mass * (v.x**2 + (q.x * v.y) ** 2) / 2
 
-    # So many substeps that it is refused, as the step itself is.
+    # It would need so many substeps that it is refused, like the step itself.
     bar = scenes.PivotedBar(damping=0.0)
     with pytest.raises(StepRefused, match=r"the step of row 1.* more than 1,000,000 substeps"):
         bar.jacobian([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1e12]])

@@ -27,7 +27,7 @@ OTHERS = [kind for kind in OWN if kind not in LEARNED]
 
 
 def actions_of(task, given):
-    """Return a batch's actions as tensors, given one for each environment."""
+    """Return a batch's actions as tensors, from one for each environment."""
     rows = np.array([np.atleast_1d(action) for action in given])
     rows = rows.reshape(len(given), *([] if len(task.formulas.choices) == 1 else [-1]))
     return torch.from_numpy(rows.astype(np.int64 if task.formulas.choices else np.float64))
@@ -38,7 +38,7 @@ def bits(numbers):
 
 
 def check_bits(kind, steps, seeds=(3, 2**64 - 1)):
-    """Step a batch and `Unfused` side by side, to the ends of their first episodes."""
+    """Step a batch and `Unfused` in parallel, to the ends of their first episodes."""
     envs = on_processor(kind, len(seeds))
     ones = {i: Unfused(envs.task) for i in range(len(seeds))}
     choose = [at_random(envs.task, i) for i in ones]
@@ -123,7 +123,7 @@ def test_single_precision_is_the_step_to_its_rounding(id):
     known.reset(0)
     steps = []
     for i in range(100):
-        # Both begin in what single precision can hold.
+        # Both start from states that single precision can represent.
         single.rows.copy_(double.rows)
         double.rows.copy_(single.rows)
         before = double.state.numpy().copy()
@@ -136,7 +136,7 @@ def test_single_precision_is_the_step_to_its_rounding(id):
         assert torch.allclose(found.double(), rewards, rtol=1e-4, atol=100 * 16 * 2.0**-24)
         for j in torch.nonzero(~(over[0] | over[1]))[:, 0].tolist():
             by_state, by_control = scene.jacobian(before[j], double.control[j].numpy(), task.dt)
-            # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
+            # A guard that stops at an edge amplifies a rounding, which is not the motion's fault.
             moved = by_control @ (single.control[j].double() - double.control[j]).numpy()
             steps.append(
                 (before[j], double.state[j].numpy().copy(), single.state[j].numpy().copy(), moved, by_state)
@@ -178,7 +178,7 @@ def test_starts_may_be_given():
     env.reset(seed=1)
     given = {"state": states.double().numpy(), "reset_mask": mask.numpy()}
     assert np.allclose(seen, env.reset(options=given)[0], rtol=1e-6)
-    # Seeds go to those that are reset.
+    # Seeds are used for the environments that are reset.
     envs.reset(seed=8, options={"reset_mask": mask})
     fresh = on_processor(BAR, 3)
     fresh.reset(seed=8)
@@ -271,7 +271,7 @@ def test_nvrtc_compiles_it():
 
 
 def test_the_benchmark_measures_both_precisions(monkeypatch):
-    """Here on the processor: its numbers are those of no GPU."""
+    """Here on the processor: its numbers say nothing about a GPU."""
     monkeypatch.setattr(benchmark_device, "DeviceEnvs", _on_any)
     monkeypatch.setattr(benchmark_device, "COPIED", 2**20)
     found = benchmark_device.rates([CHOICES.id, BAR.id], [7], "cpu", 1e-3, 3)

@@ -1,4 +1,4 @@
-"""Steps behind a first-order actuator: against systems that have it as a coordinate, and in every form."""
+"""Steps behind a first-order actuator: against systems with it as a coordinate, and in every form."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from lag_envs.stepping.machine import Layout
 from lag_envs.stepping.series import REACH, Certificate, Plain, Series
 from lag_envs.stepping.tracing import evaluate
 
-#: Of a control step, relative to the entry or to 1.
+#: Error of a control step, relative to the entry or to 1.
 LARGEST_ERROR = 2e-13
 
 # --- systems whose actuators are coordinates ----------------------------------------------------------------
 #
-# The rates of `a` and `b` are the controls that are applied. Nothing acts back on them. So the oracle, which
-# knows of no lag, gives the motion behind the actuators.
+# The rates of `a` and `b` are the applied controls. Nothing acts back on them. So the oracle, which knows
+# nothing of lag, gives the motion behind the actuators.
 
 
 class _Actuators(Scene):
@@ -136,7 +136,7 @@ class TurnThere(_Slope):
 
 
 class Case(NamedTuple):
-    """A scene and its twin, whose state is ``there(state, a', b')``; ``back`` is the way back."""
+    """A scene and its twin, whose state is ``there(state, a', b')``; ``back`` is the inverse."""
 
     scene: Scene
     twin: type
@@ -217,7 +217,7 @@ def test_step_at_any_lag(name, part, dt):
     assert worst(case, lags, dt) < LARGEST_ERROR
 
 
-# --- any scene, held against itself -------------------------------------------------------------------------
+# --- any scene, compared with itself ------------------------------------------------------------------------
 
 
 def in_pieces(scene, state, applied, command, lag, dt, pieces):
@@ -294,7 +294,7 @@ def test_tail_of_an_exponential_is_bounded():
 
 
 def tails(case, lags, h, order):
-    """Return what places and velocities leave out beyond an order, from series in 40 digits."""
+    """Return the truncation errors of places and velocities beyond an order, from series in 40 digits."""
     names = ("a", "b")[: len(lags)]
     numbers = {f"lag_{x}": lag for x, lag in zip(names, lags, strict=True)}
     numbers |= {f"to_{x}": command for x, command in zip(names, case.command, strict=True)}
@@ -413,7 +413,7 @@ def test_control_without_lag_is_held():
 def test_shortest_and_longest_lag(name):
     case = CASES[name]
     scene, commands = case.scene, [case.command] * 3
-    first = [*case.command] if name == "turn" else case.applied  # a rate that jumps moves w's place at once
+    first = [*case.command] if name == "turn" else case.applied  # a jump of a rate moves w's place at once
     at_once = scene.simulate(case.state, commands, 0.02)
     short = scene.simulate(case.state, commands, 0.02, lag=2e-8, applied=first)
     np.testing.assert_allclose(short, at_once, rtol=0, atol=1e-5)
@@ -457,7 +457,7 @@ def test_scene_without_controls_cannot_lag():
 
 
 def test_refusal_brings_what_went_before():
-    bar = PivotedBar(damping=1e6, track=None)  # without lag, a closed form knows what to do
+    bar = PivotedBar(damping=1e6, track=None)  # without lag, a closed form handles this
     assert np.isfinite(bar.simulate([2.0, 0.0], [1.0, 2.0], 0.02)).all()
     with pytest.raises(StepRefused, match=r"step 0 of 2 .* could not be certified") as refusal:
         bar.simulate([2.0, 0.0], [1.0, 2.0], 0.02, lag=0.1)
@@ -468,7 +468,7 @@ def test_refusal_brings_what_went_before():
 
 
 def behind(u, command, lag, h):
-    """Return where a control is that follows its command for a time, and its mean."""
+    """Return the place of a control that follows its command for a time, and its mean."""
     left = math.exp(-h / lag)
     return command + (u - command) * left, command + (u - command) * lag * (1.0 - left) / h
 
@@ -500,7 +500,7 @@ def test_environment_against_simulate(late):
 
 
 def test_what_overruns_its_guard_is_clipped_in_the_observation():
-    # The guard limits the command. What follows it late may leave the track, but not the observation's space.
+    # The guard limits the command. The delayed motion may leave the track, but not the observation's space.
     env = gym.make("PivotedBar-v0", lag=0.3)
     env.reset(seed=0)
     places = []

@@ -1,4 +1,4 @@
-"""The command ``lag-envs leaderboard``, the tables that follow from the board, and CI's recipe."""
+"""The command ``lag-envs leaderboard``, the tables generated from the board, and CI's recipe."""
 
 import importlib.util
 import json
@@ -31,9 +31,9 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture
 def run(monkeypatch, tmp_path, capsys):
-    """Give a function that runs the command in a folder of its own and returns status and output."""
+    """Give a function that runs the command in a separate folder and returns status and output."""
     fake_submissions.install(monkeypatch.setattr)
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # another process would have the real ones
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # another process would use the real functions
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments):
@@ -156,7 +156,7 @@ def test_mistakes(run):
 def test_missing_packages_are_named(run, monkeypatch):
     monkeypatch.setattr("lag_envs.commands.base.find_spec", lambda name: None if name == "safetensors" else 1)
     assert 'safetensors is missing: pip install "lag-envs[leaderboard]"' in run("list")[2]
-    assert cli.main(["list"]) == 0  # others don't need it
+    assert cli.main(["list"]) == 0  # others do not need it
 
 
 def test_other_commands_do_not_load_the_leaderboard():
@@ -237,7 +237,7 @@ def test_top_of_each_board(run):
 
 
 def test_agents_over_all_boards(run):
-    """Who is on both boards comes before who is better on one; the best learner is shown wherever it is."""
+    """An agent on both boards ranks above a better one on one board; the best learner is always shown."""
     for number in range(docs.BEST):
         write(f"c{number}", f"C{number}", score=0.9 + 0.01 * number, kind="controller")
     write("low", "Learner", score=0.4)
@@ -297,7 +297,7 @@ def test_the_recipe_of_the_docs_computes_a_rank(run, capsys):
 
 @pytest.fixture
 def repository(tmp_path, monkeypatch):
-    """Give CI's recipe, in a repository with a board, and a function that commits what lies there."""
+    """Give CI's recipe, in a repository with a board, and a function that commits all changes there."""
     if shutil.which("git") is None:
         pytest.skip("needs git")
     loader = SourceFileLoader("submissions", str(ROOT / ".ci" / "submissions"))

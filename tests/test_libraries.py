@@ -1,4 +1,4 @@
-"""`make test-libraries`: what it does where things cannot be had or go wrong, and the page that it writes."""
+"""`make test-libraries`: its behaviour if something is missing or goes wrong, and the page that it writes."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The algebra of recorded formulas against numbers in 30 digits, and what a record leaves out."""
+"""The algebra of recorded formulas against numbers in 30 digits, and operations that a record leaves out."""
 
 import pickle
 import random

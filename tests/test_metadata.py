@@ -1,4 +1,4 @@
-"""What package indexes, citations and the conda recipe say of the package agrees with the package."""
+"""The metadata for package indexes, citations and the conda recipe agree with the package."""
 
 import re
 import tomllib
@@ -18,7 +18,7 @@ def load(name):
 
 
 def requirements(lines):
-    """Return requirements without the spaces that pip and conda put differently."""
+    """Return requirements without the spaces in which pip and conda differ."""
     return sorted(re.sub(r"\s", "", line) for line in lines)
 
 
@@ -39,7 +39,7 @@ def test_conda_asks_for_what_pip_asks_for():
 
 
 def test_classifiers_are_known_and_tested():
-    """Each Python is one that `make setup` takes, each system one that the workflow runs the tests on."""
+    """Each Python is one that `make setup` accepts, each system one that the workflow runs the tests on."""
     assert set(PROJECT["classifiers"]) <= classifiers
     setup = (ROOT / "tools" / "setup").read_text(encoding="utf-8")
     oldest, newest = (

@@ -29,7 +29,7 @@ def test_steps_as_the_environment_does(env_id):
         _, reward, terminated, _, _ = envs.step(action)
         assert (ended == terminated).all()
         np.testing.assert_allclose(rewards, reward, rtol=1e-12, atol=1e-12)
-        # A kick that does not happen is none; where one did, the state is another.
+        # Without a kick the states agree; after a kick they differ.
         idle = np.ones((model.task.draws, n)) * 0.999
         np.testing.assert_array_equal(model.kicked(states, idle), states)
         same = np.isclose(envs.unwrapped.state, states, rtol=1e-12, atol=1e-12).all(axis=1)

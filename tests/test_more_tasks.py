@@ -66,7 +66,7 @@ def test_rewards_are_as_written_and_never_below_0(env_id):
     env = make(env_id)
     env.reset(seed=1)
     for i, action in enumerate(actions(300, env.action_space)):
-        if i % 50 == 25:  # far from the start, too
+        if i % 50 == 25:  # also far from the start
             env.reset(options={"state": env.task.examples.start["state"]})
         before = env.state
         _, reward, terminated, _, _ = env.step(action)
@@ -77,7 +77,7 @@ def test_rewards_are_as_written_and_never_below_0(env_id):
             env.reset()
 
 
-# --- traps ---
+# --- unintended solutions ---
 
 
 def best(env_id):
@@ -100,7 +100,7 @@ def test_leaving_does_not_pay(env_id, side):
     ],
 )
 def test_spinning_does_not_pay(env_id, state, share):
-    """Even where something spins from the start, which has to be brought about."""
+    """Even if something spins from the start, which takes effort to reach."""
     options = {"duration": 2.0} | ({"damping": 0.0} if env_id == RotarySwingUp.id else {})
     env = make(env_id, **options)
     env.reset(seed=0, options={"state": state})
@@ -112,7 +112,7 @@ def test_spinning_does_not_pay(env_id, state, share):
 
 
 def test_easy_entries_are_no_gift():
-    """Random actions and none get next to nothing of what is possible."""
+    """Random actions and idling get next to nothing of the possible return."""
     for env_id in REWARDS:
         known = known_returns(env_id)
         assert known.random < 0.1 * known.best
@@ -183,7 +183,7 @@ def test_only_the_driven_joint_has_friction(kind, idle):
     assert getattr(scene, f"damping{idle}") == getattr(scene, f"dry_friction{idle}") == 0.0
     driven = {"": "_2", "_2": ""}[idle]
     assert getattr(scene, f"damping{driven}") == 0.001 and getattr(scene, f"dry_friction{driven}") > 0.1
-    # What the idle motor compensates is within what the project allows it.
+    # The idle motor's compensation is within the project's limits.
     assert 0.16 * math.pi / 2 + 0.001 * 100.0 < 0.5
 
 
@@ -251,7 +251,7 @@ def value(state):
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_no_policy_exceeds_the_value_of_the_start(name):
-    """The sum telescopes: V(start) - V(end) less what differs from the law, and V is nowhere below 0."""
+    """The sum telescopes: V(start) - V(end) minus deviations from the law, and V is nowhere below 0."""
     n = 16
     envs, agent = gym.make_vec(PendulumRegret.id, n, autoreset_mode="Disabled"), POLICIES[name]()
     task = envs.unwrapped.task

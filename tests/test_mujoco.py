@@ -77,7 +77,7 @@ class Engine:
             array[self.at[name]] = value
 
     def inverse(self, q, v, a):
-        """Return the generalised forces, drag excluded, that this motion needs."""
+        """Return the generalised forces, without drag, that this motion needs."""
         self.set(self.data.qpos, **q)
         self.set(self.data.qvel, **v)
         self.set(self.data.qacc, **a)
@@ -90,7 +90,7 @@ def random_states(n, sizes, seed=0):
 
 
 def test_bar():
-    """The pivot needs no torque, the support the force that `forces` says, whatever the state."""
+    """The pivot needs no torque, the support the force given by `forces`, whatever the state."""
     bar = PivotedBar(mass=0.3, com_distance=0.4, inertia=0.02, damping=0.01)
     engine = Engine(BAR, m=0.3, arm=0.4, i=0.02, b=0.01)
     for *state, u in random_states(200, [1, 2, 6, 10, 20]):

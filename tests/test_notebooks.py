@@ -1,4 +1,4 @@
-"""The notebooks run, from the first cell to the last, wherever the package is installed."""
+"""The notebooks run from the first cell to the last, wherever the package is installed."""
 
 import json
 import os
@@ -21,9 +21,9 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # of the libraries that run n
 
 
 def run(path, folder, **environment):
-    """Run a notebook in a folder where nothing of the clone lies; return it with its outputs."""
+    """Run a notebook in a folder without anything from the clone; return it with its outputs."""
     notebook = nbformat.read(path, as_version=4)
-    # Not all the environment: the variables of the test command are none of the notebook's business.
+    # Not the whole environment: the test command's variables do not concern the notebook.
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "MPL"))}
     client = nbclient.NotebookClient(notebook, timeout=1800, kernel_name="python3")
     client.execute(cwd=str(folder), env={**kept, **environment})
@@ -31,7 +31,7 @@ def run(path, folder, **environment):
 
 
 def texts(notebook):
-    """Return all that the cells have put out, as text."""
+    """Return all output of the cells, as text."""
     return json.dumps([cell.get("outputs", []) for cell in notebook.cells])
 
 
@@ -68,7 +68,7 @@ def test_notebooks_run(path, tmp_path):
 
 @pytest.fixture(scope="session")
 def wheel():
-    """The package as its wheel has it, unpacked beside what it needs."""
+    """The package from its wheel, unpacked beside its dependencies."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         subprocess.run([*command, "--no-deps", "--target", folder, ROOT], check=True)

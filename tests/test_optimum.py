@@ -1,4 +1,4 @@
-"""The dynamic programme against cases solved by hand, its cache, and the optima that are committed."""
+"""The dynamic programme against cases solved by hand, its cache, and the committed optima."""
 
 import dataclasses
 import gzip
@@ -46,7 +46,7 @@ def test_interpolation_is_exact_for_multilinear_functions():
         points = np.stack([rng.uniform(a[0], a[-1], 100) for a in axes], axis=1)
         values = (2.0 + grid.points()).prod(axis=1).reshape(grid.shape).astype(np.float32)
         np.testing.assert_allclose(grid.interpolate(values, points), (2.0 + points).prod(axis=1), rtol=1e-5)
-        # The nodes themselves, the last ones too; and outside the nearest edge.
+        # The nodes themselves, including the last ones; and outside the nearest edge.
         np.testing.assert_array_equal(grid.interpolate(values, grid.points()), values.ravel())
         corner = np.array([[axis[-1] + 1.0 for axis in axes]])
         assert grid.interpolate(values, corner) == values[(-1,) * d]
@@ -110,7 +110,7 @@ def test_linear_quadratic_value():
         problem = ValueIteration(Grid((axis, axis), (None, None)), np.linspace(-2, 2, 81), step, steps)
         values = problem.solve(quiet=True)
         found.append(problem.grid.interpolate(values[0], points))
-    # Between nodes a concave function lies above its interpolation, the less the finer the grid.
+    # Between nodes a concave function lies above its interpolation, by less the finer the grid is.
     errors = exact - np.array(found)
     assert (errors > 0.0).all() and (errors[1] < 0.012).all() and (errors[1] < 0.55 * errors[0]).all()
     best = problem.grid.interpolate(problem.greedy(values[1]).astype(np.float32), points)
@@ -141,7 +141,7 @@ def test_double_integrator_in_least_time():
 
 
 def test_expectation_over_kicks():
-    # Nothing moves but by kicks; each step pays x²: the expected return is that of a random walk.
+    # Only kicks move it; each step pays x²: the expected return is that of a random walk.
     axis = np.linspace(-3.0, 3.0, 61)
 
     def step(points, actions):
@@ -166,7 +166,7 @@ def test_extrapolation():
 
 @pytest.mark.parametrize("order", [0.9, 1.0, 1.3, 2.0, 2.5])
 def test_error_bar_holds_the_truth(order):
-    """It does so where the order is a little below 1, or above 2, too."""
+    """This also holds if the order is a little below 1, or above 2."""
     limit, error, _ = extrapolated([7.0 - h**order for h in (4.0, 2.0, 1.0)])
     assert abs(limit - 7.0) <= error
 
@@ -180,7 +180,7 @@ class Stop(Exception):
 
 @pytest.fixture
 def small():
-    """Return a function that makes a problem, which may stop by itself in the midst of it."""
+    """Return a function that makes a problem, which may stop in the middle of its solution."""
 
     def make(steps=20, pull=0.1, **parameters):
         def step(points, actions):
@@ -212,11 +212,11 @@ def test_resumed_is_the_same_as_uninterrupted(small, tmp_path, monkeypatch):
         small().solve(tmp_path, quiet=True)
     monkeypatch.undo()
     file = tmp_path / small().name / PROGRESS
-    assert json.loads(file.read_text())["done"] == 12  # of 20, the one in which it stopped is not noted
+    assert json.loads(file.read_text())["done"] == 12  # of 20; the unfinished one is not recorded
     again = small()
     np.testing.assert_array_equal(again.solve(tmp_path, quiet=True), whole)
     assert json.loads(file.read_text())["done"] == 0
-    # What is finished is read; what depends on another number is another cache.
+    # Finished work is read; a changed number makes another cache.
     monkeypatch.setattr("agents.value_iteration.transitions", None)
     np.testing.assert_array_equal(small().solve(tmp_path, quiet=True), whole)
     names = {p.name for p in (small(), small(steps=21), small(pull=0.2), small(target=0.1))}
@@ -342,7 +342,7 @@ def test_command_writes_numbers_and_a_figure(tmp_path, capsys, monkeypatch):
     assert abs(estimate["value"] - result["bound"]["value"]) < estimate["error"] < 0.2
     assert (tmp_path / f"value-{incline.Brake.id}.png").stat().st_size > 10_000
     assert "estimate -1." in capsys.readouterr().out
-    # What is damaged is named, with the remedy.
+    # Damaged files are named, with the remedy.
     for file in tmp_path.rglob(VALUES):
         file.write_bytes(b"")
     assert optimum.main(arguments) == 2
@@ -387,7 +387,7 @@ def test_bar_is_up_in_two_seconds():
     assert play(pivoted_bar.SwingUpFree.id, agent, fresh_seeds(100)).mean() > 419.5
 
 
-# --- what is committed ---
+# --- committed results ---
 
 
 def test_whatever_is_solved_has_its_optimum():
@@ -406,7 +406,7 @@ def test_committed_results_are_consistent(file):
     assert [grid["nodes"] for grid in result["grids"]] == [
         list(grid(problem, level, 0.0).shape) for level in problem.levels
     ]
-    # The caches' names hang together with nodes, step and reward as they are now: none is out of date.
+    # The caches' names depend on nodes, step and reward: none is out of date.
     assert result["parameters"] == pytest.approx(optimum.parameters(TASKS[source](**problem.options)))
     assert problem.actions == result["actions"] and list(problem.targets) == result["targets"]
     if result["lower"] is not None:
@@ -425,7 +425,7 @@ def test_committed_results_are_consistent(file):
 
 
 def summary(env_id):
-    """Return what the agents' results hold of an environment, by agent."""
+    """Return the agents' results for an environment, by agent."""
     return json.loads((ROOT / "agents" / "results" / "summary.json").read_text())["envs"][env_id]["agents"]
 
 
@@ -450,11 +450,11 @@ def test_known_answers_come_out():
     assert math.isclose(highest("PivotedBar-v0"), highest(pivoted_bar.SwingUpFree.id), rel_tol=2e-4)
 
 
-# --- what nobody exceeds: the braking task's optimum, and all estimates, against all that was played ---
+# --- upper bounds: the braking task's optimum, and all estimates, against all results ---
 
 
 def brute_force(task, x, v):
-    """Return the largest return of rolling freely and then braking fully, by trying moments of the switch."""
+    """Return the largest return of rolling freely and then braking fully, by trying switching times."""
     scene = task.scene
     mass = scene.mass + scene.inertia / scene.radius**2
     pull = scene.mass * scene.gravity * math.sin(scene.tilt) / mass
@@ -488,7 +488,7 @@ def brute_force(task, x, v):
 
 @pytest.mark.parametrize(
     "options",
-    # With the second, third and fifth the price of the speed decides, not the speed that is free.
+    # In the second, third and fifth case the price of the speed decides, not the free speed.
     [{}, {"mass": 2.0}, {"mass": 8.0, "tilt": 0.06}, {"damping": 0.5}, {"mass": 1.2, "damping": 0.1}],
 )
 def test_optimum_of_braking(options):
@@ -510,7 +510,7 @@ def test_nothing_beats_the_optimum_of_braking(options):
     rng = np.random.default_rng(0)
     names = ("switching line", "best constant", "full damping", "zero", "random")
     agents = [make_controller(incline.Brake.id, name, **options) for name in names]
-    # And the line, with every action off by a little, to either side.
+    # And along the line, with every action changed a little to either side.
     line = agents[0]
     for agent in (*agents, None):
         observation, _ = envs.reset(seed=3)
@@ -532,7 +532,7 @@ def test_nothing_beats_the_optimum_of_braking(options):
 
 
 def highest(env_id):
-    """Return what the optimum is at most: what is proved, or the upper end of the estimate."""
+    """Return an upper bound of the optimum: the proved one, or the upper end of the estimate."""
     result = numbers(env_id)
     estimate = result["estimate"]
     return result["bound"]["value"] if result["bound"]["exact"] else estimate["value"] + estimate["error"]
@@ -560,7 +560,7 @@ def starts_of(env_id, seed, episodes):
 
 @pytest.mark.parametrize("file", VERIFIED, ids=[file.name.partition(".")[0] for file in VERIFIED])
 def test_no_verified_result_is_above_what_is_published_of_the_optimum(file):
-    """Each has episodes of its own: the optimum is moved by the reference's luck in them."""
+    """Each has its own episodes: the optimum is shifted by the reference's luck in them."""
     result = json.loads(gzip.decompress(file.read_bytes()))
     env_id = result["env"]
     most = highest(env_id)

@@ -1,4 +1,4 @@
-"""The oracle is checked against closed forms, first principles and itself by other methods."""
+"""The oracle is checked against closed forms, first principles and, by other methods, itself."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def arguments(case):
 
 
 def series(drive, theta, rate, dt, digits=50):
-    """Return the driven pendulum's end by the oracle, as one computation gives it."""
+    """Return the driven pendulum's end by the oracle, from a single computation."""
     scene, control = driven(Coefficients(*drive))
     return oracle_of(scene).once([0.0, 0.0, theta, rate], control, dt, digits)[2:]
 
@@ -81,7 +81,7 @@ def test_full_period():
 
 @pytest.mark.parametrize("track", [1.5, None])
 def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
-    """The bar's own equation is recognised, undamped and only then, its support on the way or left out."""
+    """The bar's own equation is recognised, but only if undamped, with its moving support or without one."""
     bar, start = scenes.PivotedBar(track=track), [0.3, -0.2][: 2 if track else 0]
     state = [*start, 2.0, 3.0]
     exact = oracle_of(bar).flow(state, 4.0, 1.5)
@@ -93,7 +93,7 @@ def test_what_goes_far_is_by_the_closed_form(track, monkeypatch):
 
 @pytest.mark.parametrize("decay", [1e-9, 1, 30, 2e3])
 def test_linear_limit_is_exponential(decay):
-    """Without field theta' - v decays as exp(-gamma t), v the drift that the drive settles at."""
+    """Without field theta' - v decays as exp(-gamma t), where v is the terminal drift under the drive."""
     dt, delta, start = mpf(0.02), mpf(3), (mpf(1), mpf(-7))
     gamma = mpf(decay / 0.02)
     drift = delta / gamma
@@ -159,7 +159,7 @@ def test_heavy_damping_of_one_joint_of_two(dt, monkeypatch):
     monkeypatch.setattr(oracles, "STIFF", np.inf)
     if dt == 0.02:
         assert distance(end, oracle_of(Stiff()).once(*case, 50)) < 1e-38
-    else:  # the relative rate has died out, up to what the field keeps
+    else:  # the relative rate has died out, except for what the field maintains
         assert abs(end[1] - end[3]) < 1e-2
 
 
@@ -284,7 +284,7 @@ def shell_lagrangian(q, v, t):
 def test_euler_lagrange(scene, params, state, control, place, lagrangian, carried):
     """d/dt dL/dv = dL/dq + Q along the flow, with L from the velocities in space.
 
-    The drag Q acts on v, on the shell relative to psi'; v is the state's entry less R phi'.
+    The drag Q acts on v, on the shell relative to psi'; v is the state's entry minus R phi'.
     """
     drag = 0.75
     params = {"mass": 0.5, "damping": drag, "gravity": 9.5, **params}
@@ -333,7 +333,7 @@ def test_floats_are_taken_as_they_are():
 
 
 def test_functions_of_a_formula():
-    """Each of them, by energy: the start's speed is what the place has left of it."""
+    """Each of them, by energy: the place determines how much of the initial speed is left."""
 
     class Hill(Scene):
         kind: str = "tan"
@@ -354,7 +354,7 @@ def test_functions_of_a_formula():
 
 
 class Wall(Scene):
-    """A potential without end at 0, which pulls or pushes."""
+    """A singular potential at 0, which attracts or repels."""
 
     sign: float = parameter(1.0, "J")
     coordinates = {"x": "m"}
@@ -372,7 +372,7 @@ def test_a_motion_into_a_singular_point_is_unresolved():
 
 
 def test_a_motion_to_the_edge_of_one_is_resolved():
-    """It comes as near as 1e-25, and flies off with the energy that it came with."""
+    """It comes as near as 1e-25, and leaves with its initial energy."""
     x, v = oracle_of(Wall(sign=-1.0)).flow([1e-3, -10.0], [], 0.01)
     assert v > 0 and abs(v**2 / 2 - mp.log(x) - 50 + mp.log(mpf(1e-3))) < 1e-27
 

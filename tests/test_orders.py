@@ -1,4 +1,4 @@
-"""The order of the series: what it may be, that it is taken, and what `lag-envs order` says of it."""
+"""The order of the series: its allowed values, its effect, and the output of `lag-envs order`."""
 
 from pathlib import Path
 

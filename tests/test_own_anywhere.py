@@ -1,4 +1,4 @@
-"""The example of the tutorial in the hands of other libraries: videos, workers, learners, clusters."""
+"""The tutorial's example in other libraries: videos, workers, learners, clusters."""
 
 import os
 import threading
@@ -20,7 +20,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 2, 1)).astype(np.floa
 @pytest.fixture(autouse=True)
 def example(monkeypatch, unregistered):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    for folder in (Path(__file__).parent, EXAMPLES):  # for processes that are started
+    for folder in (Path(__file__).parent, EXAMPLES):  # for child processes
         monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
 
 
@@ -86,7 +86,7 @@ def test_threads_give_the_same_bits():
     def roll(name):
         found[name] = rolled(gym.make_vec(ID, num_envs=2))
 
-    gym.make(ID).close()  # registering is Gymnasium's, which knows no threads
+    gym.make(ID).close()  # registers it: Gymnasium's registration is not thread-safe
     threads = [threading.Thread(target=roll, args=(i,)) for i in range(4)]
     for thread in threads:
         thread.start()

@@ -1,4 +1,4 @@
-"""A file of one's own in `report`, `info`, `bench` and `play`: what is found, what is said of mistakes."""
+"""A user's file in `report`, `info`, `bench` and `play`: the classes found, the messages about mistakes."""
 
 import dataclasses
 import os
@@ -20,7 +20,7 @@ from lag_envs.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 BALL = str(ROOT / "examples" / "ball_on_beam.py")
-#: Two controls, a choice among three, and nothing that acts.
+#: A task with two controls, one with a choice among three, and one without controls.
 SEVERAL = str(ROOT / "tests" / "own_tasks.py")
 pytestmark = pytest.mark.usefixtures("unregistered")
 
@@ -59,7 +59,7 @@ class Pump(Task):
 
 @pytest.fixture
 def write(tmp_path):
-    """Write a file, and forget what it defined."""
+    """Write a file, and forget its definitions."""
 
     def write(text, name="mine.py"):
         path = tmp_path / name
@@ -76,14 +76,14 @@ def write(tmp_path):
 
 
 def told(capsys, *arguments):
-    """Run the command, which fails; return what it says."""
+    """Run the command, which fails; return its message."""
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error and error.startswith("lag-envs: error: ")
     return error
 
 
-# --- what is found ---
+# --- found classes ---
 
 
 def test_info_prints_the_facts(capsys):

@@ -1,4 +1,4 @@
-"""Scenes and tasks outside the package: written by name, as good as those inside."""
+"""Scenes and tasks outside the package: written by name, with everything that the package's own have."""
 
 import copy
 import pickle
@@ -143,7 +143,7 @@ def test_bad_actions(action):
     np.testing.assert_array_equal(env.state, before)
 
 
-# Without rope the mass matrix is singular: from the start, or after substeps that were taken.
+# Without rope the mass matrix is singular: at the start, or after some substeps.
 @pytest.mark.parametrize("wild", [[0, 0, 0, 0, 0.3, 1], [0, 0, 0.2, -10, 0, 0]])
 def test_refused_step_keeps_the_state(wild):
     env = gym.make("OwnCrane-v0").unwrapped
@@ -234,7 +234,7 @@ def test_mistakes_in_a_task(changes, message):
 
 
 def test_order_of_a_task():
-    """It is the environment's and its scene's, also as a copy; every step is certified with it."""
+    """It belongs to the environment and its scene, also in a copy; every step is certified with it."""
     task = type("Calm", (own_tasks.Switched,), {"order": 10, "id": "OwnCalm-v0"})
     lag_envs.register(task)
     env = gym.make("OwnCalm-v0").unwrapped

@@ -1,4 +1,4 @@
-"""Physics: what is computed is derived again, from places by Newton, and checked against closed forms."""
+"""Physics: results are derived again, from places by Newton's laws, and checked against closed forms."""
 
 import dataclasses
 import math
@@ -64,9 +64,9 @@ def coordinates(scene):
 
 
 def newton(scene):
-    """Return reaction forces from the accelerations of centre of mass and spin, and what must vanish.
+    """Return reaction forces from the accelerations of centre of mass and spin, and the residuals.
 
-    Written for any motion of both coordinates; the drag c acts between the axis and what it rolls on.
+    Written for any motion of both coordinates; the drag c acts between the axis and the surface it rolls on.
     """
     q, v = coordinates(scene)
     p = symbolic(scene)
@@ -165,7 +165,7 @@ def example(scene):
 
 @variants([FRAME])
 def test_energy_balance(scene):
-    """A step's change of energy is work less loss, to rounding."""
+    """A step's change of energy is work minus loss, to rounding."""
     scene, state, u = example(scene)
     for dt in (0.01, 0.05):
         balance = scene.energy_balance(state, u, dt)
@@ -232,7 +232,7 @@ def test_frame_energy_of_the_bar():
 
 @pytest.mark.parametrize("tilt", [math.pi / 2, -math.pi / 2])
 def test_a_vertical_plane(tilt):
-    """The cylinder rolls down a wall as on any slope, but nothing presses it to it: no friction is enough."""
+    """The cylinder rolls down a wall as on any slope, but nothing presses it on: no friction is enough."""
     side = math.copysign(1.0, tilt)
     for damping in (0.0, 0.3):
         plane = Incline(tilt=tilt, damping=damping)
@@ -255,7 +255,7 @@ def test_a_vertical_plane(tilt):
 @pytest.mark.parametrize("share", [0.0, 1e-13, 9.9e-13, 1.01e-12, 1e-9, 1.0])
 @pytest.mark.parametrize("mass", [1e-3, 1.0, 1e3])
 def test_what_counts_as_no_load(share, mass):
-    """A normal force up to 1e-12 of the weight is none, on the plane and in the shell."""
+    """A normal force up to 1e-12 of the weight counts as none, on the plane and in the shell."""
     angle = math.acos(share)
     plane, shell = Incline(mass=mass, control="tilt"), CylinderInCylinder(mass=mass, control="damping")
     for forces in (plane.forces([0.0, 0.0], angle), shell.forces([angle, 0.0])):

@@ -130,7 +130,7 @@ EVERY = [(env, {key: value for key, value in policy.items() if value is not None
 
 @pytest.mark.parametrize(("env", "policy"), EVERY)
 def test_each_row_for_itself_to_the_bit(env, policy):
-    """Together as alone; what an episode's first action is does not depend on what was before."""
+    """Together as alone; an episode's first action does not depend on earlier episodes."""
     acting, observations = agent(env, policy), seen(env, 4)
     space, memory, together = gym.make(env).action_space, None, []
     for i, rows in enumerate(observations):
@@ -353,7 +353,7 @@ def test_arrays_with_something_wrong(tmp_path, policy, changed, reason):
     ],
 )
 def test_what_overflows_is_refused(env, policy, tmp_path):
-    """Numbers so large that their products are none: the verification says so, and does not fail."""
+    """Numbers so large that their products overflow: the verification says so, and does not fail."""
     arrays = {}
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -381,7 +381,7 @@ def test_what_is_new_needs_the_new_schema(env, policy, tmp_path):
 
 
 def test_what_is_old_stays_what_it_is(tmp_path):
-    """All that is on the board is of schema 1, has its digest still, and is written as it was."""
+    """Everything on the board is of schema 1, still has its digest, and is written as it was."""
     entries = BOARD.read().entries.values()
     assert len(entries) > 40
     for entry in entries:
@@ -396,7 +396,7 @@ def test_what_is_old_stays_what_it_is(tmp_path):
 
 @pytest.mark.parametrize("kind", ["mlp", "table", "controller"])
 def test_old_policies_get_what_they_got(kind):
-    """The first episodes of one of each architecture, to the bit, where the build is the same."""
+    """The first episodes of one of each architecture, to the bit, if the build is the same."""
     verified = (entry for entry in BOARD.read().entries.values() if entry.state == "verified")
     loaded = ((entry, load(BOARD.submission(entry.id))) for entry in verified)
     entry, found = next((e, s) for e, s in loaded if type(s.architecture) is ARCHITECTURES[kind])

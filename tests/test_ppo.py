@@ -1,4 +1,4 @@
-"""PPO in one file: it learns, repeats and resumes bit for bit, and takes every kind of action."""
+"""PPO in one file: it learns, repeats and resumes bit for bit, and supports every kind of action."""
 
 import json
 import re
@@ -64,7 +64,7 @@ class Centre(Task):
 
 
 class Jerky(Centre):
-    """The same by a few pushes to choose from, not equally many to both sides."""
+    """The same with a few pushes to choose from, more of them to one side."""
 
     id = "OwnJerky-v0"
     action = {"along": [-1.0, 0.0, 1.0], "across": [-1.0, 1.0]}
@@ -100,7 +100,7 @@ def make_run(folder, env_id=ENV, seed=3, steps=768, **more):
 
 
 def learnt(run):
-    """Return all that a finished run has decided, without times."""
+    """Return all results of a finished run, without times."""
     result = json.loads(run.path(RESULT).read_text())
     with np.load(run.path(MODEL)) as found:
         weights = {name: found[name].tobytes() for name in found}
@@ -114,7 +114,7 @@ def learnt(run):
 
 @contextmanager
 def here(*_):
-    """Work in this process in place of others."""
+    """Work in this process instead of others."""
 
     def submit(function, *arguments):
         future = Future()
@@ -164,7 +164,7 @@ def test_the_policy_that_was_written_is_the_one_that_was_evaluated(tmp_path):
     ],
 )
 def test_it_learns_with_any_actions(env_id, space, own, tmp_path):
-    """A second of training does more than half of what there is between idling and the best."""
+    """A second of training achieves more than half of the distance from idling to the best."""
     assert gym.make_vec(env_id, 2).single_action_space == space
     settings = {"n_envs": 16, "n_steps": 32, "batch_size": 128, "n_epochs": 5, "episode_share": 1.0}
     run = make_run(tmp_path, env_id, steps=6_000, **settings)
@@ -178,7 +178,7 @@ def test_it_learns_with_any_actions(env_id, space, own, tmp_path):
 
 @pytest.mark.slow
 def test_it_swings_the_bar_up(tmp_path, monkeypatch):
-    """Seeds that nothing was tuned on; some stay where the bar passes the top slowly again and again."""
+    """Seeds not used for tuning; some get stuck where the bar passes the top slowly again and again."""
     monkeypatch.setattr(learners, "EPISODES", 100)
     env_id = pivoted_bar.SwingUp.id
     scores = []
@@ -249,13 +249,13 @@ def test_noise_has_the_probability_that_is_told(by_state):
     log_prob, entropy = (
         x.detach().double() for x in head.log_prob(*map(torch.from_numpy, (hidden, means, actions)))
     )
-    # But for a constant the entropy is the mean of -log p, and both are those of a normal distribution.
+    # Up to a constant, the entropy is the mean of -log p, and both are those of a normal distribution.
     spread, mean = float(actions.std()), float(means[0, 0])
     normal = torch.distributions.Normal(mean, spread).log_prob(torch.from_numpy(actions[:, 0]))
     constant = 0.5 * np.log(2.0 * np.pi)
     assert abs(entropy[0].item() - np.log(spread)) < 0.02
     np.testing.assert_allclose(log_prob - constant, normal, atol=0.1)
-    # Held for three steps, then drawn anew.
+    # Held for three steps, then drawn again.
     held = [head.sample(rng, t, hidden[:5], means[:5]) for t in range(6)]
     assert all(np.array_equal(held[t], held[0]) for t in (1, 2)) and not np.array_equal(held[3], held[2])
 
@@ -280,7 +280,7 @@ def test_the_network_that_acts_is_the_one_that_learns():
     np.testing.assert_allclose(learner.policy.outputs(seen)[1], by_torch, atol=1e-5)
 
 
-# --- the command, and what comes after it ---
+# --- the command, and its results ---
 
 
 def test_command_trains_tells_two_clocks_and_keeps_what_is_finished(tmp_path, capsys):
@@ -384,7 +384,7 @@ def test_settings_are_tried_and_kept(tmp_path, monkeypatch, capsys):
     assert tune.main(given) == 0
     first = json.loads(file.read_text())["settings"]
     assert [s["number"] for s in first] == [0, 1] and first[0]["changed"] == {} != first[1]["changed"]
-    # More of them, or of seeds: what was tried is kept.
+    # More of them, or of seeds: earlier results are kept.
     given[2], given[4] = "3", "2"
     assert tune.main(given) == 0
     output = capsys.readouterr().out
@@ -437,7 +437,7 @@ def test_race_tells_when_levels_are_reached(names, tmp_path, monkeypatch, capsys
 
 
 @pytest.mark.slow
-# Other tests load JAX, which warns of any fork in this process; Ray's forks only start programs.
+# Other tests load JAX, which warns about any fork in this process; Ray's forks only start programs.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_seeds_over_a_ray_cluster_are_the_same(tmp_path):
     given = [ENV, "--algo", ppo.NAME, "--steps", "12288", "--seeds", "2", "--output"]

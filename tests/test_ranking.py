@@ -34,7 +34,7 @@ def returns(scores):
 
 
 def table(scores):
-    """Return scores, given for each policy and episode, as of a row."""
+    """Return a row's scores, from those of each policy and episode."""
     return Scores(np.atleast_2d(np.asarray(scores, np.float64)))
 
 
@@ -59,7 +59,7 @@ def test_intervals_of_two_policies():
     assert ends(iqm(drawn)) == pytest.approx((0.2, 0.4))
     share = np.mean(np.isclose(iqm(drawn), 0.3))
     assert share == pytest.approx(0.5, abs=0.05)
-    # Against one that lies in between, all of 0, 1/2 and 1 may come out.
+    # Against one that lies in between, all of 0, 1/2 and 1 can occur.
     same = table(policies(0.3, 0.3))
     chance = compare(table(policies(0.2, 0.4)), same, drawn, redrawn("other", same))
     assert chance == (0.5, 0.0, 1.0) and chance.undecided
@@ -161,7 +161,7 @@ def test_columns_of_a_row():
     assert row["robustness"] == {"mass +20 %": pytest.approx(iqm(np.arange(5.0) + moved))}
     assert row["often"] == pytest.approx(iqm(0.5 + moved))
     assert len(row["profile"]) == len(THRESHOLDS)
-    # What is not measured is None, as for an agent that cannot act more often.
+    # Unmeasured columns are None, as for an agent that cannot act more often.
     bare = {"policies": [{"returns": returns(row)} for row in scores], "often": [None] * 5}
     row = columns(ENV, bare, 10, KNOWN, table(scores))
     assert [row[key] for key in ("success", "settle", "effort", "often")] == [None] * 4
@@ -179,13 +179,13 @@ def test_luck_is_taken_out():
     def policies(returns):
         return [{"returns": r, "reference": MEAN.mean + x} for r, x in zip(returns, luck, strict=True)]
 
-    # One that is half as lucky as the reference, and one that has nothing to do with it.
+    # One that is half as lucky as the reference, and one that is uncorrelated with it.
     half = policies(400.0 + 0.5 * luck)
     np.testing.assert_allclose(corrected(MEAN, half), 400.0, rtol=1e-12)
     assert slope(half) == pytest.approx(0.5) and policy_error(MEAN, half) == pytest.approx(0.5 * MEAN.error)
     other = np.random.default_rng(1).normal(30.0, 1.0, luck.shape)
     np.testing.assert_allclose(corrected(MEAN, policies(other)).mean(axis=1), other.mean(axis=1), atol=0.1)
-    # Where there is no reference, or none was recorded, or it is always the same, returns stay.
+    # Without a reference, without its recording, or if it is constant, returns stay.
     assert corrected(MEAN, [{"returns": [1.0, 2.0]}]).tolist() == [[1.0, 2.0]]
     assert corrected(MEAN, [{"returns": [1.0, 2.0], "reference": None}]).tolist() == [[1.0, 2.0]]
     assert corrected(None, policies(other)).tolist() == other.tolist()
@@ -198,7 +198,7 @@ class Range:
 
 
 def test_the_reference_has_its_own_mean_and_the_error_of_that():
-    """It corrects itself: of its own episodes nothing is left, so its interval is that of the others."""
+    """It corrects itself: its own episodes cancel out, so its interval is that of the others."""
     own = np.random.default_rng(0).normal(440.0, 100.0, 1000)
     scores = scored(Range, MEAN, [{"returns": own, "reference": own}])
     assert scores.own and scores.table.mean() == pytest.approx(MEAN.mean / 452.7)
@@ -212,7 +212,7 @@ def test_the_reference_has_its_own_mean_and_the_error_of_that():
 @pytest.mark.parametrize("policies", [1, 5])
 @pytest.mark.parametrize("part", [0.0, 0.5, 1.0, 2.0])
 def test_every_interval_holds_the_error_of_the_references_mean(part, policies):
-    """As far as a row was corrected by it, whoever it is."""
+    """To the extent that a row was corrected by it, whatever the row."""
     rng = np.random.default_rng(2)
     luck = rng.normal(0.0, 50.0, (policies, 1000))
     noise = rng.normal(0.0, 3.0, (policies, 1000))
@@ -228,7 +228,7 @@ def test_every_interval_holds_the_error_of_the_references_mean(part, policies):
 
 
 def test_the_references_error_moves_all_rows_together():
-    """Two that were corrected alike are not further apart for it; against one that was not, it counts."""
+    """It does not separate two rows with equal corrections; it counts against a row without any."""
     luck = np.random.default_rng(3).normal(0.0, 50.0, 1000)
     far = MEAN._replace(error=5.0)
 
@@ -284,7 +284,7 @@ def test_means_of_references_are_theirs(env_id):
     name, mean, error, episodes = reference(env_id)
     few = play(env_id, make_controller(env_id, name), range(10**10, 10**10 + 500))
     assert abs(few.mean() - mean) <= 5.0 * few.std() / len(few) ** 0.5
-    # A variance has an error of its own, which is large where a few episodes are far off.
+    # A variance has its own error, which is large if a few episodes are far off.
     squares = (few - few.mean()) ** 2
     assert error**2 * episodes == pytest.approx(squares.mean(), abs=5.0 * squares.std() / len(few) ** 0.5)
 
@@ -321,4 +321,4 @@ def test_a_full_board_is_ranked_in_seconds():
     rows = {f"row{i}": rng.normal(i / 60, 0.3, (5 if i % 3 else 1, 1000)) for i in range(60)}
     started = time.perf_counter()
     assert len(board(**rows)) == 60
-    assert time.perf_counter() - started < 20.0  # a second or two, on a machine that has nothing else to do
+    assert time.perf_counter() - started < 20.0  # a second or two on an idle machine

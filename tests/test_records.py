@@ -1,4 +1,4 @@
-"""One record per environment: its id stands in one file, and nothing is told of it anywhere else."""
+"""One record per environment: its id stands in one file, and no other file knows it."""
 
 import re
 import subprocess
@@ -17,17 +17,17 @@ from lag_envs.tasks.measured import measured
 from tools.missing import COMMANDS, have, missing
 
 ROOT = Path(__file__).parents[1]
-#: The example of help texts, and of tests of what has nothing to do with an environment.
+#: The example in help texts, and in tests that are independent of the environment.
 EXAMPLE = "PivotedBar-v0"
 BY_HAND = (".py", ".toml", ".yml", ".yaml", ".js", ".html", ".cpp", "Makefile")
-#: What commands write, and submissions.
+#: Files that commands write, and submissions.
 GENERATED = ("leaderboard/submissions/", "leaderboard/results/", "agents/results/", "docs/", "tests/golden/")
 
 each_task = pytest.mark.parametrize("env_id", TASKS)
 
 
 def files():
-    """Return the files that somebody wrote."""
+    """Return the hand-written files."""
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     found = subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\n")
     return [
@@ -48,7 +48,7 @@ def test_an_id_stands_in_two_files_at_most():
 
 
 def test_no_id_is_put_together():
-    """No string is what comes before the version; only a class without an id gets one made of its name."""
+    """No string is an id's part before the version; only a class without an id gets one made of its name."""
     stems = "|".join({re.sub(r"-v\d+$", "", env_id) for env_id in TASKS} - set(scenes.__all__))
     made = {"src/lag_envs/own_files.py", "src/lag_envs/tasks/registration.py", "tests/test_own_files.py"}
     made.add("tools/libraries/minari_replay.py")  # a data set
@@ -59,7 +59,7 @@ def test_no_id_is_put_together():
 
 
 def test_tasks_are_found():
-    """Reading the files finds what importing them would: every task with an id, in its module."""
+    """Reading the files finds the same as importing them: every task with an id, in its module."""
     places = find(Path(ROOT, "src/lag_envs/tasks"), "lag_envs.tasks.")
     assert places == TASKS.data
     assert next(iter(TASKS)) == EXAMPLE
@@ -89,7 +89,7 @@ def test_records_are_whole(env_id):
     for name, found in known.items():
         try:
             assert build(task(), name) is not None
-        except ValueError as error:  # until its plan has been found
+        except ValueError as error:  # until its plan has been computed
             assert "plan" in missing(env_id) and "there is no plan" in str(error)
         assert all(low < high for low, high in found.tune.values())
 
@@ -110,7 +110,7 @@ def test_there_is_a_task_that_nobody_has_solved():
 @pytest.mark.slow
 @each_task
 def test_nothing_lacks(env_id):
-    """The quick tests take what has been generated so far; before an issue is closed all of it is there."""
+    """The quick tests use what has been generated so far; before an issue is closed all of it is there."""
     assert missing(env_id) == {}
 
 

@@ -73,7 +73,7 @@ def moment(task, share=0.5, **changes):
 
 
 def blue(frame):
-    """Return height and width of what has the colours of a body."""
+    """Return height and width of the area with the colours of a body."""
     rows, columns = np.nonzero(np.any([np.all(frame == colour, axis=-1) for colour in BLUE], axis=0))
     return np.ptp(rows) + 1, np.ptp(columns) + 1
 
@@ -116,7 +116,7 @@ def test_cylinders_are_drawn_to_scale():
 
 
 def test_bar_is_drawn_to_scale():
-    # 1.08 reaches to either side, a reach is the bar's 0.6 m; half a thickness sticks out above the pivot.
+    # 1.08 reaches to either side, a reach is the bar's 0.6 m; half a thickness extends above the pivot.
     height, width = blue(picture(pivoted_bar.SwingUpFree.id, [0.0, 0.0], 0.0))
     assert height == pytest.approx(0.6 * 1.035 * 384 / (2 * 1.08 * 0.6), abs=4)
     assert width == pytest.approx(0.07 * 384 / (2 * 1.08), abs=4)
@@ -472,7 +472,7 @@ def test_numbers_keep_their_width():
 
 @pytest.mark.parametrize("env_id", SINGLE)
 def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
-    """Gymnasium's play, as it is called without arguments: keys are pressed, then the window is closed."""
+    """Gymnasium's play, called without arguments: keys are pressed, then the window is closed."""
     from gymnasium.utils.play import play
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -494,7 +494,7 @@ def test_play_takes_every_combination_of_the_keys(env_id, monkeypatch):
     assert env.unwrapped.control == 0.0
 
 
-# --- what is shown on request ---
+# --- optional displays ---
 
 
 def shown(env_id, steps=5, **look):
@@ -605,7 +605,7 @@ def test_a_trail_is_of_the_seconds_that_are_asked_for_and_of_one_episode():
     env.reset(seed=1)
     env.render()
     assert len(env._viewer._trail) == 1
-    for _ in range(2):  # also where pictures are taken late
+    for _ in range(2):  # also if pictures are taken late
         env.reset()
         for _ in range(30):
             env.step(np.ones(1, np.float32))
@@ -691,7 +691,7 @@ def test_vector_environment_renders_a_grid(tiles, shape):
 
 
 def test_a_polygon_covers_its_area():
-    """The sum over the pixels is the area, exactly but for the rounding to bytes."""
+    """The sum over the pixels is the area, exactly except for the rounding to bytes."""
     rng, room = np.random.default_rng(1), np.zeros((60, 92))
     for _ in range(200):
         angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, 9))
@@ -725,7 +725,7 @@ def test_png_can_be_read(tmp_path):
     assert np.array_equal(read, frame)
 
 
-# --- beside the page ---
+# --- compared with the page ---
 
 
 def test_colours_and_widths_are_those_of_the_page():
@@ -765,10 +765,10 @@ def test_pictures_are_quick(env_id):
 
 
 def test_windows_keep_real_time(window, monkeypatch):
-    """Also where an interval is no whole number of milliseconds, or shorter than a screen's."""
+    """Also if an interval is no whole number of milliseconds, or shorter than a screen's."""
 
     class Clock:
-        """One that other programs do not disturb: a look at it takes 0.2 ms."""
+        """A clock that other programs do not disturb: reading it takes 0.2 ms."""
 
         now, pictures = 0.0, 0
 
@@ -789,7 +789,7 @@ def test_windows_keep_real_time(window, monkeypatch):
             env.step(np.zeros(1, np.float32))
         assert clock.now - start == pytest.approx(steps * dt, abs=0.017)
         assert clock.pictures - shown == pytest.approx(pictures, abs=1)
-        clock.now += 5.0  # whoever steps was busy: what is lost is not caught up with
+        clock.now += 5.0  # the caller was busy: lost time is not caught up with
         start = clock.now
         for _ in range(steps):
             env.step(np.zeros(1, np.float32))
@@ -853,7 +853,7 @@ PAINT = """([picture, poses, margin]) => {
 @pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
 @pytest.mark.parametrize("env_id", covering())
 def test_pictures_are_those_of_the_page(env_id, page):
-    """Both painters, given the same shapes and poses; what differs are roundings where edges are."""
+    """Both painters, given the same shapes and poses; only roundings at edges differ."""
     from lag_envs.leaderboard.site import scenery
 
     task = TASKS[env_id]

@@ -1,4 +1,4 @@
-"""Drives as links: what is true, what is false, and what is no link."""
+"""Drives as links: true ones, false ones, and invalid links."""
 
 import struct
 import zlib

@@ -193,7 +193,7 @@ def test_missing_package(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", SECTIONS)
 def test_sections_stand_without_rows(name):
-    """A report that was broken off early still makes a page, and claims nothing."""
+    """A report that was interrupted early still makes a page, and claims nothing."""
     content = module(name).content([], [])
     assert content.title and content.text
     assert [claim.text for claim in content.claims if claim.holds is not None] == []
@@ -257,7 +257,7 @@ def test_broken_off_report_is_not_taken_over(written, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_quick_report(tmp_path):
-    """Every claim holds in a quick report, but that nobody is faster."""
+    """Every claim holds in a quick report, except that nobody is faster."""
     command = [sys.executable, "-m", "lag_envs.cli", "report", "--quick", str(tmp_path / "quick")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

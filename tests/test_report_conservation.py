@@ -1,4 +1,4 @@
-"""What is conserved, what is left out: small regenerations of both sections and of their claims."""
+"""Conservation and omitted terms: small regenerations of both sections and of their claims."""
 
 import math
 
@@ -15,7 +15,7 @@ def claims(content):
     return {claim.text: claim.holds for claim in content.claims}
 
 
-#: Those whose scene has a flow of its own.
+#: Those whose scene has a dedicated flow.
 FORMS = [id for id in TASKS if TASKS[id]().scene._form is not None]
 
 
@@ -44,7 +44,7 @@ def test_claims_hold(runs):
 
 
 def test_energy_of_ours_and_of_others(runs):
-    """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as theory has it."""
+    """Ours is at rounding; Verlet's drift is bounded and RK4's grows, as in theory."""
     drift = {(r["name"], r["method"]): r for r in runs if r["kind"] == "drift"}
     for name in conservation.FREE:
         limit = 1e-12 if name == "incline" else 1e-13
@@ -105,7 +105,7 @@ def test_what_is_left_out_saves_operations():
     "name", [name for name, problem in conservation.FREE.items() if problem.scene._form.angle is not None]
 )
 def test_cosine_and_sine_stay_a_pair(name):
-    """c² + s² does not grow; θ leaves the pair's angle by no more than its own roundings add up to."""
+    """c² + s² does not grow; θ differs from the pair's angle only by its own accumulated roundings."""
     at = conservation.marks(100_000)
     theta, _, c, s = conservation.run(conservation.FREE[name], conservation.OURS, at).T
     assert np.abs(c * c + s * s - 1.0).max() < 1e-15
@@ -114,13 +114,13 @@ def test_cosine_and_sine_stay_a_pair(name):
     assert (apart <= 4.0 * conservation.EPS * at * np.maximum(1.0, np.abs(theta))).all()
 
 
-#: Constants that act at random or at a limit only are moved by more, so that few steps show it.
+#: Constants that act only at random or at a limit are changed by more, so that few steps show it.
 MOVED = {"chance0": 1.0, "limit": 0.5, "x": 0.01, "self_radius": 0.5, "self_shell_radius": 0.5}
 
 
 @pytest.mark.parametrize("id", covering(i for i in FORMS if i in PERFECT))
 def test_every_constant_changes_something(id):
-    """Move each constant, 1e-3 where not said otherwise: a compiled start or step comes out differently."""
+    """Change each constant, by 1e-3 unless stated otherwise: the results of a start or step differ."""
     env = gym.make(id).unwrapped
     env.reset(seed=1)
     program, rows, angle = env._program, env._rows.copy(), env.task.scene._form.angle
@@ -151,5 +151,5 @@ def test_every_constant_changes_something(id):
 
     for j, name in enumerate(program.uniform):
         pairs = zip(outcomes(j, 1.0), outcomes(j, 1.0 + MOVED.get(name, 1e-3)), strict=True)
-        # Not a number would differ from itself.
+        # NaN would differ from itself.
         assert any(not np.array_equal(a, b, equal_nan=True) for a, b in pairs), f"{name} changes nothing"

@@ -120,7 +120,7 @@ def test_exact_states_are_those_of_equations_that_are_typed_in():
 
 
 def same(path, start, given):
-    """Hold a path's end against the driven pendulum's, with coefficients and length of each step."""
+    """Compare a path's end with the driven pendulum's, with coefficients and length of each step."""
     y = [mpf(x) for x in start]
     for coefficients, dt in given:
         numbers = {"alpha": 0, "beta": 0, "gamma": 0, "delta": 0} | coefficients
@@ -131,9 +131,9 @@ def same(path, start, given):
 
 @pytest.mark.parametrize("id", covering(PERFECT, engine))
 def test_one_second_of_every_environment(id):
-    """Exact flows to rounding; series leave out what their certificate allows, in each step.
+    """Exact flows to rounding; series to the truncation error that their certificate allows, in each step.
 
-    Exact steps take long: of environments that act 500 times a second, less than a second has to do.
+    Exact steps take long: for environments that act 500 times a second, less than a second has to do.
     """
     (row,) = environments.ours(id, seed=0, duration=min(1.0, 150 * TASKS[id].interval))
     assert row["seconds"] > 0.2
@@ -150,7 +150,7 @@ def test_one_second_of_every_environment(id):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("id", [i for i in PERFECT if TASKS[i]().scene._form])
 def test_every_step_of_whole_episodes(id, seed):
-    """What README says of random actions; beside it stubborn ones, that spin a bar round and round."""
+    """README's statement on random actions; beside it long pushes that spin a bar round and round."""
     (row,) = environments.ours(id, seed)
     assert row["error"]["one step"] < environment_results.LARGEST_STEP
     assert stubborn(id, seed)["error"]["one step"] < 1e-14
@@ -159,7 +159,7 @@ def test_every_step_of_whole_episodes(id, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("id", [i for i in PERFECT if not TASKS[i]().scene._form])
 def test_every_step_of_a_series(id):
-    """The same, of an episode's beginning: exact steps of these scenes take long."""
+    """The same for an episode's beginning: exact steps of these scenes take long."""
     duration = 100 * TASKS[id].interval
     (row,) = environments.ours(id, 1, duration)
     assert row["error"]["one step"] < 1e-12
@@ -167,7 +167,7 @@ def test_every_step_of_a_series(id):
 
 
 def stubborn(id, seed, **options):
-    """Return the row of an episode with actions that are held for long."""
+    """Return the row of an episode with actions that are held for a long time."""
     env = gym.make(id, disable_env_checker=True, **options)
     env.reset(seed=seed)
     episode = play(env, iter(actions(10_000, env.action_space, seed=seed + 9)))
@@ -187,7 +187,7 @@ def test_one_step_is_the_worst_of_all_steps():
     wrong = environments.against_exact(task, episode._replace(states=states), 0)
     theta, theta_dot = wrong["entries"]
     assert theta_dot["one step"] == pytest.approx(1e-10, rel=0.2)
-    assert theta["one step"] < 3e-12  # what the next steps make of the other speed
+    assert theta["one step"] < 3e-12  # the effect of the changed speed on the next steps
     assert wrong["error"]["one step"] == pytest.approx(1e-10 / theta_dot["size"], rel=0.2)
 
 
@@ -239,7 +239,7 @@ def test_report_without_rows():
 
 
 def test_episodes_with_cut_speeds_are_passed_over(rows):
-    """Pendulum-v1 cuts its speed at 8 rad/s with seed 1, so another one is taken."""
+    """Pendulum-v1 clips its speed at 8 rad/s with seed 1, so another seed is taken."""
     row = next(row for row in rows if row["case"] == "Pendulum-v1")
     assert row["seed"] in (1, 1001)
     _, episode, seed = gymnasium_peers.random_episode("Pendulum-v1", 1, 200, True)
@@ -262,11 +262,11 @@ def test_a_worse_stepper_breaks_the_claims(rows):
     worse = episode._replace(states=scene.simulate(episode.states[0], episode.controls, env.task.dt))
     row = environments.against_exact(env.task, worse, seed=0)
     claims = environments.content([*rows, row | {"case": pivoted_bar.SwingUpFree.id, "seed": 0}], []).claims
-    assert [claim.holds for claim in claims[:4]] == [False, True, False, True]  # the series' are another's
+    assert [claim.holds for claim in claims[:4]] == [False, True, False, True]  # the series' are unaffected
 
 
 def test_what_a_certificate_allows_is_told_apart_from_rounding(rows):
-    """A step of the general series may leave out more than a rounding, that of an exact flow may not."""
+    """A general-series step's truncation error may exceed a rounding, that of an exact flow may not."""
     (row,) = (row for row in rows if row["case"] == cart_pole.CartPoleExact.id)
     assert environment_results.LARGEST_STEP < row["error"]["one step"] < TOLERANCE
     held = environments.content([row], []).claims[:4]

@@ -1,4 +1,4 @@
-"""The report on scenes of energies: exact ends, the same models for all, whose setting is the quickest."""
+"""The report on scenes of energies: exact ends, equal models for all, and whose setting is the quickest."""
 
 import importlib.util
 from functools import cache
@@ -21,7 +21,7 @@ COUNT = 3
 
 
 class Trolley(Scene):
-    """A pendulum on a trolley whose rate, or place, is held, with what a rival cannot leave out."""
+    """A pendulum on a trolley whose rate, or place, is held, with terms that a rival cannot leave out."""
 
     length: float = parameter(0.7, "m", above=0.0)
     steep: float = parameter(0.4, "1/m")
@@ -114,7 +114,7 @@ def test_pinocchio_has_the_same_models(name, tmp_path_factory, monkeypatch):
 @pytest.mark.parametrize("together", [False, True])
 @pytest.mark.parametrize("name", ["cart-pole", "double pendulum, driven"])
 def test_ours_is_what_simulate_does(name, together):
-    """What is timed has the bits of `simulate`."""
+    """The timed code has the bits of `simulate`."""
     problems, _ = problem(name)
     order = int(problems.scene._order(general_results.DT))
     found = (
@@ -141,7 +141,7 @@ def test_every_rival_converges(name):
             assert worst(Heyoka("Taylor", 1e-12), name, together) < 1e-11
 
 
-# --- what it comes to ---
+# --- results ---
 
 
 def point(family, method, setting, error, ns, mode="single", batched=True, clock=100.0):

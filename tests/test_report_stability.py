@@ -19,7 +19,7 @@ PROBLEM = Result("bound", "lost", "key", problem="stopped after 1 s")
 
 
 def draw(content):
-    """Draw every picture and give every cell to JSON, as a report does."""
+    """Draw every picture and write every cell as JSON, like a report."""
     for picture in content.pictures:
         picture.draw().canvas.draw()
     for table in (*content.tables, *content.details, *filter(None, [content.summary])):
@@ -48,7 +48,7 @@ def test_bound_is_never_broken():
 
 
 def test_what_is_left_out_is_the_sum_of_the_rest():
-    """The exact end less the series multiplied out by hand, and less the recurrence that is compiled."""
+    """The exact end minus the series multiplied out by hand, and minus the compiled recurrence."""
     alpha, gamma, theta, omega, h = 3.0, 0.75, 0.4, 1.1, 0.125
     drive = Coefficients(alpha, 0.0, gamma, 0.0, 0.0)
     scene, control = bound.driven(drive)
@@ -71,7 +71,7 @@ def test_what_is_left_out_is_the_sum_of_the_rest():
 
 
 def test_bound_is_that_of_the_product():
-    """With the product's x, the bound that is drawn is the bound that the product reports."""
+    """With the package's x, the drawn bound is the bound that the package reports."""
     drive, omega, h = Coefficients(20.0, 3.0, 0.5, 0.0, 0.0), 2.0, 0.01
     known = pendulum.truncation_bound(omega, drive, h)
     assert known.substeps == 1
@@ -146,7 +146,7 @@ def test_refused(name):
 
 
 def test_missed_and_lost_cases_show(monkeypatch):
-    """A case that is taken where it should be refused is missed; one that cannot be measured says why."""
+    """A case that is accepted but should be refused is missed; one that cannot be measured says why."""
     wrong = extremes.EXTREMES["step of 1e-6 s"]._replace(expected=extremes.REFUSED)
     monkeypatch.setitem(extremes.EXTREMES, "step of 1e-6 s", wrong)
     monkeypatch.setitem(extremes.EXTREMES, "odd", wrong._replace(scene="Unknown"))
@@ -209,7 +209,7 @@ def test_float32_of_ordinary_steps():
 
 
 def test_formulas_on_arrays_are_the_compiled_ones():
-    """The comparison integrators, run as NumPy formulas, give what they give as compiled flows."""
+    """The comparison integrators as NumPy formulas give the same as the compiled flows."""
     from lag_envs.report.integrators import comparison
     from lag_envs.report.stepped import Stepped
 
@@ -250,7 +250,7 @@ def test_refused_and_amplified_cells():
 
 
 def test_many_substeps():
-    """A bar of 1e-8 m over a second swings 5,000 times: what it was once off by 30 times too much."""
+    """A bar of 1e-8 m swings 5,000 times in a second: an earlier version was off by 30 times too much."""
     row = extremes.measure("bar of 1e-8 m, 1 s")
     assert row["substeps"] > 200_000
     assert row["outcome"] == extremes.FULL and row["met"]

@@ -1,4 +1,4 @@
-"""Work-precision: orders of convergence, rivals in their best forms, what is said of who is faster."""
+"""Work-precision: orders of convergence, rivals in their best forms, statements about who is faster."""
 
 import dataclasses
 import json
@@ -40,7 +40,7 @@ def truths(name, count, steps=1):
 
 
 def worst(rival, name, together, steps=1, count=6):
-    """Return the largest error of a rival, run as the report runs it."""
+    """Return the largest error of a rival, run as in the report."""
     some = truths(name, count, steps)
     sample = rival.build(Problems([t.case for t in some]), work_precision.control_step(name), steps, together)
     return max(t.error(end) for t, end in zip(some, sample.end(), strict=True))
@@ -52,7 +52,7 @@ def worst(rival, name, together, steps=1, count=6):
     ids=lambda method: method.method,
 )
 def test_order_of_convergence(method):
-    """The error of one step of length h grows like h^(order + 1), however cosine and sine are come by."""
+    """The error of one step of length h grows like h^(order + 1), however cosine and sine are computed."""
     assert work_precision.measured_order(method, single_steps()) == pytest.approx(method.order, abs=0.2)
 
 
@@ -68,7 +68,7 @@ def test_a_step_is_exact(name, mode):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_ours_is_what_simulate_does(name):
-    """What is timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
+    """The code timed as ours has the bits of the shipped `simulate`, alone and in a batch, at any speed."""
     dt, steps = work_precision.control_step(name), 3
     cases = [
         case._replace(state=tuple(4.0 * x for x in case.state)) for case in ensemble(name, 70, vary=False)
@@ -84,7 +84,7 @@ def test_ours_is_what_simulate_does(name):
 @pytest.mark.parametrize("quick", [True, False])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_only_what_is_shipped_counts_as_ours(name, quick, monkeypatch):
-    """No order and no tolerance but the scene's own is compared with anybody."""
+    """Only the scene's own order and tolerance are compared with others."""
     for horizon in work_precision.QUICK if quick else work_precision.HORIZONS:
         found = work_precision.rivals(name, horizon, "compiled", quick)
         assert {r.method for r in found if r.family == "ours"} <= {Ours.METHOD, Ours.ONE_CALL}
@@ -185,7 +185,7 @@ def test_heyokas_own_step_is_what_is_timed(mode, monkeypatch):
     ("method", "setting"), [("Euler", 256), ("implicitfast", 256), ("RK4", 16)], ids=lambda x: str(x)
 )
 def test_mujoco(method, setting):
-    """Its own model of the bar is the bar, over several control steps, more than one rollout holds."""
+    """Its own model of the bar is the bar, over more control steps than one rollout holds."""
     pytest.importorskip("mujoco")
     limit = 1e-9 if method == "RK4" else 1e-2
     assert worst(peers.MuJoCo(method, setting), "PivotedBar", False, steps=5, count=3) < limit
@@ -215,7 +215,7 @@ def test_all_libraries_at_their_finest(package, name, mode):
 
 
 def test_a_scene_of_ones_own():
-    """Rivals take any equation: one that is no flow of ours, with two angles that are carried along."""
+    """Rivals take any equation: here one that is no flow of ours, with two angles that are carried along."""
 
     class Coupled(Equation):
         """Two pendulums with a spring; closed form for small swings in phase: cos(√p t)."""
@@ -247,7 +247,7 @@ def test_a_scene_of_ones_own():
             ends = rival.build(Some(), 0.1, 4, together).end()
             assert ends[:, 0] == pytest.approx(exact, rel=1e-4, abs=0) and ends.shape == (2, 4)
     wrong = Some()
-    wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # what is not carried is not asked for
+    wrong.y = Some.y * np.array([[1.0]] * 4 + [[0.0]] * 4)  # unknowns that are not carried are not used
     assert Compiled("RK4", 8).build(wrong, 0.1, 4, True).end()[:, 0] == pytest.approx(exact, rel=1e-4, abs=0)
     with pytest.raises(ValueError, match="ETD4RK needs more than the rate"):
         Compiled("ETD4RK", 1).build(Some(), 0.1, 4, False)
@@ -280,7 +280,7 @@ def test_what_takes_too_long_is_not_run(monkeypatch):
     assert len({(row["mode"], row["method"]) for row in rows}) == len(rows)
 
 
-# --- what is said ---
+# --- statements ---
 
 
 def row(
@@ -368,7 +368,7 @@ def test_batches_with_other_bits_are_told():
 
 
 def test_sentences_count_what_the_table_has():
-    """Random points: every count and every ratio in a sentence is found again in the table."""
+    """Random points: every count and every ratio in a sentence appears in the table."""
     rng = np.random.default_rng(1)
     rows = []
     for variant in VARIANTS:
@@ -447,7 +447,7 @@ def test_only_what_is_shipped_is_committed_as_ours():
 
 
 def test_jobs_are_brought_to_one_scale():
-    """A job that ran while the machine was twice as slow is not twice as slow a rival."""
+    """A rival whose job ran on a machine of twice the speed is not counted as twice as fast."""
     slow = both("Taylor", 300.0, 1e-13, family="heyoka", clock=200.0)
     ns = {p.name: p.ns for p in verdicts.gathered(OWN + slow)}
     assert ns == {OURS: 100.0, "heyoka Taylor": 150.0}
@@ -468,7 +468,7 @@ def test_errors_below_amplified_rounding_are_none():
 
 
 def test_a_lost_job_is_a_row_and_claims_nothing():
-    """Without rows every claim is open; the problem is told."""
+    """Without rows every claim is open; the problem is stated."""
     lost = Result("work_precision", "compiled: PivotedBar", "key", problem="stopped after 120 s")
     content = work_precision.content([], [lost])
     assert all(claim.holds is None for claim in content.claims)
@@ -494,7 +494,7 @@ def test_the_picture_has_the_fastest_form_of_each():
 
 
 def test_long_horizons_are_exact_products():
-    """The reference is asked for the time that the steps add up to, without a rounding."""
+    """The reference is computed for the exact sum of the steps' times, without a rounding."""
     for name in VARIANTS:
         dt = work_precision.control_step(name)
         for horizon in work_precision.HORIZONS.values():

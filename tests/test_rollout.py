@@ -1,4 +1,4 @@
-"""Episodes that are stepped together: what comes of them, and what is noted on the way."""
+"""Episodes that are stepped together: their outcomes, and the observers' records."""
 
 import numpy as np
 import pytest
@@ -14,13 +14,13 @@ ENV = incline.Brake.id
 
 @pytest.mark.parametrize("env_id", covering())
 def test_together_as_one_by_one(env_id):
-    """Also where episodes end at different times, and seeds are anyhow.
+    """Also if episodes end at different times, and for arbitrary seeds.
 
-    Agents round differently for one and for many, which an unstable motion multiplies: so for 200 steps only.
+    Agents round differently for one and for many, which an unstable motion amplifies: so only for 200 steps.
     """
     seeds, short = [5, 99, 7], {"duration": 200 * TASKS[env_id].interval}
     for name, found in controllers(TASKS[env_id]).items():
-        if not found.plans and name != "random":  # which draws for all together
+        if not found.plans and name != "random":  # random draws for all together
             agent = make_controller(env_id, name)
             together = play(env_id, agent, seeds, **short)
             np.testing.assert_allclose(one_by_one(env_id, agent, seeds, **short), together, rtol=1e-12)
@@ -86,7 +86,7 @@ def test_observation_std():
     np.testing.assert_allclose(observation_std(ENV, [5]), np.std(seen, axis=0), rtol=1e-5)
 
 
-# --- what is noted ---
+# --- observers ---
 
 
 def test_arrivals_by_hand():
@@ -107,7 +107,7 @@ def test_recorded_episodes_hold_together():
     assert played.states.shape == (steps.max() + 1, 20, 2) and played.actions.shape == (steps.max(), 20, 1)
     np.testing.assert_array_equal(played.rewards.sum(axis=0), rollout.returns)
     np.testing.assert_array_equal(played.running, [step.running for step in taken])
-    over = int(steps.argmin())  # what is left after its end is where that was
+    over = int(steps.argmin())  # after its end, its last state is kept
     assert (played.states[steps[over] :, over] == played.states[-1, over]).all()
     np.testing.assert_allclose(np.abs(played.observations[0]), np.abs(played.states[0]), rtol=1e-6)
 

@@ -38,7 +38,7 @@ def test_noise_is_kept_and_then_drawn_anew(name, observations):
         taken = [policy._predict(observations) for _ in range(7)]
     same = [torch.equal(a, b) for a, b in pairwise(taken)]
     assert same == [True, True, False, True, True, False]
-    one = observations[:1].expand(4, -1)  # each environment has noise of its own
+    one = observations[:1].expand(4, -1)  # each environment has its own noise
     with torch.no_grad():
         assert len(policy._predict(one).unique(dim=0)) == 4
         assert len(policy._predict(observations[:2])) == 2  # another number of environments: new noise
@@ -56,7 +56,7 @@ def test_without_noise_it_is_the_librarys_policy(name, observations):
         wide = theirs._predict(3.0 * observations, True)
         inputs = torch.cat([observations, torch.full((4, 2), 0.3)], dim=1)
         tripled = torch.cat([3.0 * observations, torch.full((4, 2), 0.3)], dim=1)
-        # Biases stay, and so do a critic's weights of actions.
+        # Biases stay, and so do a critic's weights for actions.
         torch.testing.assert_close(scaled._predict(observations, True), wide)
         for mine, other in zip(scaled.critic.q_networks, theirs.critic.q_networks, strict=True):
             torch.testing.assert_close(mine(inputs), other(tripled))
@@ -66,7 +66,7 @@ def test_without_noise_it_is_the_librarys_policy(name, observations):
 
 @pytest.mark.parametrize("name", ["SAC", "TQC"])
 def test_what_is_drawn_is_what_is_learnt_from(name):
-    """Actions have the distribution whose likelihood the learner computes: mean and spread of the network."""
+    """Actions have the distribution whose likelihood the learner computes: the network's mean and spread."""
     policy = ours(name, noise_steps=1)
     many = torch.full((20_000, 5), 0.2)
     with torch.no_grad():

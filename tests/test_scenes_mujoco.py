@@ -22,7 +22,7 @@ def model(body, gravity=9.81):
 
 
 def rod(mass, com, inertia, along=(0, 0, -1)):
-    """Return an inertial of a thin rod: its inertia along itself is next to nothing, as MuJoCo needs some."""
+    """Return an inertial of a thin rod: its axial inertia is tiny but positive, as MuJoCo requires."""
     place = " ".join(str(com * x) for x in along)
     sizes = [inertia if x == 0 else 1e-13 for x in along]
     sizes = [s if s > 1e-12 else 2e-13 for s in sizes]
@@ -81,7 +81,7 @@ def test_acrobot():
 
 
 def test_two_link_arm():
-    """The load is a point in the forearm's end: one rod with both's mass, centre and inertia."""
+    """The load is a point at the forearm's end: one rod with the mass, centre and inertia of both."""
     scene = TwoLinkArm(load=0.5, damping=0.3)
     m, c = 1.5, (0.15 + 0.5 * 0.3) / 1.5
     inertia = 0.3**2 / 12 + (c - 0.15) ** 2 + 0.5 * (0.3 - c) ** 2

@@ -79,7 +79,7 @@ def sums(series, first):
     return [sum(float(c.abs_upper()) for c in x.coeffs()[first:]) for x in series]
 
 
-# --- what is tested -----------------------------------------------------------------------------------------
+# --- tested series ------------------------------------------------------------------------------------------
 
 
 @cache
@@ -147,7 +147,7 @@ class Judged(NamedTuple):
 
 
 def judge(system, case, order, tolerance, h, bounds):
-    """Hold a certified step against its exact series."""
+    """Compare a certified step with its exact series."""
     state, control, _ = case
     q, v = taylor(system, state, control, h, order + 18)
     after = [bound * h / (order + 2) for bound in bounds]
@@ -220,7 +220,7 @@ def exact_nodes(record, scalars, q, v, h, order):
         return flint.arb(scalars[w] if isinstance(w, str) else w)
 
     for node in record.nodes:
-        args = [values[a] for a in node.args if a < len(values)]  # of a function, the first counts
+        args = [values[a] for a in node.args if a < len(values)]  # for a function, the first one counts
         match node.op:
             case "place":
                 value = q[node.index]
@@ -259,7 +259,7 @@ def test_every_rule_bounds_its_tail(system):
 
 
 def test_tails_cut_one_order_later_than_sums_are_found_out():
-    # A certificate for the order N + 1, taken for that of sums up to N, leaves v_{N+1} unbounded.
+    # A certificate for the order N + 1, used for sums up to N, leaves v_{N+1} unbounded.
     system, generator, order = SYSTEMS[2], np.random.default_rng(6), 8
     found = []
     for _ in range(12):
@@ -271,7 +271,7 @@ def test_tails_cut_one_order_later_than_sums_are_found_out():
 
 
 class Vanishing(Scene):
-    """A mass (1 - x) that is pushed so that it moves at a constant speed, until it is no more."""
+    """A mass (1 - x) that is pushed to move at a constant speed, until it vanishes."""
 
     coordinates = {"x": "m"}
 
@@ -298,7 +298,7 @@ def test_where_the_mass_vanishes_within_the_step_only_less_will_do():
     assert plain_attempt(system, ([0.0, 1.0], [], 0.9), 8, 1e-20)[0] == 0.9
 
 
-#: States at rest under forces that balance, but for roundings.
+#: States at rest under forces that balance, up to roundings.
 AT_REST = {
     "CartPole": [0.5, 0.0, math.pi, 0.0],
     "Acrobot": [0.0] * 4,
@@ -318,7 +318,7 @@ def test_rest_at_an_equilibrium_is_certified_in_one_step(system):
 
 
 def count_operations(system, order):
-    """Return how many sums, products and quotients an attempt takes that is certified as a whole."""
+    """Return the number of sums, products and quotients of an attempt that is certified as a whole."""
     counts = Counter()
 
     def counting(slots):
@@ -383,20 +383,20 @@ def single_steps(system, cases, dt, order, fused=True):
 
 
 def simulate(scene, start, controls, dt, order, fused=True):
-    """Return a trajectory, from compiled code or from what stands in its place; as objects."""
+    """Return a trajectory, from compiled code or its replacement; as objects."""
     _, constants, code = stepper(scene, fused)
     given = [constants[name.removeprefix("k_")] for name in code.constants]
     trajectory = np.zeros((len(controls) + 1, len(start)))
     trajectory[0] = start
     run = code.compile_simulate()
-    if isinstance(run, types.FunctionType):  # Python's own, which is to meet Python's own numbers
+    if isinstance(run, types.FunctionType):  # plain Python, which is to get Python's own numbers
         trajectory, controls = trajectory.astype(object), np.array(controls, dtype=object)
     assert not run(trajectory, np.asarray(controls), dt, order, *given)
     return trajectory
 
 
 def in_python(name, source, *helpers, **constants):
-    """Stand in for `compile_function`: run the source by Python, and what was recorded too."""
+    """Replace `compile_function`: run the source in Python, and the recorded operations too."""
 
     def block(operations, inputs, outputs):
         def run(*values):
@@ -413,7 +413,7 @@ def in_python(name, source, *helpers, **constants):
 
 
 def advance_in_python(record, tolerance=TOLERANCE, fused=False):
-    """Stand in for `compile_advance`: the driver's own code on `Plain`."""
+    """Replace `compile_advance`: the driver's own code on `Plain`."""
     series, layout, n = Series(record), Layout(record), record.size
 
     def attempt(rows, at, dt, order, tolerance):
@@ -541,7 +541,7 @@ def test_refusal_of_a_scene_brings_what_went_before():
 
 
 def test_threads_share_a_scene_and_run_side_by_side():
-    scene = Chain(bars=2, gravity=0.0, damping=0.01)  # nobody else's: both threads find nothing compiled
+    scene = Chain(bars=2, gravity=0.0, damping=0.01)  # used nowhere else: both threads find nothing compiled
     controls = np.random.default_rng(10).uniform(-5.0, 5.0, 200_000)
     starts = [[0.0, 0.0, 1.0, 2.0, -1.0, x] for x in (3.0, -4.0)]
     found, turns = {}, 0
@@ -587,7 +587,7 @@ def exact_slopes(system, state, control, dt):
 
 
 def step_error(system, state, control, dt, order):
-    """Return the worst error of a control step, as a part of condition times size."""
+    """Return the worst error of a control step, relative to condition times size."""
     end = simulate(system.scene, state, [control], dt, order)[1]
     exact = exact_step(system, state, control, dt)
     first, n = 2 * system.driven, len(state)
@@ -677,7 +677,7 @@ def test_code_for_every_processor(target, features, fused, lanes):
     machine_code = found.create_target_machine(features=features, opt=2, codemodel="small")
     _, assembly = attempt_for(target, machine_code, fused, lanes)
     calls = set(re.findall(r"^\s+(?:callq?|bl)\s+([\w*%]+)", assembly, re.MULTILINE))
-    if fused and not features:  # a processor without fused instructions: the C library has them
+    if fused and not features:  # a processor without fused instructions calls the C library
         assert calls == {"fma"}
     else:
         assert calls <= ({"__chkstk"} if "windows" in target else set())  # touches a large stack's pages

@@ -1,4 +1,4 @@
-"""Learners that go by gradients and by a controller: they learn, repeat and resume bit for bit."""
+"""Learners by gradients and by a controller: they learn, repeat and resume bit for bit."""
 
 import copy
 import json
@@ -85,7 +85,7 @@ def test_gradients_are_slopes_of_what_is_earned(env_id, share):
 
 
 def test_it_swings_the_free_bar_up():
-    """In about a second of training, where back-propagation through time without bounds stays below .6."""
+    """In about a second of training; back-propagation through time without bounds stays below .6."""
     hyper = hyperparameters("shac", FREE) | {"n_timesteps": 4e5}
     learner = shac.Learner(FREE, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:
@@ -95,7 +95,7 @@ def test_it_swings_the_free_bar_up():
 
 @pytest.mark.slow
 def test_it_keeps_the_bar_up_on_a_track():
-    """For ten seconds: a policy that drifts drops it at the track's end and stays below .9."""
+    """For ten seconds: a policy that drifts reaches the track's end, drops the bar, and stays below .9."""
     hyper = hyperparameters("shac", TRACK)
     learner = shac.Learner(TRACK, shac.Settings.of(hyper), 300, int(hyper["n_timesteps"]))
     while learner.trained < learner.steps:

@@ -1,4 +1,4 @@
-"""The leaderboard's page: what is written, and how it behaves in a real browser."""
+"""The leaderboard's page: its files, and its behaviour in a real browser."""
 
 import http.server
 import itertools
@@ -40,9 +40,9 @@ HOSTILE = (
     "Ω" * 300,
     "constructor",
 )
-#: Roles of what must have a name for those who do not see it.
+#: Roles of elements that need a name for screen readers.
 NAMED = {"button", "combobox", "slider", "searchbox", "radio", "checkbox", "link", "image", "img", "region"}
-# So that the warning below is shown and no error.
+# So that the warning below is shown instead of an error.
 pytestmark = pytest.mark.filterwarnings("default:THERE IS NO CHROMIUM")
 
 
@@ -104,7 +104,7 @@ def open_page(browsing, folder):
 
 
 def see_episodes(page):
-    """Go to where episodes are watched, which loads them, and back."""
+    """Go to the place where episodes are watched, which loads them, and back."""
     there = "document.querySelector('#watch').scrollIntoView({ behavior: 'instant' })"
     until(page, f"({there}, document.querySelectorAll('.episode option').length >= 2)")
     page.evaluate("scrollTo({ top: 0, behavior: 'instant' })")
@@ -120,7 +120,7 @@ def unpacked(column, n, unit):
 
 
 def recorded(task, env_id, seed=0):
-    """Return an episode as the page's data have it, of random actions."""
+    """Return an episode of random actions, in the form of the page's data."""
     rng = np.random.default_rng(seed)
     states, n = [[float(x) for x in task.centre]], 40
     actions = rng.uniform(-1, 1, (n, task.formulas.actions))
@@ -155,7 +155,7 @@ class Reach(Task):
 
 @pytest.fixture
 def own(monkeypatch):
-    """Return a board of scenes that are not of the package, and one without bodies."""
+    """Return a board of scenes that are not in the package, including one without bodies."""
     example = Path(__file__).parents[1] / "examples" / "ball_on_beam.py"
     gym.registry.pop("BallOnBeam-v0", None)
     balance = runpy.run_path(str(example))["Balance"]
@@ -171,7 +171,7 @@ def own(monkeypatch):
 
 
 def colours(page, selector):
-    """Return how many colours a canvas shows."""
+    """Return the number of colours on a canvas."""
     return page.evaluate(f"""(() => {{
         const c = document.querySelector({json.dumps(selector)});
         const copy = new OffscreenCanvas(c.width, c.height);
@@ -182,7 +182,7 @@ def colours(page, selector):
 
 
 def column(page, selector):
-    """Return the texts of a column of the ranking, from top to bottom, of the rows that are shown."""
+    """Return the texts of a column of the ranking, from top to bottom, for visible rows."""
     return page.evaluate(
         f"[...document.querySelectorAll('.ranking tbody tr:not([hidden]) {selector}')].map(e => e.innerText)"
     )
@@ -199,7 +199,7 @@ def reading(page, side, name):
     ).replace("−", "-")
 
 
-# --- what is written ---
+# --- files ---
 
 
 def test_what_comes_from_submissions_is_escaped(hostile):
@@ -478,7 +478,7 @@ def test_scenes_of_ones_own_are_drawn(own, open_page, tmp_path):
 
 
 def flat(shape):
-    """Return a shape as the script has it."""
+    """Return a shape in the script's form."""
     match shape:
         case Line(points, role):
             return ["line", np.array(points), role]
@@ -654,7 +654,7 @@ def test_pictures_of_the_ranking(open_page):
     assert "SAC, half of them above 0.96" in page.evaluate("document.querySelector('#profile svg').ariaLabel")
     page.click(".legend button:nth-child(6)")
     assert page.evaluate("document.querySelectorAll('#profile .chosen').length") == 6
-    # The value function and the path over it, which another pair of coordinates does not have.
+    # The value function and the path over it; another pair of coordinates has none.
     until(page, "document.querySelector('.phase').ariaLabel.endsWith('over the value function')")
     shaded = colours(page, ".phase")
     page.evaluate("""(() => { const s = document.querySelector('.pair select'); s.value = '1';
@@ -690,7 +690,7 @@ def test_narrow_screen(open_page, scheme):
     for name in ("index", "PivotedBar-v0", cylinder_in_cylinder.Tilt.id):
         page = open_page(name, viewport={"width": 320, "height": 640}, is_mobile=True, color_scheme=scheme)
         assert page.evaluate("document.documentElement.scrollWidth") == 320
-    # Cards instead of columns; what would be lost with the heads is sorted by a list.
+    # Cards instead of columns; a list replaces sorting by the column heads.
     page.evaluate("""(() => { const s = document.querySelector('.order select'); s.value = 'effort';
         s.dispatchEvent(new Event('change', {bubbles: true})); })()""")
     efforts = [float(x.split()[-1]) for x in column(page, "[data-label=Effort]")]
@@ -760,7 +760,7 @@ def test_axe_finds_nothing_serious(open_page, served, name, scheme):
 
 @pytest.mark.slow
 def test_axe_finds_nothing_serious_on_the_whole_board(browser, tmp_path):
-    """On every page, but of an environment's agents, whose pages are made alike, on the first one's."""
+    """On every page; for an environment's agents, whose pages are made alike, only on the first one's."""
     board = Path(__file__).parents[1] / "leaderboard"
     build(board_data(Board(board)), tmp_path)
     pages = {}
@@ -775,7 +775,7 @@ def test_axe_finds_nothing_serious_on_the_whole_board(browser, tmp_path):
 
 
 def loaded(browser, url, **network):
-    """Return how many bytes a page loads, and after how many milliseconds it can be read."""
+    """Return the number of bytes that a page loads, and the milliseconds until it can be read."""
     page, sizes = browser.new_page(), []
     page.on("response", lambda answer: sizes.append(len(answer.body())))
     if network:
@@ -799,7 +799,7 @@ def test_page_is_light_before_anything_is_played(served, browser, name):
 
 @pytest.mark.slow
 def test_so_is_every_page_of_the_board(browser, tmp_path):
-    """The episodes there are longer, up to thousands of steps."""
+    """The longest episodes, with up to thousands of steps."""
     build(board_data(Board(Path(__file__).parents[1] / "leaderboard")), tmp_path)
     for env_id in TASKS:
         assert loaded(browser, (tmp_path / f"{env_id}.html").as_uri())[0] < 300_000, env_id
@@ -808,7 +808,7 @@ def test_so_is_every_page_of_the_board(browser, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIZED)
 def test_page_can_be_read_soon_on_slow_4g(served, browser, name):
-    """1.6 Mbit/s, 150 ms to and fro, as Lighthouse has it; the best of three, for others may be at work."""
+    """1.6 Mbit/s, 150 ms round trip, as in Lighthouse; the best of three, since the machine may be busy."""
     slow = {"latency": 150, "downloadThroughput": 2e5, "uploadThroughput": 1e5}
     assert min(loaded(browser, f"{served}/{name}.html", **slow)[1] for _ in range(3)) < 2_000
 
@@ -832,7 +832,7 @@ def test_what_a_screen_reader_meets(open_page):
     assert all(b - a <= 1 for a, b in itertools.pairwise(levels))
     ids = page.evaluate("[...document.querySelectorAll('[id]')].map(e => e.id)")
     assert len(ids) == len(set(ids))
-    # The first stop skips what is the same on all pages, and every stop is seen.
+    # The first stop skips the parts common to all pages, and every stop is visible.
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"
     page.keyboard.press("Enter")

@@ -1,4 +1,4 @@
-"""Snapshots: environments that go back, or over to another process, and on with the same bits."""
+"""Snapshots: environments that are restored, here or in another process, continue with the same bits."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CASES = [
 
 
 def go_on(env: gym.Env, steps: int, seed: int = 0) -> list:
-    """Return all that is seen in so many steps, resets included."""
+    """Return everything observable in so many steps, resets included."""
     rng, seen = np.random.default_rng(seed), []
     for _ in range(steps):
         action = (
@@ -59,7 +59,7 @@ def test_a_single_environment_goes_on_with_the_same_bits(env_id, keywords):
     assert go_on(env, 40) != first
     env.unwrapped.set_state(snapshot)
     assert go_on(env, 40) == first
-    other.reset(seed=99)  # which Gymnasium's checker asks for
+    other.reset(seed=99)  # required by Gymnasium's checker
     other.unwrapped.set_state(pickle.loads(pickle.dumps(snapshot)))
     assert go_on(other, 40) == first
 

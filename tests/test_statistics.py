@@ -1,4 +1,4 @@
-"""Statistics of returns: by hand, against rliable, and what intervals promise."""
+"""Statistics of returns: by hand, against rliable, and the coverage of intervals."""
 
 import warnings
 from functools import partial
@@ -29,7 +29,7 @@ from lag_envs.scores import known_returns, normalised
 
 
 def rliable(part):
-    """Return a part of rliable; all but its metrics do not import beside every pandas."""
+    """Return a part of rliable; only its metrics can be imported beside every pandas."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -93,7 +93,7 @@ def test_numbers_are_rounded_wherever_they_stand():
 
 
 def test_luck_is_taken_out():
-    """What goes with another agent's luck is found, and what does not go with it is left alone."""
+    """The part that is correlated with another agent's luck is found, and the rest is left alone."""
     rng = np.random.default_rng(0)
     luck = rng.normal(3.0, 50.0, 20_000)
     assert luck_slope([400.0 + 0.5 * luck[:99], -7.0 + 0.5 * luck[1:100]], [luck[:99], luck[1:100]]) == (
@@ -119,7 +119,7 @@ def test_intervals_resample_each_stratum():
     assert np.mean(iqm(drawn) == 0.5) == pytest.approx(0.5, abs=0.05)
     assert interval(iqm, [3.0, 3.0, 3.0]) == [3.0, 3.0]
     assert interval(iqm, [3.0]) is None and interval(pooled_iqm, [1.0, 2.0], [3.0]) is None
-    # As rliable does it: rows of a matrix (runs, tasks) are drawn anew for each column by itself.
+    # As in rliable: rows of a matrix (runs, tasks) are resampled independently for each column.
     rng = np.random.default_rng(1)
     scores = rng.normal([0.0, 1.0, 5.0], size=(8, 3))
     drawn = [pooled_iqm(*(column[rng.integers(8, size=8)] for column in scores.T)) for _ in range(1500)]

@@ -68,7 +68,7 @@ def operations(scene):
 
 
 def advance_of(scene, dt):
-    """Return the scene's compiled step, and what it takes behind state, control and step."""
+    """Return the scene's compiled step, and its arguments after state, control and step."""
     numbers = scene._constants()
     code = scene._form.stepper(dt, frozenset(name for name, value in numbers.items() if value == 0.0))
     return code.compile(), [scene._form.largest_majorant(dt), *(v for v in numbers.values() if v)]
@@ -138,7 +138,7 @@ def test_order(order):
 
 
 def least_x(w, drive):
-    """Return the least x for which the bound is proved."""
+    """Return the smallest x for which the bound is proved."""
     low, high = 0.0, 64.0
     for _ in range(60):
         x = 0.5 * (low + high)
@@ -149,7 +149,7 @@ def least_x(w, drive):
 
 @pytest.mark.parametrize("order", [14, 20])
 def test_bound_is_never_broken(order):
-    """Truncation against a longer series in 200 random cases: 300 times below the bound at the closest."""
+    """Truncation against a longer series in 200 random cases: at least a factor of 300 below the bound."""
     rng = np.random.default_rng(order)
     closest = [0.0, 0.0]
     tested = 0
@@ -174,7 +174,7 @@ def test_bound_is_never_broken(order):
 
 
 def test_bound_is_not_far_off():
-    """How loose the bound is: less than a factor of 3 per power where drive and field pull together."""
+    """How loose the bound is: less than a factor of 3 per power if drive and field pull together."""
     w, drive = mpf(0.0), Coefficients(mpf(0.02), 0.0, 0.0, mpf(0.02), 0.0)
     W, _ = pendulum.taylor_coefficients(w, mpf(0), mpf(-1), drive, 25)
     x = least_x(w, drive)
@@ -184,7 +184,7 @@ def test_bound_is_not_far_off():
 def test_every_task_is_one_certified_step():
     """At the corners of TASKS' ranges of state and control one step is enough, to 1e-12 in theta'.
 
-    Of a long control step it may take two.
+    A long control step may take two.
     """
     pendulums = set()
     for name, kind in TASKS.items():
@@ -261,7 +261,7 @@ def body(kind, **parameters):
 
 
 def one_step(case):
-    """Return the step's error over 1e-12 scale and over eps cond + 1e-12 scale; None where refused.
+    """Return the step's error over 1e-12 scale and over eps cond + 1e-12 scale; None if refused.
 
     cond counts roundings of state, control and parameters: the scene's constants are floats made from them.
     """
@@ -294,7 +294,7 @@ def test_one_step(kind, n, seed, allowed):
 
 @pytest.mark.slow
 def test_one_step_of_extremes():
-    """Full accuracy or a refusal; measured with what the system itself makes of the state's rounding."""
+    """Full accuracy or a refusal; measured with the system's own amplification of the state's rounding."""
     refused = 0
     for case in random_cases("extreme", 36, 24):
         error = one_step(case)
@@ -331,7 +331,7 @@ def any_pendulum():
 
 
 def pendulum_errors(theta, omega, drive, dt):
-    """Return errors of theta and theta' as shares of what is asked for, and the substeps."""
+    """Return errors of theta and theta' as shares of their limits, and the substeps."""
     c, s = math.cos(theta), math.sin(theta)
     x = pendulum.largest_majorant(dt)
     *end, substeps = any_pendulum()(theta, omega, c, s, *map(float, drive), dt, x)
@@ -416,7 +416,7 @@ def turned_by_gravity(k, spin, dt):
 @pytest.mark.parametrize("spin", [100.0, 700.0, 2500.0])
 @pytest.mark.parametrize("gravity", [9.81, 1e-3, 1e-25])
 def test_heavy_drag_in_a_turning_shell_with_gravity(spin, gravity):
-    """Gravity's part by quadrature; what is left out of it is of the order of (α/Γ)²/ψ' dt."""
+    """Gravity's part by quadrature; its truncation error is of the order of (α/Γ)²/ψ' dt."""
     for dt, decay in ((1.0, 1e6), (0.3, 1e6), (0.02, 1e6), (0.02, 1e5)):
         shell = CylinderInCylinder(damping=0.24 * decay / dt, gravity=gravity)
         k = coefficients(shell)
@@ -499,7 +499,7 @@ def test_still_plane_is_the_fixed_one():
 
 @pytest.mark.parametrize("control", [-0.05, -3.0])
 def test_negative_drag(control):
-    """A drag that is the control may be negative; then it pushes, and the bound takes its size."""
+    """A drag that is the control may be negative; then it pushes, and the bound uses its size."""
     shell = CylinderInCylinder(control="damping")
     k = coefficients(shell)
     rows = shell.simulate([0.5, 0.2], [control] * 20, 0.02)
@@ -605,7 +605,7 @@ def test_hard_case(name):
     ],
 )
 def test_refusal(scene, state, control, dt):
-    """A step that cannot be taken says so at once, keeps what was computed, and leaves the scene usable."""
+    """A refused step says so at once, keeps the results so far, and leaves the scene usable."""
     calm = np.full(len(state), 0.1)
     before = scene.simulate(calm, [0.0], 0.02)
     with contextlib.suppress(StepRefused):
@@ -726,7 +726,7 @@ def test_against_dop853(kind):
 
 
 def random_action(env, rng, size=1.0):
-    """Return an action of an environment, as a share of the largest where it is one of a range."""
+    """Return an action of an environment, as a share of the largest if it lies in a range."""
     if env.task.formulas.choices:
         return rng.integers(env.action_space.n)
     return env.action_space.high * rng.uniform(-size, size, env.action_space.shape)
@@ -734,7 +734,7 @@ def random_action(env, rng, size=1.0):
 
 @pytest.mark.parametrize("name", covering(PERFECT))
 def test_simulate_is_the_environments_step(name):
-    """From a given state, with the control that was applied: the same bits, but for the kicked speed."""
+    """From a given state, with the applied control: the same bits, except for the kicked speed."""
     env = gym.make(name).unwrapped
     rng = np.random.default_rng(4)
     env.reset(seed=5)
@@ -796,7 +796,7 @@ def test_floats_arrays_and_tensors(which):
 
 
 def test_compiled_is_the_formula():
-    """Fused operations change the last places only."""
+    """Fused operations change only the last places."""
     formula, columns = next(iter(formulas()))
     plain = np.array(formula(*columns))
     x = pendulum.largest_majorant(0.02)
@@ -816,7 +816,7 @@ def test_compiled_is_the_formula():
     ],
 )
 def test_what_is_zero_costs_nothing(scene, parameter, state):
-    """A constant that is zero leaves fewer operations, and the numbers are those of a very small one."""
+    """A constant that is zero saves operations, and the numbers are those of a very small one."""
     keywords = {"control": "tilt"} if scene is Incline else {}
     without, with_it = (scene(**keywords, **{parameter: value}) for value in (0.0, 1e-50))
     assert operations(without) < operations(with_it)
@@ -830,7 +830,7 @@ def test_track_costs_only_itself():
 
 
 def test_same_bits_in_every_process():
-    """Neither hash seeds nor the order of compilation show."""
+    """Neither hash seeds nor the order of compilation have an effect."""
     code = (
         "from lag_envs.scenes import *; import numpy as np;"
         "a = PivotedBar(track=None).simulate([1, 2], np.linspace(-5, 5, 300), 0.02);"

@@ -1,4 +1,4 @@
-"""Each task restated in plain numbers, checked against what the environments do."""
+"""Each task restated in plain numbers, checked against the environments."""
 
 from __future__ import annotations
 
@@ -307,7 +307,7 @@ def test_starts(env_id):
 
 
 def assert_uniform(share):
-    """Hold sorted numbers against the uniform distribution: Kolmogorov-Smirnov at a chance of 1e-5."""
+    """Compare sorted numbers with the uniform distribution: Kolmogorov-Smirnov at a chance of 1e-5."""
     n = len(share)
     assert np.abs(share - (np.arange(n) + 0.5) / n).max() < 2.5 / math.sqrt(n)
 
@@ -406,7 +406,7 @@ def test_the_track_is_never_left(track, dt):
                 env.step(np.array([a]))
                 s, s_dot = env.state[:2]
                 worst = max(worst, abs(s) - track, abs(s) + s_dot**2 / 10 - track)
-                # Where the root is nearly double, rounding moves it by the square root of rounding.
+                # Near a double root, the root's error is the square root of rounding.
                 assert env.control == pytest.approx(
                     nearest_safe(y[0], y[1], 5.0 * a, 5.0, track, dt), abs=1e-8 / dt
                 )
@@ -498,7 +498,7 @@ CROSSINGS = [
     (0.3, 0.0, -1.0, {"dt": 1.0}),
     (0.5, 1.0, 1.0, {"dt": 1.0}),
     (0.2, 1.0, 1.0, {"dt": 1.0, "damping": 10.0}),
-    # flat: the cylinder coasts, and may come to the line with hardly any speed
+    # flat: the cylinder coasts, and may reach the line with hardly any speed
     (0.01, 1.0, -1.0, {"tilt": 0.0}),
     (0.01, 1.0, 1.0, {"tilt": 0.0}),
     (0.1, 1.0, 1.0, {"tilt": 0.0, "damping": 5.0, "dt": 1.0}),
@@ -538,7 +538,7 @@ def test_crossing_time(distance, speed, action, options):
         )
         assert 0 <= time <= env.task.dt * (1 + mpf(10) ** -14)
         wanted = -time - 5 * max(end - mpf(0.5), 0)
-        # Rounding the place shows in the time as rounding over speed.
+        # Rounding the place changes the time by rounding over speed.
         assert abs(reward - wanted) < 1e-12 * (1 + speed) + (4 * 2**-53 * distance / end if end else 0)
 
 

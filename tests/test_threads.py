@@ -1,4 +1,4 @@
-"""Threads that step a batch together: the same bits as one, whoever comes when, in whatever process."""
+"""Threads that step a batch together: the same bits as one thread, in any order and in any process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def made(threads, n=MANY, env_id=ID, **options):
 
 
 def digest(envs, steps, seed=3):
-    """Return a digest of all that so many steps give; with a seed, after a reset."""
+    """Return a digest of all results of so many steps; with a seed, after a reset."""
     found = hashlib.sha256()
     if seed is not None:
         found.update(envs.reset(seed=seed)[0].tobytes())
@@ -81,7 +81,7 @@ def test_a_bad_action_steps_nothing():
 
 
 def test_refused_environments_do_not_stop_the_others():
-    """The one that is named is the last, as with one thread."""
+    """The named environment is the last, as with one thread."""
     stuck = [BLOCK + 3, 4 * BLOCK, 5 * BLOCK + 1]
     lengths = np.full(MANY, 0.3)
     lengths[stuck] = 1e-30
@@ -133,7 +133,7 @@ def toy():
 
 
 def room(blocks):
-    """Return arrays of the toy: places, keys with what threads share, and those of a step."""
+    """Return arrays of the toy: places, keys with the threads' shared data, and those of a step."""
     count = blocks * BLOCK
     flags = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     arrays = np.zeros(count, np.float32), np.zeros((1, count), np.float32), np.zeros(count), *flags
@@ -170,7 +170,7 @@ def test_who_comes_late_finds_nothing_to_do(toy):
 
 
 def test_no_two_helpers_have_one_share(toy):
-    """They would share the room in which a step is computed."""
+    """They would share a step's working memory."""
     f, ids, arrays, count = room(5)
     par = np.array([0.0, 0.5])
     taken = 3 * count + sharing.WORDS + 5 + 1
@@ -189,7 +189,7 @@ def test_no_two_helpers_have_one_share(toy):
 
 
 def test_a_step_waits_for_what_is_left_of_the_last_one():
-    """As after an interrupt from the keyboard while a helper was at it."""
+    """As after a keyboard interrupt while a helper was working."""
     envs, twin = made(2), made(2)
     digest(envs, 3), digest(twin, 3)
     left = 3 * MANY + 1

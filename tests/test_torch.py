@@ -44,7 +44,7 @@ def test_torch_func(step):
         rows = torch.autograd.functional.jacobian(lambda s, a: step(s, a).states, (states[i], actions[i]))
         torch.testing.assert_close(rows[0], by_state[i], rtol=1e-14, atol=1e-14)
         torch.testing.assert_close(rows[1], by_action[i], rtol=1e-14, atol=1e-14)
-    # A batch of batches, one of them the same for all.
+    # A batch of batches, with one of them shared by all.
     nested = torch.func.vmap(lambda a: step(states, a).rewards)(torch.stack([actions, -actions]))
     torch.testing.assert_close(nested[0], step(states, actions).rewards)
     slope = torch.func.grad(lambda s: step(s, actions[0]).rewards)(states[0])

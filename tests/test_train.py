@@ -1,4 +1,4 @@
-"""The training script: learners, checkpoints, seeds side by side, Ray, and what users get wrong."""
+"""The training script: learners, checkpoints, parallel seeds, Ray, and users' mistakes."""
 
 import errno
 import io
@@ -87,7 +87,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         cut = make_run(tmp_path / "cut", algo, normalize=True)
         content = cut.load_checkpoint()
         model = learners.thaw(cut, content)
-        # Weights, optimiser, normalisation and memory are those that were learnt, and learning goes on.
+        # Weights, optimiser, normalisation and memory are restored, and learning goes on.
         normalise, buffer = pickle.loads(content["normalisation"]), pickle.loads(content["buffer"])
         assert model.get_vec_normalize_env().obs_rms.mean.tolist() == normalise.obs_rms.mean.tolist()
         assert (buffer is None) == (algo == "ppo") and model.num_timesteps == cut.trained
@@ -110,7 +110,7 @@ def test_every_learner_goes_on_from_its_checkpoint(algo, tmp_path):
         and first["hyperparameters"] == cut.hyperparameters
     )
     assert not cut.path(run.CHECKPOINT).exists()
-    # The policy that was written acts like the one that was evaluated, one by one and together.
+    # The written policy acts like the evaluated one, one by one and together.
     policy = load_policy(tmp_path / "cut")
     returns = play(ENV, policy, run.fresh_seeds(3))
     assert returns.tolist() == first["evaluation"]["returns"]
@@ -301,11 +301,11 @@ def test_help_is_quick():
     assert time.perf_counter() - started < 20.0
 
 
-# --- the libraries around ---
+# --- other libraries ---
 
 
 @pytest.mark.slow
-# Other tests load JAX, which warns of any fork in this process; Ray's forks only start programs.
+# Other tests load JAX, which warns about any fork in this process; Ray's forks only start programs.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_on_a_local_ray_cluster(command, config, tmp_path):
     arguments = (ENV, "--seeds", "2", "--config", str(config))
@@ -341,7 +341,7 @@ def test_hyperparams_prints_a_file_of_the_zoo(capsys):
 
 
 def test_hyperparameters_name_what_the_package_brings():
-    """The Zoo imports the wrappers by name, where there is no clone."""
+    """The Zoo imports the wrappers by name, without a clone."""
     for algo in ALGORITHMS:
         for entry in yaml.safe_load(printed(algo)).values():
             for wrapper in entry.get("env_wrapper", []) + entry.get("vec_env_wrapper", []):
@@ -351,7 +351,7 @@ def test_hyperparameters_name_what_the_package_brings():
 
 
 def test_any_script_of_the_zoo_finds_the_environments(tmp_path):
-    """A script that, as `record_video`, neither imports packages nor takes --gym-packages."""
+    """A script that, like `record_video`, neither imports packages nor takes --gym-packages."""
     (tmp_path / "rl_zoo3").mkdir()
     (tmp_path / "rl_zoo3" / "__init__.py").write_text("")
     script = (
@@ -395,14 +395,14 @@ def test_the_zoo_trains_shows_and_films(algo, tmp_path):
     assert list(tmp_path.glob(f"logs/{algo}/{ENV}_1/videos/*.mp4"))
 
 
-# --- environments of one's own ---
+# --- users' environments ---
 
 BALL, SEVERAL = ROOT / "examples" / "ball_on_beam.py", ROOT / "tests" / "own_tasks.py"
 
 
 @pytest.fixture
 def beside_the_example(monkeypatch):
-    """Have the example's folder on the path, here and in the workers, and forget what it registers."""
+    """Put the example's folder on the path, here and in the workers, and forget its registration."""
     monkeypatch.syspath_prepend(str(BALL.parent))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(BALL.parent), *filter(None, sys.path)]))
     yield
@@ -419,7 +419,7 @@ def beside_the_example(monkeypatch):
         slow("ball_on_beam:BallOnBeam-v0", "BallOnBeam-v0"),
         # It chooses among three actions.
         slow(f"{SEVERAL}:Switched", "OwnSwitched-v0"),
-        # It has two controls and two targets. Quick is fast PPO's training in test_add_task.py.
+        # It has two controls and two targets. The quick version is fast PPO's training in test_add_task.py.
         slow(f"{SEVERAL}:Deliver", "OwnCrane-v0"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Numbers with twice the digits, against fractions, as Python runs them and as they are compiled."""
+"""Numbers with twice the digits, against fractions, in Python and compiled."""
 
 import math
 from fractions import Fraction
@@ -10,7 +10,7 @@ from lag_envs.stepping.compiling import compile_traced
 from lag_envs.stepping.tracing import pairwise_sum, polynomial, sum_of_products
 from lag_envs.stepping.twofold import Twofold, mixed_polynomial, two_product, two_sum
 
-HALF_DIGITS = 2.0**-100  #: sums of a few terms are this exact, relative to the largest
+HALF_DIGITS = 2.0**-100  #: accuracy of sums of a few terms, relative to the largest
 
 
 def exact(number):
@@ -31,7 +31,7 @@ def test_error_free_transformations():
 
 
 def formula(xp, *numbers):
-    """Run what the series is made of."""
+    """Run the operations of the series."""
     a, b, c, d = (Twofold(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True))
     results = [
         a + b,
@@ -98,7 +98,7 @@ def test_a_float_stands_for_its_fraction():
 
 
 def test_mixed_polynomial():
-    """Small terms are computed as floats, and that does not show."""
+    """Small terms are computed as floats, without a visible effect."""
     sine = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(8)]
     for x in np.linspace(-0.5, 0.5, 41):
         z = Twofold(float(x)) * Twofold(float(x))

@@ -1,4 +1,4 @@
-"""The unfused step: against the fused one, and against the other ways to carry it out."""
+"""The unfused step: against the fused one, and against its other implementations."""
 
 import os
 import subprocess
@@ -56,7 +56,7 @@ def check_against_fused(env, seeds):
         first = unfused.reset(seed)
         assert np.allclose(unfused.state, env.state, rtol=1e-15, atol=1e-16)
         assert np.allclose(observation, first, rtol=1e-6, atol=1e-7)
-        if unfused.program.drawn:  # what follows from drawn parameters is rounded otherwise in the script
+        if unfused.program.drawn:  # the script rounds results of drawn parameters differently
             synchronise_constants(unfused, env.drawn_task)
         steps, over = [], [False]
         act = by_agent(env.task) if seed % 2 else at_random(env.task, seed)
@@ -64,7 +64,7 @@ def check_against_fused(env, seeds):
             action = act(unfused, i)
             before, target = env.state, env.target
             unfused.state = before
-            # The fused step carries the angle's cosine and sine along; they are of this very angle now.
+            # The fused step carries the angle's cosine and sine along; they belong to exactly this angle now.
             lifted = slice(len(before), len(env._program.y))
             env._rows[lifted] = unfused.numbers[lifted]
             unfused.target = [] if target is None else np.atleast_1d(target)
@@ -81,7 +81,7 @@ def check_against_fused(env, seeds):
         np.testing.assert_allclose(own_rewards, rewards, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(own_seen, seen, rtol=1e-6, atol=1e-6)
         by_states, by_controls = env.drawn_task.scene.jacobian(starts, controls, env.task.dt)
-        # A guard that stops at an edge makes much of a rounding, which is not the motion's affair.
+        # A guard that stops at an edge amplifies a rounding, which is not the motion's fault.
         moved = np.einsum("nij,nj->ni", by_controls, own_controls - controls)
         assert np.abs(moved).max(initial=0.0) <= 1e-10
         sizes = np.maximum(np.abs(starts).max(axis=0), np.abs(ends).max(axis=0))
@@ -92,7 +92,7 @@ def check_against_fused(env, seeds):
 
 
 def synchronise_constants(unfused, task):
-    """Give the script the constants of a task; they are its own to 1e-14."""
+    """Give the script the constants of a task; they equal its own to 1e-14."""
     exact = task.formulas.constants()
     for i, name in enumerate([*unfused.program.given, *unfused.program.derived]):
         if name in exact:
@@ -173,7 +173,7 @@ def test_names_do_not_meet_when_changed_at_once():
 
 
 class Odd(OWN[2]):
-    """Its arrow is placed by what is no arithmetic on the state."""
+    """The place of its arrow is computed by more than arithmetic on the state."""
 
     id = "OwnOdd-v0"
 

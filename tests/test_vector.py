@@ -1,4 +1,4 @@
-"""The native vector environment against Gymnasium's own of the single one: the same bits."""
+"""The native vector environment against Gymnasium's own of single environments: the same bits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ each_mode = pytest.mark.parametrize("mode", MODES)
 
 
 def lasting(env_id, steps):
-    """Return the keyword that makes episodes so many of the task's own steps long, or shorter."""
+    """Return the keyword that limits episodes to so many of the task's own steps."""
     return {"duration": min(steps, TASKS[env_id].steps) * TASKS[env_id].interval}
 
 
@@ -42,7 +42,7 @@ def pair(env_id, n, mode="NextStep", **options):
 
 
 def lanes(env_id):
-    """Return how many environments the record's batch of mixed parameters has."""
+    """Return the size of the record's batch with mixed parameters."""
     (number,) = {len(values) for values in TASKS[env_id].examples.batch.values()}
     return number
 
@@ -85,10 +85,10 @@ def assert_same(a, b):
 
 
 def assert_alike(native, sync, steps, seed=0):
-    """Step both alike, return how many episodes ended.
+    """Step both alike, return the number of ended episodes.
 
-    With autoreset disabled, what is over is reset, and now and then what is not: rarely enough that half of
-    the episodes reach their end.
+    With autoreset disabled, finished episodes are reset, and now and then others too: rarely enough that half
+    of the episodes reach their end.
     """
     n, disabled = native.num_envs, native.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     stray = 0.5 / native.task.limit
@@ -103,7 +103,7 @@ def assert_alike(native, sync, steps, seed=0):
         mask = over | (rng.random(n) < stray)
         if disabled and mask.any():
             seeds = [int(rng.integers(1000)) if rng.random() < 0.2 else None for _ in range(n)]
-            # Gymnasium's pops the mask from the dict.
+            # Gymnasium's removes the mask from the dict.
             assert_same(*(e.reset(seed=seeds, options={"reset_mask": mask.copy()}) for e in (native, sync)))
     return ends
 
@@ -126,7 +126,7 @@ def test_same_bits_in_every_mode(env_id, mode, n, steps):
     native, sync = pair(env_id, n, mode, **lasting(env_id, 50))
     assert_same(native.reset(seed=3), sync.reset(seed=3))
     assert assert_alike(native, sync, steps) > n // 2
-    # Episodes go on where no new seed is given.
+    # Episodes go on if no new seed is given.
     assert_same(native.reset(), sync.reset())
     assert_alike(native, sync, 20, seed=1)
 
@@ -287,7 +287,7 @@ def test_masked_rows_are_not_looked_at():
     observations, _ = envs.reset(options={"state": state, "target": target, "reset_mask": mask})
     assert observations[1].tolist() == np.array([0.1, 0.2, 0.05, -0.25], dtype=np.float32).tolist()
     assert (observations[~mask] == first[~mask]).all() and (envs.state[~mask] == kept[~mask]).all()
-    # A target by hand holds for one episode.
+    # A target from the options holds for one episode.
     envs.reset(options={"reset_mask": mask})
     assert envs.target[1] != -0.25
 
@@ -400,7 +400,7 @@ def test_copies_go_on_alike(env_id, clone):
     before = twin.state
     for action in actions(60, envs.action_space, seed=1):
         mine = envs.step(action)
-        assert (twin.state == before).all()  # nothing in common
+        assert (twin.state == before).all()  # nothing is shared
         assert_same(mine, twin.step(action))
         before = twin.state
     assert twin.metadata == envs.metadata and twin.spec == envs.spec
@@ -458,7 +458,7 @@ def test_record_episode_statistics(mode):
     assert recorded > 10
 
 
-# --- what is refused ---
+# --- refusals ---
 
 
 def running(n, env_id="PivotedBar-v0", **options):
@@ -608,13 +608,13 @@ def test_a_refused_environment_does_not_stop_the_others(mode):
         twin.step(action[[0, 2]])
         assert (envs.state[[0, 2]] == twin.state).all()
         assert (envs.state[1] == stuck).all()
-    # Once its state is one from which it can go on, it does.
+    # Once its state allows it, it goes on.
     envs.reset(options={"state": np.zeros((3, 2)), "reset_mask": np.array([False, True, False])})
     with pytest.raises(StepRefused):
         envs.step(np.ones((3, 1)))
 
 
-# --- what a review found ---
+# --- findings of a review ---
 
 
 @each_mode

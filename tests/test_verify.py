@@ -1,4 +1,4 @@
-"""Verification: scores recomputed, the same bits again, and the numbers that the board shows."""
+"""Verification: recomputed scores, reproducible bits, and the numbers that the board shows."""
 
 import argparse
 import gzip
@@ -19,7 +19,7 @@ from lag_envs.leaderboard.verify import declare_verify, replay, run_verify, veri
 from lag_envs.scores import known_returns
 from lag_envs.tasks import TASKS
 
-#: Behind the mark the plane is tilted back; near it, against the speed.
+#: Beyond the mark the plane is tilted back; near it, against the speed.
 GAINS = {"gain": np.array([-63.0, -55.5, -43.4, 63.0]), "offset": np.zeros(1)}
 ABOUT = {"name": "x", "authors": ["A"], "license": "MIT"}
 
@@ -49,7 +49,7 @@ def test_seeds_follow_from_bytes_and_nonce():
     assert all(2**40 <= seed < 2**63 for seed in (first, *others))
 
 
-# --- what is measured ---------------------------------------------------------------------------------------
+# --- measurements -------------------------------------------------------------------------------------------
 
 
 def test_result_is_of_json_types_and_complete(result, submission):
@@ -67,7 +67,7 @@ def test_result_is_of_json_types_and_complete(result, submission):
 
 
 def test_numbers_are_those_of_single_episodes(result, submission):
-    """Returns, success, time and effort, from the single environment and in another way."""
+    """Returns, success, time and effort, computed differently from the single environment."""
     agent = submission.policies[0][1].agent()
     policy, env = result["policies"][0], gym.make(ENV)
     first = protocol.first_seed(submission.digest, "nonce", 0)
@@ -124,7 +124,7 @@ def test_bits_count_on_the_same_build_only(result, changed):
 
 
 def spoil(result, name, value, episode=None):
-    """Return a result of another build with something else in it."""
+    """Return a result of another build with one thing changed."""
     other = json.loads(json.dumps(result)) | {"build": None}
     if episode is None:
         other[name] = value
@@ -159,7 +159,7 @@ def test_a_condition_that_is_another_is_found(result):
 
 
 def test_one_episode_of_many_may_go_another_way(result):
-    """As it does where a rounding decides; but no two, and not so that it shows in the score."""
+    """As may happen if rounding decides; but not for two, and not so that it shows in the score."""
     many = json.loads(json.dumps(result)) | {"episodes": 1000, "build": None}
     for name in ("returns", "success", "settle", "effort", "reference"):
         many["policies"][0][name] = (many["policies"][0][name] * 200)[:1000]
@@ -207,7 +207,7 @@ def test_a_result_is_not_unpacked_for_ever(monkeypatch):
 
 @pytest.mark.parametrize("make", [learned, partial(built_in, name="random"), partial(built_in, name="PD")])
 def test_replays_are_of_the_verified_episodes(tmp_path, make):
-    """To the bit, also where a policy draws its actions for all episodes together."""
+    """To the bit, even if a policy draws its actions for all episodes together."""
     made = make(tmp_path / "a")
     few = verify(made, "n", 5)
     for policy in (0, len(made.policies) - 1):
@@ -411,7 +411,7 @@ def test_names_of_folders_do_nothing_to_a_terminal(tmp_path, capsys):
 
 
 def test_another_plan_as_good_is_no_difference():
-    """Of one who plans the means of efforts and times count, of others each episode's."""
+    """For a planner, the means of efforts and times count; for others, each episode's."""
     n = 1000
     kept = {
         "returns": [100.0] * n, "reference": None, "success": [True] * n,

@@ -1,4 +1,4 @@
-"""Work in other processes: whoever dies or hangs costs only itself, and nobody outlives the one who asked."""
+"""Work in other processes: one that dies or hangs loses only its own, and none outlives its parent."""
 
 import os
 import signal
@@ -87,7 +87,7 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
 
 def test_a_cluster_that_does_not_start(monkeypatch):
     def init(*args, **kwargs):
-        raise Exception("The current node timed out during startup.")  # as Ray does
+        raise Exception("The current node timed out during startup.")  # like Ray
 
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
     with (

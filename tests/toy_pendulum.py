@@ -1,4 +1,4 @@
-"""A scene and a task on it outside the package, as CONTRIBUTING.md has them."""
+"""A scene and a task on it outside the package, as in CONTRIBUTING.md."""
 
 from lag_envs.scenes import Scene, parameter
 from lag_envs.scenes.shapes import Circle, Line

@@ -1,4 +1,4 @@
-"""Trainings for tests: they can be interrupted at a step that is chosen."""
+"""Trainings for tests, which can be interrupted at a chosen step."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ def go(run, until=10**9):
 
 
 def kill_and_interrupt(*arguments):
-    """Kill a script that trains, start it again, interrupt it; return what it printed then."""
+    """Kill a training script, start it again, interrupt it; return its output then."""
     path = os.pathsep.join(filter(None, [str(ROOT / "src"), os.getenv("PYTHONPATH")]))
     for number in (signal.SIGKILL, signal.SIGINT):
         process = subprocess.Popen(

@@ -2,9 +2,9 @@
 
 ``python -m tools.double_pendulum CHECKOUT`` needs a checkout of
 github.com/dfki-ric-underactuated-lab/double_pendulum, and SciPy, SymPy and PyYAML. It compares parameters and
-accelerations, and runs the project's own LQR, with its friction compensation, from near upright on both: on
-its simulator, which takes a Runge-Kutta step in each control interval, and on ours. It fails where they
-differ by more than that integrator's error.
+accelerations, and runs the project's own LQR, with its friction compensation, from near upright on both its
+simulator, which takes a Runge-Kutta step in each control interval, and ours. It fails if the results differ
+by more than that integrator's error.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROBOTS = {"AcrobotReal-v0": 1, "PendubotReal-v0": 0}
 #: Our order of the state from theirs: (angles, rates).
 ORDER = [0, 2, 1, 3]
 START = [np.pi + 0.05, -0.03, 0.0, 0.0]
-#: What the idle motor may give [N m], and the friction that was identified.
+#: Torque limit of the idle motor [N m], and the identified friction.
 IDLE = 0.5
 FRICTION = {"damping": 0.001, "damping_2": 0.001, "dry_friction": 0.16, "dry_friction_2": 0.12}
 
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def check(env_id: str, joint: int, checkout: Path) -> bool:
-    """Compare one task with the project's plant, simulator and LQR, print what was found, and judge it."""
+    """Compare one task with the project's plant, simulator and LQR, and print and judge the results."""
     from double_pendulum.analysis.leaderboard import get_swingup_time  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
     from double_pendulum.model.plant import DoublePendulumPlant  # type: ignore[import-not-found]
@@ -57,7 +57,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
     limits[joint] = float(env.task.limit_control)
     theirs.set_torque_limit(limits)
     plant = DoublePendulumPlant(model_pars=theirs)
-    # Both motors and all friction: theirs compensates the idle joint's by its motor, ours has left it out.
+    # Both motors and all friction: theirs compensates the idle joint's by its motor, ours leaves it out.
     names = {name: getattr(env.scene, name) for name in env.scene._numbers()}
     whole = type(env.scene)(control="both", **(names | FRICTION))
 
@@ -69,7 +69,7 @@ def check(env_id: str, joint: int, checkout: Path) -> bool:
         t0=0.0, x0=START, tf=env.task.duration, dt=env.task.dt, controller=published(theirs, joint)
     )
     path = np.array(states)[:, ORDER]
-    # Each of their steps, once more from where it began.
+    # Each of their steps, repeated from its start.
     alone = [whole.simulate(y, [u], env.task.dt)[1] for y, u in zip(path[:-1], torques, strict=True)]
     local = float(np.median(np.abs(np.array(alone) - path[1:]).max(axis=1)))
     print(f"  their torques on ours, step by step: {local:.1e} apart in the median")
@@ -105,7 +105,7 @@ def accelerations(scene: Any, plant: Any) -> float:
 
 
 def published(theirs: Any, joint: int) -> Any:
-    """Return the project's LQR as its leaderboard has it, with friction compensated as on its machine."""
+    """Return the project's LQR as on its leaderboard, with friction compensated as on its machine."""
     from double_pendulum.controller.lqr.lqr_controller import LQRController  # type: ignore[import-not-found]
     from double_pendulum.model.model_parameters import model_parameters  # type: ignore[import-not-found]
 

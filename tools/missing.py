@@ -1,7 +1,8 @@
-"""What has been measured and drawn of each environment, and what has not yet: ``python -m tools.missing``.
+"""The generated data and pictures that each environment has or lacks: ``python -m tools.missing``.
 
-A new environment works before anything is generated for it: pages say "not measured yet", and the tests that
-compare with what is kept take the environments that have it. With what lacks come the commands that make it.
+A new environment works before anything is generated for it: pages say "not measured yet", and tests that
+compare with stored results use the environments that have them. Missing items are listed with the commands
+that make them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import known
 
 ROOT = Path(__file__).parents[1]
-#: What there is to generate, with the command; ID stands for the environment.
+#: Everything that can be generated, with its command; ID stands for the environment.
 COMMANDS = {
     "returns": "python -m agents.scale ID --output src/lag_envs/tasks/measured.json",
     "rollouts": "python tests/golden_rollouts.py ID",
@@ -32,18 +33,18 @@ COMMANDS = {
     "accuracy": "make report ARGS='--docs .'",
     "picture": "python -m tools.docs --pictures",
 }
-#: What only some environments have.
+#: Items that only some environments have.
 SOME = ("plan", "value iteration", "behaviour", "board", "accuracy", "picture")
 
 
 def have(what: str) -> list[str]:
-    """Return the ids of which something is there; `COMMANDS` has what that may be."""
+    """Return the ids that have an item, one of the keys of `COMMANDS`."""
     there = _there(what)
     return [env_id for env_id in TASKS if env_id in there]
 
 
 def missing(env_id: str) -> dict[str, str]:
-    """Return what lacks of an environment, and the command that makes it."""
+    """Return the missing items of an environment, with their commands."""
     task = TASKS[env_id]
     for_all = [what for what in COMMANDS if what not in SOME]
     if task.value_iteration:
@@ -51,7 +52,7 @@ def missing(env_id: str) -> dict[str, str]:
     if task.plans is not None:
         for_all.append("plan")
     if task.goal:
-        for_all += ["behaviour", "board", "picture"]  # of the agents on the board, and its best one's
+        for_all += ["behaviour", "board", "picture"]  # of the agents on the board, and of the best one
     if not task.imperfections:
         for_all.append("accuracy")
     return {what: COMMANDS[what].replace("ID", env_id) for what in for_all if env_id not in _there(what)}
@@ -114,7 +115,7 @@ def _measured_errors() -> Iterable[str]:
 
 
 def main() -> int:
-    """Print what lacks; return 1 where something does."""
+    """Print the missing items; return 1 if there are any."""
     rows = [[env_id, what, command] for env_id in TASKS for what, command in missing(env_id).items()]
     print("\n".join(columns([["environment", "what lacks", "command"], *rows])) if rows else "Nothing lacks.")
     return 1 if rows else 0

@@ -1,1 +1,1 @@
-"""The documentation's site: what MkDocs does not do by itself, and what is generated from records."""
+"""The documentation's site: extensions of MkDocs, and pages generated from records."""

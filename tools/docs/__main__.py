@@ -1,7 +1,7 @@
-"""Write what is generated from the environments' records into README and docs: ``python -m tools.docs``.
+"""Write the texts generated from the environments' records into README and docs: ``python -m tools.docs``.
 
 ``python -m tools.docs --pictures`` also draws the environments' moving pictures, from episodes of the
-leaderboard's best learned agents; with ids, those of these environments.
+leaderboard's best learned agents; with ids, only theirs.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from tools.docs.environments import ROOT, by_scene
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the generated texts of this checkout."""
     parser = argparse.ArgumentParser(
-        prog="python -m tools.docs", description="Write what follows from records."
+        prog="python -m tools.docs", description="Write the texts generated from records."
     )
     parser.add_argument(
-        "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; by default all"
+        "--pictures", nargs="*", metavar="ID", help="draw moving pictures too; all by default"
     )
     args = parser.parse_args(arguments)
     for path, text in generated(ROOT).items():
@@ -36,14 +36,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def generated(root: Path) -> dict[Path, str]:
-    """Return the generated files, as they ought to be."""
+    """Return the generated files as they should be."""
     readme = root / "README.md"
     text = replaced(readme.read_text(encoding="utf-8"), "environments", by_scene(source))
     return {readme: text}
 
 
 def source(env_id: str) -> str:
-    """Return where an environment's record is, for who reads README without the site."""
+    """Return the place of an environment's record, for readers of README without the site."""
     return f"src/{TASKS[env_id].__module__.replace('.', '/')}.py"
 
 

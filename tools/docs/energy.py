@@ -1,8 +1,8 @@
 """Gymnasium's environments and ours with the same spaces: one policy in both, and energy against time.
 
 ``python -m tools.docs.energy`` prints the returns of a task's reference controller in both, and draws
-``docs/images/energy-ID.png``. Plotted is the energy less the work that the control has done since the start,
-over random actions: nothing rubs in these three, so it must stay what it was.
+``docs/images/energy-ID.png``. It plots the energy minus the control's work since the start, under random
+actions: these three systems have no friction, so the difference must stay constant.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 def with_peer() -> dict[str, str]:
-    """Return the ids of Gymnasium by our own."""
+    """Return Gymnasium's ids by our own."""
     return {env_id: TASKS[env_id].peer for env_id in TASKS if TASKS[env_id].peer}
 
 
@@ -48,10 +48,10 @@ def returns(env_id: str, agent: Any, episodes: int) -> Array:
 
 
 def balance(scene: Scene, states: Array, controls: Array) -> Array:
-    """Return the energy less the control's work [J] along states (n + 1, n_state), controls held between.
+    """Return the energy minus the control's work [J] along states (n + 1, n_state), controls held between.
 
-    The control is a force or torque on coordinates, the same wherever the system is, so its work in a step is
-    that times their change.
+    The control is a constant force or torque on coordinates, independent of the state, so its work in a step
+    is that force times their change.
     """
     layout = scene._layout
     places = [layout.state.index(e) for e in layout.state if e.kind == "place"]
@@ -77,7 +77,7 @@ def _forces(scene: Any, control: float) -> dict[str, float]:
 def paths(env_id: str, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Return times [s] and balances [J] of the same random actions in both, over an episode's length.
 
-    Both start in the same state in mid-task, and go on where an episode would end.
+    Both start from the same state of mid-task motion, and continue past the end of an episode.
     """
     task = TASKS[env_id]()
     peer, theirs = PEERS[task.peer], gym.make(task.peer, disable_env_checker=True).unwrapped

@@ -1,7 +1,7 @@
-"""An environment's page, generated from its record: what people decided, what was measured, what follows.
+"""An environment's page, generated from its record: its design, its measurements, derived formulas.
 
-Headings are Gymnasium's. Prose is the docstring's, section by section; every table, number and formula comes
-from the task, from ``measured.json``, from the board and from the accuracy report.
+The headings are Gymnasium's. Prose is the docstring's, section by section; all tables, numbers and formulas
+come from the task, from ``measured.json``, from the board and from the accuracy report.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def page(
     board : mapping, optional
         The environment's part of `lag_envs.leaderboard.standings.board_data`.
     accuracy : mapping, optional
-        What ``docs/accuracy.json`` holds.
+        The contents of ``docs/accuracy.json``.
     """
     task: Task = TASKS[env_id]()
     prose = {name: _linked(text) for name, text in sections(type(task)).items()}
@@ -98,17 +98,17 @@ def index() -> str:
 
 {overview("{}.md".format)}
 
-Mean return ± standard error of random actions and of the best policy known, as `python -m agents.scale`
-measured them.
+Mean return ± standard error of random actions and of the best policy known, as measured by
+`python -m agents.scale`.
 
-Actions lie in [-1, 1] and are scaled to the control, or are choices; environments that are Gymnasium's with
-exact motion have Gymnasium's spaces. Observations are float32, the state behind them float64.
+Actions lie in [-1, 1] and are scaled to the control, or are choices; exact versions of Gymnasium's
+environments have Gymnasium's spaces. Observations are float32, the underlying state float64.
 [Usage](../usage.md#keywords-of-every-environment) has the keywords that all of them take.
 """
 
 
 def overview(link: Callable[[str], str]) -> str:
-    """Return the table of all environments; `link` tells where an id's page is."""
+    """Return the table of all environments; `link` returns the address of an id's page."""
     rows = []
     for env_id in TASKS:
         task = TASKS[env_id]()
@@ -129,7 +129,7 @@ def overview(link: Callable[[str], str]) -> str:
 
 
 def by_scene(source: Callable[[str], str]) -> str:
-    """Return a short table: scenes and the ids of their tasks; `source` tells where an id's file is."""
+    """Return a short table: scenes and the ids of their tasks; `source` gives the address of an id's file."""
     files: dict[str, list[str]] = {}
     for env_id in TASKS:
         files.setdefault(source(env_id), []).append(env_id)
@@ -167,8 +167,8 @@ def _energy(env_id: str, task: Task) -> str:
         return ""
     return (
         f"![Energy less work against time in {task.peer} and {env_id}](../images/energy-{env_id}.png)\n\n"
-        "The energy less the work that the control has done, under random actions from a start in mid-task. "
-        "Nothing rubs, so it must stay what it was."
+        "The energy minus the work that the control has done, under random actions from a start in mid-task. "
+        "There is no friction, so it must stay constant."
     )
 
 
@@ -185,7 +185,7 @@ def _summary(env_id: str, task: Task) -> str:
 
 
 def _box(space: Any) -> str:
-    """Return a box without its bounds where they differ; the table below has them."""
+    """Return a box without its bounds if they differ; the table below has them."""
     ends = {float(x) for x in space.low}, {float(x) for x in space.high}
     if all(len(end) == 1 for end in ends):
         return f"Box({number(ends[0].pop())}, {number(ends[1].pop())}, {space.shape}, {space.dtype})"
@@ -222,7 +222,7 @@ def _observation(task: Task) -> str:
 
 
 def _bound(value: Any) -> str:
-    """Return a bound with four digits; the largest float32 stands for none."""
+    """Return a bound with four digits; the largest float32 means no bound."""
     if abs(value) >= np.finfo(np.float32).max:
         return "-∞" if value < 0 else "∞"
     return f"{float(value):.4g}"
@@ -297,7 +297,7 @@ def derivation(scene: Scene) -> str:
     kind, symbols = type(scene), scene._numbers()
     choices = ((f.name, getattr(scene, f.name)) for f in parameters(kind) if f.name not in symbols)
     lagrangian, *motion = map(equations.mathml, _derived(kind, tuple(choices)))
-    return "\n\n".join(["The Lagrangian, T - V:", lagrangian, "and what follows from it:", *motion])
+    return "\n\n".join(["The Lagrangian, T - V:", lagrangian, "and the equations of motion:", *motion])
 
 
 def _equations(task: Task) -> str:
@@ -320,23 +320,24 @@ def _accuracy(env_id: str, task: Task, accuracy: Mapping[str, Any] | None) -> st
         order = task.scene.step_bound(task.centre, task.limit_control, task.dt).order
         rate = f"{task.scene._layout.free[0]}_dot"
         texts.append(
-            f"Stepped by a Taylor series of order {order}. One series per step is certified to leave out "
-            f"at most 1e-12 rad/s as long as |`{rate}`| is at most {math.floor(10.0 * speed) / 10.0:.1f} "
-            "rad/s, whatever the control. Above that the step is divided, by the same bound."
+            f"Stepped by a Taylor series of order {order}. One series per step is certified to have a "
+            f"truncation error of at most 1e-12 rad/s as long as |`{rate}`| is at most "
+            f"{math.floor(10.0 * speed) / 10.0:.1f} rad/s, whatever the control. Above that, the step is "
+            "divided by the same bound."
         )
     if task.scene._form is None:
         texts.append(
-            "Stepped by Taylor series. Each comes with a proved bound on what it leaves out: at most "
-            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. Where that does not help, "
-            "say with a link of a millimetre, an error names state and control, and the state is kept."
+            "Stepped by Taylor series. Each comes with a proved bound on its truncation error: at most "
+            f"{TOLERANCE:.0e} of the velocities' size, or the step is divided. If that does not help, for "
+            "example with a link of a millimetre, an error names state and control, and the state is kept."
         )
     for row in _summary_rows(accuracy, "environments"):
         if row["environment"] == env_id:
             texts.append(
                 "Measured against 40-digit arithmetic, over whole episodes of random actions: the largest "
                 f"error of a single step is {row['one step']:.1e} of the state's size, that of an episode "
-                f"{row['whole episode']:.1e}, which is {number(row['error / rounding floor'])} times what "
-                "one rounding of the start grows to by itself. See [Accuracy](../accuracy.md)."
+                f"{row['whole episode']:.1e}, which is {number(row['error / rounding floor'])} times one "
+                "rounding of the start, as amplified by the system. See [Accuracy](../accuracy.md)."
             )
     return "\n\n".join(texts)
 
@@ -363,12 +364,12 @@ def _returns(env_id: str) -> str:
         for name, text in names.items()
         if (row := found["measured"].get(name))
     ]
-    text = "Mean return ± standard error, as `python -m agents.scale` measured them:"
+    text = "Mean return ± standard error, as measured by `python -m agents.scale`:"
     return f"{text}\n\n{markdown_table(['Policy', 'Return', 'Episodes'], rows)}"
 
 
 def _open(env_id: str) -> str:
-    """Return that nobody has solved it, and what was tried."""
+    """Return the statement that nobody has solved it, and the list of attempts."""
     task = TASKS[env_id]
     if task.open is None:
         return ""
@@ -383,7 +384,7 @@ def _open(env_id: str) -> str:
         [name, budget, plus_minus(row["mean"], row["error"]) if (row := found.get(name)) else ""]
         for name, budget in task.open.tried.items()
     ]
-    return f"{text}What was tried:\n\n{markdown_table(['Method', 'Budget', 'Return'], rows)}"
+    return f"{text}Tried so far:\n\n{markdown_table(['Method', 'Budget', 'Return'], rows)}"
 
 
 def _agents(env_id: str, task: Task, board: Mapping[str, Any] | None) -> str:
@@ -411,7 +412,7 @@ def _interval(row: Mapping[str, Any]) -> str:
     return f"{low:.4f} to {high:.4f}"
 
 
-# --- what pages are made from -------------------------------------------------------------------------------
+# --- sources of the pages -----------------------------------------------------------------------------------
 
 
 def pages(data: Mapping[str, Any], root: Path = ROOT, env_ids: Iterable[str] = TASKS) -> dict[str, str]:
@@ -420,11 +421,11 @@ def pages(data: Mapping[str, Any], root: Path = ROOT, env_ids: Iterable[str] = T
     Parameters
     ----------
     data : mapping
-        What `lag_envs.leaderboard.standings.board_data` returns.
+        The result of `lag_envs.leaderboard.standings.board_data`.
     root : Path, optional
         The checkout.
     env_ids : iterable of str, optional
-        Which ones; by default all.
+        Which ones; all by default.
     """
     accuracy = json.loads((root / "docs" / "accuracy.json").read_text(encoding="utf-8"))
     boards = {one["id"]: one for one in data["environments"] if not one["frozen"]}

@@ -1,6 +1,6 @@
 """A scene's formulas as LaTeX, derived by SymPy from its Lagrangian, and LaTeX as MathML.
 
-Browsers draw MathML themselves, so a page needs neither a script nor a font for its formulas.
+Browsers draw MathML themselves, so a page needs no script and no font for its formulas.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def equations(scene: Scene) -> list[str]:
 
 
 def with_numbers(scene: Scene) -> str:
-    """Return the acceleration of the only free coordinate with the scene's numbers in place of symbols."""
+    """Return the acceleration of the only free coordinate, with the scene's numbers inserted."""
     (name,) = scene._layout.free
     acceleration = sympy.Function(name, real=True)(symbolic.t).diff(symbolic.t, 2)
     equation = _tidied(symbolic.euler_lagrange(scene, name))
@@ -68,7 +68,7 @@ def with_numbers(scene: Scene) -> str:
 
 
 def _tidied(expression: Any) -> Any:
-    """Simplify by the identities that mechanics needs; `sympy.simplify` takes ten times as long."""
+    """Simplify by the identities that mechanics needs; `sympy.simplify` is ten times slower."""
     expression = sympy.expand(expression)
     for angle in sorted({f.args[0] for f in expression.atoms(sympy.sin, sympy.cos)}, key=str):
         sine, cosine = sympy.sin(angle), sympy.cos(angle)
@@ -88,7 +88,7 @@ def _accelerations(scene: Scene) -> list[Any]:
 def _latex(scene: Scene, expression: Any) -> str:
     """Print an expression: dots for derivatives in time, and the letters of the scene's docstring.
 
-    The symbols' names put factors into an order: parameters as they are declared, then the motion.
+    The symbols' names order the factors: parameters in the order of their declaration, then the motion.
     """
     t, steps, shown = symbolic.t, [{}, {}, {}, {}], {}
 
@@ -108,9 +108,9 @@ def _latex(scene: Scene, expression: Any) -> str:
     for known in expression.free_symbols:
         if known.name in order:
             take(3, known, f"a{order[known.name]:02}", symbol(type(scene), known.name))
-    for step in steps:  # derivatives before what they are of
+    for step in steps:  # derivatives before their functions
         expression = expression.xreplace(step)
-    for i, angle in enumerate(sorted(expression.atoms(sympy.atan), key=str)):  # SymPy leaves brackets out
+    for i, angle in enumerate(sorted(expression.atoms(sympy.atan), key=str)):  # SymPy omits the brackets
         within = sympy.latex(angle.args[0], symbol_names=shown)
         shown[known := sympy.Symbol(f"y{i}")] = rf"\arctan({within})"
         expression = expression.xreplace({angle: known})
@@ -123,10 +123,10 @@ def _word(name: str) -> str:
 
 
 def mathml(latex: str, block: bool = True) -> str:
-    """Return a formula as MathML that carries its LaTeX; as a block it can be scrolled sideways."""
+    """Return a formula as MathML that includes its LaTeX; a block formula can be scrolled sideways."""
     element = convert(latex, display="block" if block else "inline")
     head, body = re.fullmatch(r"(<math[^>]*>)(.*)</math>", element, re.DOTALL).groups()  # type: ignore[union-attr]
-    # A letter after the other, upright, is a word.
+    # Several upright letters in a row are a word.
     body = re.sub(
         r'(?:<mi mathvariant="normal">[a-z]</mi>|<mtext>&#x000A0;</mtext>){2,}',
         lambda word: "<mtext>" + re.sub(r"<[^>]+>", "", word[0]) + "</mtext>",

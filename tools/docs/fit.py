@@ -1,7 +1,8 @@
 """The recording of `docs/fit.md` and the picture of its residuals: ``python -m tools.docs.fit``.
 
-There is no real recording that could be passed on. This one is simulated, by SciPy's integrator on the
-textbook's equation, not by this package. It then gets what a film has: noise, tenths of degrees, lost frames.
+There is no real recording that could be passed on. This one is simulated with SciPy's integrator from the
+textbook's equation, not with this package. It then gets the flaws of a film: noise, rounding to tenths of
+degrees, lost frames.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ PICTURE = ROOT / "docs" / "images" / "fit-residuals.png"
 #: The rod: mass [kg], length [m], damping [N m s], gravity [m/s²].
 ROD = {"mass": 0.12, "length": 0.5, "damping": 0.002, "gravity": 9.81}
 FRAMES, RATE = 240, 30
-#: Angle at first, and noise [degrees].
+#: Initial angle, and noise [degrees].
 RELEASED, NOISE = 70.0, 0.6
 
 
 def recording() -> str:
-    """Return the recording as a table: seconds, and degrees from where the rod hangs."""
+    """Return the recording as a table: seconds, and degrees from hanging at rest."""
     from scipy.integrate import solve_ivp
 
     inertia = ROD["mass"] * ROD["length"] ** 2 / 3.0
@@ -53,14 +54,14 @@ def recording() -> str:
 
 
 def fitted() -> Fit:
-    """Return what the page finds."""
+    """Return the page's numbers."""
     angle = np.genfromtxt(RECORDING, delimiter=",", skip_header=1)[:, 1]
     states = np.column_stack([np.pi + np.radians(angle), np.full_like(angle, np.nan)])
     return Pendulum(mass=ROD["mass"]).fit([(states, None, 1.0 / RATE)], ["length", "damping"])
 
 
 def main() -> int:
-    """Write the recording, fit it, draw what is left."""
+    """Write the recording, fit it, draw the residuals."""
     from agents.figures import save
 
     write(RECORDING, recording())

@@ -1,4 +1,4 @@
-"""What MkDocs calls while it builds the site: it adds generated pages, the root's files and the board."""
+"""Hooks that MkDocs calls to build the site: they add generated pages, the root's files and the board."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "src"), str(ROOT)]
 
-#: Files of the checkout that are pages of the site too.
+#: Files of the checkout that become pages of the site too.
 ROOT_FILES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "NOTICE.md": "notice.md"}
 SOURCE = "https://github.com/lag-envs/lag-envs/blob/main/"
-#: Where the leaderboard's page is, and the folder of the environments' pages.
+#: Places of the leaderboard's page and of the environments' pages.
 BOARD, ENVIRONMENTS = "board", "environments"
 
 
 @cache
 def board() -> dict[str, Any]:
-    """Return what the leaderboard's page is made from."""
+    """Return the data of the leaderboard's page."""
     from lag_envs.leaderboard.board import Board
     from lag_envs.leaderboard.standings import page_data
 
@@ -35,7 +35,7 @@ def board() -> dict[str, Any]:
 
 @cache
 def generated() -> dict[str, str]:
-    """Return the pages that are generated, by their place in the site."""
+    """Return the generated pages, by their place in the site."""
     from tools.docs import environments, scenes
 
     found = {
@@ -57,7 +57,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the generated pages, and those of the root."""
+    """Add the generated pages, and those from the root."""
     texts = generated() | {
         place: (ROOT / name).read_text(encoding="utf-8") for name, place in ROOT_FILES.items()
     }
@@ -80,7 +80,7 @@ def board_pages(config: MkDocsConfig) -> dict[str, str | bytes]:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fill in the scenes' names, and point links that leave the folder docs to the site or to the source."""
+    """Fill in the scenes' names, and redirect links out of the folder docs to the site or to the source."""
     from lag_envs.scenes import SCENES
 
     names = ", ".join(sorted(kind.__name__ for kind in SCENES))

@@ -1,4 +1,4 @@
-"""Small parts of Markdown pages: docstrings cut at their headings, numbers."""
+"""Small parts of Markdown pages: docstrings split at their headings, numbers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def first_line(kind: type) -> str:
 
 
 def sections(kind: type) -> dict[str, str]:
-    """Return a docstring's text by its ``##`` headings; what comes before them goes by the empty heading."""
+    """Return a docstring's text by its ``##`` headings; text before them has the empty heading."""
     parts = re.split(r"^## (.+)$", inspect.getdoc(kind) or "", flags=re.MULTILINE)
     return dict(zip(["", *parts[1::2]], (part.strip() for part in parts[::2]), strict=True))
 
 
 def number(value: float) -> str:
-    """Return a number as a reader writes it.
+    """Return a number as people write it.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def plus_minus(mean: float, error: float) -> str:
 
 
 def described(kind: type) -> dict[str, str]:
-    """Return what a numpydoc docstring says of each of its parameters."""
+    """Return a numpydoc docstring's description of each parameter."""
     text = inspect.getdoc(kind) or ""
     block = re.search(r"^Parameters\n-+\n(.*?)(?=^\w[^\n]*\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL)
     found: dict[str, str] = {}
@@ -70,5 +70,5 @@ def groups(kind: type) -> dict[str, list[str]]:
 
 
 def cell(value: Any) -> str:
-    """Return a default value as a reader types it."""
+    """Return a default value as people type it."""
     return number(value) if isinstance(value, float) else repr(value)

@@ -14,16 +14,16 @@ from lag_envs.leaderboard.board import Board
 from lag_envs.leaderboard.standings import board_data
 from lag_envs.tasks import TASKS
 
-#: Pictures a second, and the largest file [bytes].
+#: Frames per second, and the largest file [bytes].
 RATE, LARGEST = 15, 300_000
-#: Score from which on a learned agent is shown, and not the best of all.
+#: Above this score, a learned agent is shown instead of the best of all.
 GOOD = 0.8
-#: Widths [pixels], qualities, and which pictures are kept; the first that makes a file small enough is taken.
+#: Widths [pixels], qualities, and strides of frames; the first that makes a small enough file is taken.
 CHOICES = ((480, 60, 1), (480, 40, 1), (400, 40, 1), (360, 30, 1), (360, 30, 2), (320, 20, 3))
 
 
 def draw(board: Path, folder: Path, envs: Collection[str]) -> None:
-    """Draw environments of a board: the best learned agent if it is good, else the best of all."""
+    """Draw environments of a board: the best learned agent if it is good, otherwise the best of all."""
     folder.mkdir(parents=True, exist_ok=True)
     for found in board_data(Board(board))["environments"]:
         rows = [row for row in found["rows"] if row["replays"] and row["rank"] is not None]
@@ -36,7 +36,7 @@ def draw(board: Path, folder: Path, envs: Collection[str]) -> None:
 
 
 def frames(env_id: str, replay: Mapping[str, Any]) -> tuple[list[Image.Image], float]:
-    """Return pictures of a recorded episode, and the seconds between them."""
+    """Return frames of a recorded episode, and the seconds between them."""
     task = TASKS[env_id]()
     viewer = Viewer(task, "rgb_array")
     controls = task.wanted(replay["actions"])
@@ -54,7 +54,7 @@ def frames(env_id: str, replay: Mapping[str, Any]) -> tuple[list[Image.Image], f
 
 
 def write(path: Path, pictures: list[Image.Image], seconds: float) -> None:
-    """Write an animation that loops, in the best quality that is not too large."""
+    """Write an animation that loops, in the best quality that fits the size limit."""
     for width, quality, every in CHOICES:
         size = width, round(pictures[0].height * width / pictures[0].width)
         first, *rest = (picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures[::every])

@@ -18,7 +18,7 @@ def page() -> str:
     parts = [
         "# Scenes",
         "A scene states its kinetic and potential energy, its drag and its applied forces. Everything on "
-        "this page follows from them: SymPy derives the formulas below from the energies that are "
+        "this page follows from them: SymPy derives the formulas below from the same energies that are "
         "stepped. [Physics](physics.md) says more about the first three, [the tutorial](tutorial.md) how "
         "to write one.",
         markdown_table(["scene", "", "state", "control"], [_row(kind) for kind in SCENES]),

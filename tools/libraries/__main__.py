@@ -1,8 +1,8 @@
-"""Run every library that we name by its own scripts on our environments: ``make test-libraries``.
+"""Run every library that we name, with its own scripts, on our environments: ``make test-libraries``.
 
-`libraries.toml` says what is installed, each library in an environment of its own in ``.venv-libraries``, and
-what is run there. Scripts that no wheel holds are downloaded at a commit, and checked against a digest. Where
-one cannot be had, or a library not be installed, the table says so.
+`libraries.toml` lists the packages to install, each library in a virtual environment of its own in
+``.venv-libraries``, and the scripts to run. Scripts that no wheel contains are downloaded at a fixed commit
+and checked against a digest. If a script or a library is not available, the table says so.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ QUIET = {
     "RAY_AUTH_MODE": "disabled",
     "RAY_USAGE_STATS_ENABLED": "0",
     "PYTHONUNBUFFERED": "1",
-    # The networks are small: threads would wait for each other.
+    # The networks are small: threads would only wait for each other.
     "OMP_NUM_THREADS": "1",
 }
 
 
 class NotRun(Exception):
-    """Something that a run needs cannot be had; the text says what."""
+    """Something that a run needs is not available; the text says what."""
 
 
 class Failed(Exception):
-    """A run went wrong; the text says how."""
+    """A run failed; the text says how."""
 
 
 def libraries() -> dict[str, Any]:
@@ -63,7 +63,7 @@ def libraries() -> dict[str, Any]:
 
 
 def install(name: str, library: dict[str, Any], wheel: Path) -> Path:
-    """Make or update a library's environment, with our wheel in it; return its folder of programs."""
+    """Make or update a library's virtual environment, with our wheel in it; return its folder of programs."""
     home = HOME / name
     python = home / "bin" / "python"
     pip = [python, "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
@@ -74,7 +74,7 @@ def install(name: str, library: dict[str, Any], wheel: Path) -> Path:
             _quietly([sys.executable, "-m", "venv", "--clear", home])
         _quietly([*pip, *pins])
         stamp.write_text(json.dumps(pins))
-    # Our requirements are checked by pip, except where a library's own pins are older than they allow.
+    # pip checks our requirements, except if a library's own pins are older than they allow.
     _quietly([*pip, "--force-reinstall", "--no-deps", wheel])
     if not library.get("older", False):
         _quietly([*pip, wheel])
@@ -102,9 +102,9 @@ def fetch(source: dict[str, Any], path: str, digest: str) -> bytes:
     Raises
     ------
     NotRun
-        Where it cannot be downloaded.
+        If it cannot be downloaded.
     Failed
-        Where it is not the file that was looked at.
+        If it is not the expected file.
     """
     kept = HOME / "scripts" / source["repository"] / source["commit"] / path
     if kept.exists():
@@ -125,7 +125,7 @@ def fetch(source: dict[str, Any], path: str, digest: str) -> bytes:
 
 
 def scripts(entry: dict[str, Any]) -> dict[str, str]:
-    """Return the files of a run by name, with what is replaced in them."""
+    """Return the files of a run by name, with replacements made in them."""
     source = entry.get("source", {"files": {}})
     texts = {Path(p).name: fetch(source, p, digest).decode() for p, digest in source["files"].items()}
     for old, new in entry.get("replace", []):
@@ -160,7 +160,7 @@ def run(name: str, number: int, entry: dict[str, Any], programs: Path) -> float:
             status: int | None = process.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             status = None
-        finally:  # whatever it has left running
+        finally:  # end everything that it has left running
             try:
                 os.killpg(process.pid, signal.SIGKILL)
             except ProcessLookupError:
@@ -218,14 +218,14 @@ def test(name: str, library: dict[str, Any], wheel: Path) -> list[dict[str, Any]
 
 
 def outcome(row: dict[str, Any]) -> str:
-    """Return what came of a run, in words."""
+    """Return a run's outcome, in words."""
     if row["result"] == "passed":
         return f"passed, {row['seconds']} s"
     return f"{row['result']}: {row['reason'].splitlines()[0]}"
 
 
 def table(found: dict[str, Any]) -> str:
-    """Return the results as the page shows them."""
+    """Return the results as shown on the page."""
     about = f"Python {found['python']}, {found['system']}, {found['date']}; `make test-libraries`."
     rows = [
         [row["library"], row["version"], row["gymnasium"], row["what"], outcome(row)] for row in found["rows"]
@@ -242,11 +242,11 @@ def write_page(found: dict[str, Any]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all libraries, or some; return 1 where a run failed, or none could be made."""
+    """Run all libraries, or some; return 1 if a run failed, or none was possible."""
     known = libraries()
     parser = argparse.ArgumentParser(
         prog="make test-libraries ARGS=...",
-        description="Run every library that we name by its own scripts on our environments.",
+        description="Run every library that we name, with its own scripts, on our environments.",
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"some of {', '.join(known)} (default: all)")
     parser.add_argument("--docs", action="store_true", help="write the results into docs/libraries.md")
@@ -258,7 +258,7 @@ def main(arguments: list[str] | None = None) -> int:
     wheel = build_wheel()
     rows = [row for name in args.names or known for row in test(name, known[name], wheel)]
     if args.docs:
-        # What was not run now keeps its last result.
+        # Libraries that were not run now keep their last result.
         old = json.loads(RESULTS.read_text())["rows"] if args.names and RESULTS.exists() else []
         rows_of = {n: [r for r in rows if r["key"] == n] or [r for r in old if r["key"] == n] for n in known}
         system = f"{platform.system()} {platform.machine()}"

@@ -1,7 +1,7 @@
 """Every wrapper of Gymnasium, single and vector, around each of our environments; its checkers; its `play`.
 
-``python gymnasium_wrappers.py single|vector|checkers|play``. A wrapper that is not listed here is an
-error, so that none which a new release brings is missed.
+``python gymnasium_wrappers.py single|vector|checkers|play``. A wrapper that is not listed here is an error,
+so that no wrapper of a new release is missed.
 """
 
 import sys
@@ -23,7 +23,7 @@ from gymnasium.vector import AutoresetMode
 import lag_envs
 
 STEPS = 60
-#: Of no use to any environment but one kind.
+#: Wrappers for a single kind of environment.
 ELSEWHERE = {"AtariPreprocessing": "for Atari games only"}
 
 
@@ -33,7 +33,7 @@ def pixels(env):
 
 
 def image(envs):
-    """Return a vector environment whose observations are made pictures, which some wrappers ask for."""
+    """Return a vector environment whose observations are made pictures, as some wrappers require."""
     one = spaces.Box(0, 255, (16, 16, 3), np.uint8)
     many = spaces.Box(0, 255, (envs.num_envs, 16, 16, 3), np.uint8)
     show = lambda o: np.broadcast_to(np.uint8(127 * np.tanh(o[:, :1]) + 128)[:, None, None], many.shape)  # noqa: E731
@@ -41,14 +41,14 @@ def image(envs):
 
 
 def as_dict(envs):
-    """Return a vector environment whose observations are dicts, which some wrappers ask for."""
+    """Return a vector environment whose observations are dicts, as some wrappers require."""
     one = spaces.Dict({"a": envs.single_observation_space, "b": envs.single_observation_space})
     many = spaces.Dict({"a": envs.observation_space, "b": envs.observation_space})
     return vector.TransformObservation(envs, lambda o: {"a": o, "b": -o}, many, one)
 
 
 BOX = spaces.Box(-2.0, 2.0, (1,), np.float32)
-#: How each wrapper is put around a single environment `e`.
+#: How each wrapper is applied to a single environment `e`.
 SINGLE = {
     "DelayObservation": lambda e: single.DelayObservation(e, 2),
     "DtypeObservation": lambda e: single.DtypeObservation(e, np.float64),
@@ -89,7 +89,7 @@ SINGLE = {
     "JaxToNumpy": lambda e: single.JaxToNumpy(single.ArrayConversion(e, np, jnp)),
     "JaxToTorch": lambda e: single.JaxToTorch(single.ArrayConversion(e, np, jnp)),
 }
-#: How each is put around a vector environment.
+#: How each is applied to a vector environment.
 VECTOR = {
     "VectorizeTransformObservation": lambda e: vector.VectorizeTransformObservation(
         e, single.ReshapeObservation, shape=(1, *e.single_observation_space.shape)
@@ -124,12 +124,12 @@ VECTOR = {
     "JaxToNumpy": lambda e: vector.JaxToNumpy(vector.ArrayConversion(e, np, jnp)),
     "JaxToTorch": lambda e: vector.JaxToTorch(vector.ArrayConversion(e, np, jnp)),
 }
-#: These take or return what is no NumPy array, and their spaces do not say so.
+#: These take or return something other than NumPy arrays, and their spaces do not say so.
 OTHER_ARRAYS = ("ArrayConversion", "NumpyToTorch", "JaxToTorch")
 
 
 def listed(module, ours):
-    """Return the names of a module's wrappers; an error names those that are not ours to run."""
+    """Return the names of a module's wrappers; exit with an error if they differ from our list."""
     names = [n for n in module.__all__ if isinstance(getattr(module, n), type) and n not in ELSEWHERE]
     unknown, gone = sorted(set(names) - set(ours)), sorted(set(ours) - set(names))
     if unknown or gone:
@@ -138,7 +138,7 @@ def listed(module, ours):
 
 
 def play_episodes(env, tensors):
-    """Take steps with an env or vector env, and look at what comes back."""
+    """Take steps with an env or vector env, and check the results."""
     observation, _ = env.reset(seed=1)
     env.action_space.seed(1)
     many = hasattr(env, "num_envs")
@@ -164,7 +164,7 @@ def wrappers(kind):
     theirs = set()
     for env_id in lag_envs.TASKS:
         for name in names:
-            # JAX compiles for a second: one environment shows it.
+            # JAX compiles for a second, so one environment has to do.
             if "Jax" in name and env_id != "PivotedBar-v0":
                 continue
             tensors = name in OTHER_ARRAYS
@@ -198,7 +198,7 @@ def fails_alike(error, wrapper, mode, tensors):
 
 
 def checkers():
-    """Hold every environment against Gymnasium's checkers, and time it with its benchmarks."""
+    """Check every environment with Gymnasium's checkers, and time it with its benchmarks."""
     for env_id in lag_envs.TASKS:
         check_env(gym.make(env_id, render_mode="rgb_array").unwrapped)
         check_environments_match(gym.make(env_id), gym.make(env_id), num_steps=300, seed=1)
@@ -234,7 +234,7 @@ def play():
 
 
 if __name__ == "__main__":
-    # Gymnasium's own way to warn of an environment. What its wrappers do to make others warn is theirs.
+    # Gymnasium warns about an environment by UserWarning. Other warnings come from what its wrappers do.
     warnings.simplefilter("error", UserWarning)
     warnings.filterwarnings(
         "ignore", ".*will not contain the last frame", UserWarning

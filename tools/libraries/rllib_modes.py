@@ -1,4 +1,4 @@
-"""RLlib's PPO in each of its ways to step many environments: in turn, in processes, our native vector one."""
+"""RLlib's PPO with each way to step many environments: in turn, in processes, our native vector one."""
 
 import ray
 from ray.rllib.algorithms.ppo import PPOConfig

@@ -13,7 +13,7 @@ def bar():
 
 
 def check(what, env, steps=60, **options):
-    """Check the specs, roll out and say how far it came."""
+    """Check the specs, roll out, and print the number of steps."""
     check_env_specs(env)
     path = env.rollout(steps, **options)
     print(what, tuple(path.shape), flush=True)
@@ -29,7 +29,7 @@ def main():
             envs = gym.make_vec(env_id, num_envs=4, autoreset_mode=mode, duration=1.0)
             path = check(f"{env_id} x 4, {mode}", GymWrapper(envs), 120, break_when_any_done=False)
             assert path["next", "done"].sum() >= 8
-    # Keywords that TorchRL tries, and gives up where the environment does not take them.
+    # Keywords that TorchRL tries, and drops if the environment does not take them.
     check("frame_skip", GymEnv("lag_envs:PivotedBar-v0", frame_skip=3))
     check("from_pixels", GymEnv("lag_envs:PivotedBar-v0", from_pixels=True, pixels_only=False), 5)
     check("num_envs", GymEnv("lag_envs:PivotedBar-v0", num_envs=2))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 def random_actions(n: int, scale: float = 1.0) -> list[NDArray[np.float32]]:
     """Return batches of shape (n, 1), uniform in [-scale, scale]: enough that they do not repeat too soon.
 
-    A few that come round again and again are a force with a period: they drive pendulums into resonance, to
-    speeds at which steps are divided.
+    A few batches repeated over and over would act as a periodic force, which drives pendulums into resonance,
+    to speeds at which steps are divided.
     """
     count = max(64, min(1024, 2**17 // n))
     return list(np.random.default_rng(0).uniform(-scale, scale, (count, n, 1)).astype(np.float32))

@@ -1,4 +1,4 @@
-"""A task that ``lag-envs bench`` sets beside Gymnasium's CartPole."""
+"""A task that ``lag-envs bench`` compares with Gymnasium's CartPole."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lag_envs.tasks import Task
 
 
 class ChainSwing(Task):
-    """Bars that hang from a support which is pushed to and fro; they start anywhere, turning fast."""
+    """Bars hanging from a support that is pushed to and fro; they start anywhere, turning fast."""
 
     scene: Any = Chain
     interval, steps = 0.02, 500
@@ -18,7 +18,7 @@ class ChainSwing(Task):
 
     @property
     def start(self) -> dict[str, float]:
-        """Return a box around hanging still."""
+        """Return a box around hanging at rest."""
         names = self.scene.coordinates
         return dict.fromkeys(names, math.pi) | {f"{name}_dot": 3.0 for name in names}
 
@@ -31,7 +31,7 @@ class ChainSwing(Task):
         return found
 
     def reward(self, before: Any, after: Any, control: Any, target: Any, dt: Any, xp: Any) -> Any:
-        """Return how high the chain's end is, and what a place off the middle costs."""
+        """Return the height of the chain's end minus a cost for being off the middle."""
         height = sum(-xp.cos(after[name]) for name in self.scene.coordinates)
         return height - 0.1 * after.s**2
 

@@ -13,7 +13,7 @@ from typing import Any
 from lag_envs.benchmark.results import quartiles
 from lag_envs.progress import progress
 
-#: What a cold start does after the start of the process, in stages; prints the seconds of each.
+#: The stages of a cold start after the start of the process; prints the seconds of each.
 COLD_START = """
 from time import perf_counter
 times = [perf_counter()]
@@ -41,7 +41,7 @@ STAGES = (
 
 
 def cold_starts(id: str, count: int, times: dict[str, list[list[float]]], files: Sequence[str] = ()) -> bool:
-    """Time the stages of whole processes into `times`; return False where the user broke it off."""
+    """Time the stages of whole processes into `times`; return False if the user interrupted it."""
     empty = (count + 1) // 2
     with progress(empty + count) as advance, tempfile.TemporaryDirectory() as folder:
         try:
@@ -60,7 +60,7 @@ def cold_start(id: str, cache: str, files: Sequence[str] = ()) -> list[float]:
     """Return the seconds of each of `STAGES` of a process that takes one step."""
     load = "".join(f"from lag_envs.own_files import registered; registered({name!r})\n" for name in files)
     command = [sys.executable, "-P", "-c", COLD_START.format(id=id, load=load)]
-    # As with installed packages, what is imported is there as bytecode: what lacks it is written at first.
+    # As with installed packages, imported modules have their bytecode: it is written first where missing.
     given = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     given["NUMBA_CACHE_DIR"] = cache
     start = time.perf_counter()

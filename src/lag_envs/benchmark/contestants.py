@@ -1,4 +1,4 @@
-"""Who takes part: our environments in every form, Gymnasium's, the peers, and the core itself."""
+"""The contestants: our environments in every form, Gymnasium's, the peers, and the core itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lag_envs.benchmark.rounds import CORE, THREADED, VARIED, Contestant
 def contestants(
     ids: Sequence[str], sizes: Sequence[int], keywords: Sequence[str] = (), threads: int = 1
 ) -> list[Contestant]:
-    """Return ours, with other keywords and several threads too, and the peers."""
+    """Return our environments, also with other keywords and several threads, and the peers."""
     rows = []
     for id in ids:
         rows += [Contestant("lag_envs", id, "made", 1, partial(made, id))]
@@ -38,7 +38,7 @@ def contestants(
 
 
 def keywords_of(text: str) -> dict[str, Any]:
-    """Return keywords as they stand in a call, or raise a ValueError.
+    """Return keywords written as in a call, or raise a ValueError.
 
     Examples
     --------

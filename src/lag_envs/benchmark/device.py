@@ -1,8 +1,8 @@
 """How fast a GPU steps environments: the command ``lag-envs bench --device cuda``.
 
-The rate is that of whole steps as a training takes them: control, motion, reward, observation, ending, kick
-and restarts. Beside it stands what the step has to read and write, as a share of the memory's rate, which is
-measured by copying in the same run.
+The rate is that of whole steps as in training: control, motion, reward, observation, ending, kick and
+restarts. Beside it stands the data that the step has to read and write, as a share of the memory's rate,
+which is measured by copying in the same run.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import torch
 from lag_envs.device import DeviceEnvs
 from lag_envs.tables import columns
 
-#: Numbers that are copied to measure the memory, more than any cache holds.
+#: Numbers copied to measure the memory, more than any cache holds.
 COPIED = 2**28
-#: Bytes of an environment besides its numbers: its age read and written, and three truth values.
+#: Bytes of an environment besides its numbers: its age, read and written, and three booleans.
 FLAGS = 4 + 4 + 3
 
 
 class Rate(NamedTuple):
-    """What was measured of one environment.
+    """Measurement of one environment.
 
     Attributes
     ----------
@@ -35,11 +35,11 @@ class Rate(NamedTuple):
     dtype : torch.dtype
         Precision of its numbers.
     num_envs : int
-        How many of them.
+        How many environments step together.
     steps : float
-        Steps a second of all of them together.
+        Steps per second of all of them together.
     share : float
-        What they read and write, as a share of what the memory can.
+        Data that they read and write, as a share of what the memory can transfer.
     """
 
     id: str
@@ -63,7 +63,7 @@ def rates(
     device : str or torch.device
         The GPU.
     seconds : float
-        Aimed length of a sample.
+        Target length of a sample.
     rounds : int
         Samples of each; the median counts.
     """
@@ -78,7 +78,7 @@ def rates(
 
 
 def traffic(envs: DeviceEnvs) -> int:
-    """Return the bytes that a step of one environment reads and writes at least."""
+    """Return the bytes that a step of one environment must at least read and write."""
     number = envs.rows.element_size()
     kept, seen = envs.rows.shape[0], len(envs.task.observation)
     actions = envs.task.formulas.actions
@@ -86,7 +86,7 @@ def traffic(envs: DeviceEnvs) -> int:
 
 
 def table(found: Sequence[Rate]) -> str:
-    """Return what was measured, as text."""
+    """Return the measurements as text."""
     head = ("environment", "precision", "environments", "steps/s", "share of memory's rate")
     rows = [
         (r.id, str(r.dtype).removeprefix("torch."), f"{r.num_envs:,}", f"{r.steps:.3g}", f"{r.share:.0%}")
@@ -96,14 +96,14 @@ def table(found: Sequence[Rate]) -> str:
 
 
 def _bandwidth(device: str | torch.device, seconds: float, rounds: int) -> float:
-    """Return the bytes a second that copying reads and writes."""
+    """Return the bytes per second that copying reads and writes."""
     memory = torch.empty(COPIED, dtype=torch.float32, device=device)
     copy = torch.empty_like(memory)
     return 2 * memory.nbytes * _calls_a_second(lambda: copy.copy_(memory), memory.device, seconds, rounds)
 
 
 def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
-    """Return a function that takes a step of random actions that were made beforehand."""
+    """Return a function that takes a step with random actions made beforehand."""
     space = envs.sample.single_action_space
     space.seed(0)
     sample = torch.as_tensor(np.array([space.sample() for _ in range(1000)]), device=envs.device)
@@ -114,7 +114,7 @@ def _stepping(envs: DeviceEnvs) -> Callable[[], Any]:
 
 
 def _calls_a_second(run: Callable[[], Any], device: torch.device, seconds: float, rounds: int) -> float:
-    """Return how often a function can be called, the median of samples so long."""
+    """Return how often per second a function can be called, the median of samples of a given length."""
 
     def wait() -> None:
         if device.type == "cuda":

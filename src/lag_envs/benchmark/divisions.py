@@ -1,7 +1,7 @@
-"""How often the certificate divides steps, and what that costs: a section of ``lag-envs bench``.
+"""How often the certificate divides steps, and the cost of this: a section of ``lag-envs bench``.
 
-A step is divided where one series would leave out too much, as when a chain whips. `Scene.step_bound` tells
-into how many parts.
+A step is divided if a single series would have too large a truncation error, as when a chain whips.
+`Scene.step_bound` gives the number of parts.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from lag_envs.tables import markdown_table
 from lag_envs.tasks import TASKS
 
-#: Environments of a batch under random actions, and of how many steps one is looked at.
+#: Environments of a batch under random actions, and the interval of steps that are examined.
 BATCH, EVERY = 16, 5
 
 
@@ -25,14 +25,14 @@ def divisions(ids: Sequence[str]) -> list[dict[str, Any]]:
     Parameters
     ----------
     ids : sequence of str
-        Environments of the package; those with imperfections are left out, for their steps are divided where
-        commands change too.
+        Environments of the package; those with imperfections are left out, since their steps are also divided
+        where commands change.
 
     Returns
     -------
     list of dict
         For each one ``id``; ``mean`` and ``most`` substeps of a step, ``divided``, the share of steps with
-        more than one, and ``fastest``, the largest velocity that was seen [SI].
+        more than one, and ``fastest``, the largest velocity that occurred [SI].
     """
     return [_divided(env_id) for env_id in ids if env_id in TASKS and not TASKS[env_id].imperfections]
 
@@ -50,7 +50,7 @@ def _divided(env_id: str) -> dict[str, Any]:
         _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
         fastest = max(fastest, float(np.abs(before[:, fast]).max()))
         if step % EVERY == 0:
-            going = ~(terminated | truncated)  # of the others the control is gone
+            going = ~(terminated | truncated)  # the others have lost their control
             held = zip(before[going], envs.control[going], strict=True)
             parts += [int(scene.step_bound(state, control, dt).substeps) for state, control in held]
     envs.close()
@@ -67,13 +67,13 @@ HEAD = ("id", "series a step", "most", "steps that are divided", "fastest [1/s]"
 
 
 def cells(row: Mapping[str, Any], nanoseconds: float | None) -> tuple[str, ...]:
-    """Return a line of the table; `nanoseconds` is the time of a step, where it was measured."""
+    """Return a line of the table; `nanoseconds` is the time of a step, if it was measured."""
     each = "" if nanoseconds is None else f"{nanoseconds / row['mean']:,.0f} ns"
     share = f"{100.0 * row['divided']:.0f} %"
     return row["id"], f"{row['mean']:.2f}", str(row["most"]), share, f"{row['fastest']:.1f}", each
 
 
 def markdown(rows: Sequence[Mapping[str, Any]], times: Mapping[str, float]) -> str:
-    """Return the table of those whose steps are divided at times, with the times of their steps [ns]."""
+    """Return the table of environments with divided steps, with the times of their steps [ns]."""
     lines = [cells(row, times.get(row["id"])) for row in rows if row["most"] > 1]
     return markdown_table(list(HEAD), [list(line) for line in lines])

@@ -1,4 +1,4 @@
-"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, and what README says."""
+"""A report in this project's documentation: ``docs/speed.json``, docs/speed.md, and README's summary."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lag_envs.tables import markdown_table
 
 
 def take_over(report: dict[str, Any], checkout: Path) -> None:
-    """Write a report into a checkout: ``docs/speed.json``, and what docs/speed.md and README say of it."""
+    """Write a report into a checkout: ``docs/speed.json``, and its texts in docs/speed.md and README."""
     write(checkout / "docs" / "speed.json", to_json(report))
     for path, text in texts(report, checkout).items():
         write(path, text)
 
 
 def texts(report: dict[str, Any], checkout: Path) -> dict[Path, str]:
-    """Return the files of a checkout that tell of a report, as they ought to be."""
+    """Return the files of a checkout with a report's texts, as they should be."""
     page, readme = checkout / "docs" / "speed.md", checkout / "README.md"
     text = replaced(page.read_text(encoding="utf-8"), "bench", markdown(report))
     return {
@@ -39,12 +39,12 @@ def to_json(report: dict[str, Any]) -> str:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """Return the table of docs/speed.md: every environment at the sizes of `TARGETS`; what misses is marked.
+    """Return the table of docs/speed.md: every environment at the sizes of `TARGETS`; misses are marked.
 
     Parameters
     ----------
     report : dict
-        What `bench` returns; of these sizes, with CartPole-v1 among them.
+        The result of `bench`; of these sizes, including CartPole-v1.
     """
     rows = {(row["library"], row["id"], row["kind"], row["num_envs"]): row for row in report["rows"]}
     rival = ("gymnasium", "CartPole-v1")
@@ -71,18 +71,19 @@ def markdown(report: dict[str, Any]) -> str:
     ]
     machine, settings = report["machine"], report["settings"]
     parts = [
-        "Time of a step, and how many times as long a step of as many of Gymnasium's `CartPole-v1` takes: "
-        f"medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
+        "Time of a step, also as a multiple of the time of Gymnasium's `CartPole-v1` for as many "
+        f"environments: medians of {settings['rounds']} rounds, {settings['clock']} time on one core of "
         f"{machine['processor']} (`lag-envs bench`, Gymnasium {report['versions']['gymnasium']}, "
         f"{report['date']}).",
         markdown_table(["id", *sizes], lines),
     ]
     if told := list(filter(None, (_of_series(report["rows"], target) for target in SERIES_TARGETS))):
-        parts.append(f"Scenes that are only energies, beside the same `CartPole-v1`: {'; '.join(told)}.")
+        parts.append(f"Scenes defined by energies alone, beside the same `CartPole-v1`: {'; '.join(told)}.")
     if found := report.get("divisions"):
         parts.append(
-            "Into how many series the certificate divides steps under random actions, and the time of one, "
-            "many at once. Others never needed more than one; those with imperfections were left out."
+            "The number of series into which the certificate divides steps under random actions, and the "
+            "time of one, many at once. Other environments never needed more than one; those with "
+            "imperfections were left out."
         )
         parts.append(divisions.markdown(found, times_of(report)))
     if cold := report["cold_start"]:
@@ -92,7 +93,7 @@ def markdown(report: dict[str, Any]) -> str:
 
 
 def _of_series(rows: list[dict[str, Any]], target: Target) -> str:
-    """Return what was measured of the general series where it has a target."""
+    """Return the measurements of the general series that have a target."""
     for row in rows:
         if target.meant_for(row) and "ratio" in row:
             time, ratio = 1e9 / row["steps_per_second"][1], row["ratio"][1]
@@ -102,7 +103,7 @@ def _of_series(rows: list[dict[str, Any]], target: Target) -> str:
 
 
 def claim(report: dict[str, Any]) -> str:
-    """Return what README says of speed: the ranges of the table, and how many targets are missed."""
+    """Return README's summary of speed: the ranges of the table, and how many targets are missed."""
     ours = [row for row in report["rows"] if row["library"] == "lag_envs" and "ratio" in row]
     kinds = {"a flow of their own": True, "the general series, or imperfections": False}
     lines = [
@@ -125,7 +126,7 @@ def claim(report: dict[str, Any]) -> str:
 
 
 def _range(rows: list[dict[str, Any]], target: Target) -> str:
-    """Return the least and the largest ratio of rows of a target's size."""
+    """Return the smallest and the largest ratio of rows of a target's size."""
     size = target.kind, target.num_envs
     ratios = sorted(row["ratio"][1] for row in rows if (row["kind"], row["num_envs"]) == size)
     return f"{ratios[0]:.2g} to {ratios[-1]:.2g}" if ratios else ""

@@ -1,4 +1,4 @@
-"""Scenes that are only energies, beside Gymnasium's CartPole."""
+"""Scenes defined by energies alone, beside Gymnasium's CartPole."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lag_envs.benchmark.environments import stepped
 from lag_envs.benchmark.rounds import ENERGIES, Contestant, Run
 from lag_envs.envs.vector import LagrangianVectorEnv
 
-#: How many bars the longest chain has.
+#: Bars of the longest chain.
 LONGEST = 6
 
 
 def of_energies(sizes: Sequence[int]) -> list[Contestant]:
-    """Return the exact CartPole and the double pendulum at all sizes, and chains of bars at one of them."""
-    # Batches of some thousand long chains would take minutes until their episodes are spread out.
+    """Return the exact CartPole and the double pendulum at all sizes, and chains of bars at one size."""
+    # Batches of thousands of long chains would take minutes until their episodes are staggered.
     middle = max((n for n in sizes if n <= 1024), default=min(sizes))
     some: list[tuple[str, str, dict[str, Any], int]]
     some = [("CartPole, exact", "lag_envs.tasks.cart_pole:CartPoleExact", {}, n) for n in sizes]
@@ -39,7 +39,7 @@ def energies(task: str, given: dict[str, Any], n: int) -> Run:
 
 
 def chains(rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return the time of a step by the number of bars [ns], and the exponent of the power that fits it best.
+    """Return the time of a step by the number of bars [ns], and the exponent of the best power-law fit.
 
     Examples
     --------

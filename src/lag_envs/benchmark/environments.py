@@ -1,4 +1,4 @@
-"""Environments of Gymnasium's interface, one alone or a batch, made ready to be stepped."""
+"""Environments with Gymnasium's interface, single or in a batch, made ready to be stepped."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def unwrapped(id: str, **keywords: Any) -> Run:
 
 
 def single(env: gym.Env) -> Run:
-    """Prepare one environment of Gymnasium's interface."""
+    """Prepare one environment with Gymnasium's interface."""
     # A choice as Python's int, as users give it.
     endless = cycle([a[0].item() if a.ndim == 1 else a[0] for a in actions_of(env.action_space, 1)])
     env.reset(seed=0)
@@ -41,7 +41,7 @@ def single(env: gym.Env) -> Run:
 
 
 def ours(id: str, n: int, **keywords: Any) -> Run:
-    """Prepare a native vector environment, of one thread unless told otherwise."""
+    """Prepare a native vector environment, with one thread unless stated otherwise."""
     return stepped(gym.make_vec(id, num_envs=n, **{"num_threads": 1} | keywords))
 
 
@@ -54,7 +54,7 @@ def stepped(envs: VectorEnv) -> Run:
 
 
 def stagger_episodes(envs: VectorEnv, actions: Sequence[Any]) -> None:
-    """Shift the episodes against each other, so that every sample has its share of endings."""
+    """Stagger the episodes, so that every sample has its share of endings."""
     limit = envs.spec.max_episode_steps if envs.spec else None
     length = limit or round(envs.task.limit)  # type: ignore[attr-defined]
     turn = np.arange(envs.num_envs) * length // envs.num_envs

@@ -1,7 +1,7 @@
-"""What derivatives of a control step cost beside the step: two sections of ``lag-envs bench``.
+"""The cost of a control step's derivatives, relative to the step: two sections of ``lag-envs bench``.
 
-In the first both start from the same states. The step is the compiled one, state after state;
-`Scene.simulate` would have the states of one motion. The second has whole steps: those of a vector
+In the first section, both start from the same states. The step is the compiled one, called for each state;
+`Scene.simulate` would follow a single motion. The second section has whole steps: those of a vector
 environment, and the same steps backwards.
 """
 
@@ -22,9 +22,9 @@ from lag_envs.tasks import TASKS
 
 #: Length of the step [s], states in a batch, and calls in a sample of single ones.
 DT, BATCH, CALLS = 0.02, 1024, 20
-#: Environments whose whole steps go backwards, and steps from which they start.
+#: Environments whose whole steps are differentiated, and steps from which they start.
 ENVS, STEPS = 16384, 8
-#: Scenes of the package, each with the control that asks most of it.
+#: Scenes of the package, each with its most expensive control.
 CASES: dict[str, Callable[[], Scene]] = {
     "PivotedBar": scenes.PivotedBar,
     "Incline": scenes.Incline,
@@ -41,7 +41,7 @@ CASES: dict[str, Callable[[], Scene]] = {
 
 
 def compile_steps(scene: Scene, dt: float) -> Callable[[Any, Any], Any]:
-    """Return a function that takes a step from each of many states, and returns the sum of what came out."""
+    """Return a function that takes a step from each of many states, and returns the sum of the results."""
     code, constants = scene._code(dt), scene._constants()
     numbers = [constants[name.removeprefix("k_")] for name in code.constants]
     general, n = scene._form is None, len(scene.state_names)
@@ -74,7 +74,7 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
     Parameters
     ----------
     rounds : int
-        How often; all are measured in turn, and the least counts.
+        Number of rounds; all are measured in turn, and the shortest time counts.
     clock : callable
         Returns the time [s].
     names : sequence of str
@@ -85,7 +85,7 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
     list of dict
         For each scene its ``name``; ``columns`` K, by states and controls; ``step_ns`` and ``jacobian_ns`` of
         a row of a batch, ``ratio`` and its ``aim`` 1 + 2K; ``call_us`` of one call, and ``call_ratio`` to one
-        of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which is to be 4 at most.
+        of `Scene.simulate`; ``vjp_ns`` of a row backwards, and ``vjp_ratio``, which should be at most 4.
     """
     found = []
     for name in names or CASES:
@@ -137,7 +137,7 @@ def jacobians(rounds: int, clock: Callable[[], float], names: Sequence[str] = ()
 def backwards(
     rounds: int, clock: Callable[[], float], ids: Sequence[str] = (), count: int = ENVS
 ) -> list[dict[str, Any]]:
-    """Measure what a whole step of a vector environment costs backwards, on one core.
+    """Measure the cost of a whole step of a vector environment backwards, on one core.
 
     Parameters
     ----------
@@ -146,13 +146,13 @@ def backwards(
     ids : sequence of str
         Environments; by default one for each scene.
     count : int
-        How many of them there are in a batch.
+        How many of each there are in a batch.
 
     Returns
     -------
     list of dict
-        For each its ``id``; ``step_ns`` and ``back_ns`` for each environment; ``ratio``, which is to be 4 at
-        most.
+        For each its ``id``; ``step_ns`` and ``back_ns`` for each environment; ``ratio``, which should be at
+        most 4.
     """
     smooth = [name for name, kind in TASKS.items() if not kind().formulas.choices and not kind.imperfections]
     found = []
@@ -210,7 +210,7 @@ def _least(
     clock: Callable[[], float],
     before: Callable[[], None] = lambda: None,
 ) -> list[float]:
-    """Return the least time of each [s], without what is done before it; all of them run once before."""
+    """Return the shortest time of each [s], without that of `before`; all of them run once first."""
     least = [float("inf")] * len(runs)
     for run in runs:
         run()

@@ -28,28 +28,28 @@ LIBRARIES = ("gymnasium", "numpy", "numba", "llvmlite", "envpool", "gymnax", "ja
 
 @dataclass
 class Settings:
-    """What is measured, and for how long."""
+    """Contents and length of a measurement."""
 
     ids: tuple[str, ...] = tuple(TASKS)
-    files: tuple[str, ...] = ()  #: users' own, which register some of the ids
-    keywords: tuple[str, ...] = ()  #: each as a call takes them: measured beside the defaults
-    energies: bool = False  #: scenes that are only energies too, beside CartPole-v1
-    jacobians: bool = False  #: what derivatives of a step cost beside it
-    divisions: bool = False  #: how often the certificate divides steps
+    files: tuple[str, ...] = ()  #: users' own files, which register some of the ids
+    keywords: tuple[str, ...] = ()  #: each as in a call: measured beside the defaults
+    energies: bool = False  #: also scenes defined by energies alone, beside CartPole-v1
+    jacobians: bool = False  #: also the cost of a step's derivatives
+    divisions: bool = False  #: also how often the certificate divides steps
     sizes: tuple[int, ...] = (1, 64, 1024, 16384)
-    threads: int = 1  #: where more, batches that they step are measured too
+    threads: int = 1  #: if more than 1, also batches stepped by so many
     rounds: int = 31
-    seconds: float = 0.05  #: aimed length of one sample
-    clock: str = "wall"  #: or "cpu", which leaves out what other programs take of the core
+    seconds: float = 0.05  #: target length of one sample
+    clock: str = "wall"  #: or "cpu", which leaves out the time of other programs on the core
     speed: bool = True
-    cold_starts: int = 9  #: processes with a filled cache; with an empty one half as many
+    cold_starts: int = 9  #: processes with a filled cache; half as many with an empty one
     date: str = ""
     output: str | None = None
-    checkout: str | None = None  #: whose docs take the result over
+    checkout: str | None = None  #: docs to write the result into
 
 
 def bench(settings: Settings) -> dict[str, Any]:
-    """Measure, print the tables, write the file if one is named, and return what it holds."""
+    """Measure, print the tables, write the file if one is named, and return its contents."""
     for name in settings.files:
         registered(name)
     ours = settings.ids, settings.sizes, settings.keywords, settings.threads

@@ -1,7 +1,7 @@
-"""How many multiply-adds a second a core does at most, measured: a section of ``lag-envs bench``.
+"""The largest number of multiply-adds per second of a core, measured: a section of ``lag-envs bench``.
 
-A product costs as much as a product with a sum, so each counts as one. Sums alone are left out, for many
-processors do them beside.
+A product costs as much as a multiply-add, so each counts as one. Sums alone are left out, since many
+processors do them in parallel.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lag_envs.envs.program import Program
 from lag_envs.envs.vector import on_a_line
 from lag_envs.stepping.compiling import compile_function, count_operations
 
-#: Numbers, few enough for the nearest cache, and multiply-adds on each: enough that loads do not count.
+#: Numbers, few enough for the nearest cache, and multiply-adds on each: enough that loads do not matter.
 NUMBERS, TIMES = 1024, 12
 PRODUCTS = frozenset({"*", "a*b+c", "a*b-c", "c-a*b"})
 
@@ -39,7 +39,7 @@ def _compiled() -> Callable:
 
 
 def peak() -> Callable[[int], int]:
-    """Return a function that does at least so many multiply-adds on each number, and returns how many."""
+    """Return a function that does at least so many multiply-adds on each number and returns their number."""
     multiply_adds, numbers = _compiled(), on_a_line(np.ones(NUMBERS))
 
     def run(count: int) -> int:
@@ -51,7 +51,7 @@ def peak() -> Callable[[int], int]:
 
 
 def products(program: Program) -> int | None:
-    """Return how many products an ordinary step of one environment computes; None where a loop does it."""
+    """Return how many products an ordinary step of one environment computes; None if it has a loop."""
     if program.general:
         return None
     lines = [*program.control, *program.fast, *program.outcome, *program.kick, *program.observe]
@@ -59,9 +59,9 @@ def products(program: Program) -> int | None:
 
 
 def arithmetic(rows: Sequence[Contestant]) -> list[dict[str, Any]]:
-    """Return, for our largest batch of each id, its products a step and its share of the core's peak.
+    """Return, for our largest batch of each id, its products per step and its share of the core's peak.
 
-    The share has quartiles, over the rounds, of products a second to multiply-adds a second.
+    The share is products per second over multiply-adds per second, as quartiles over the rounds.
     """
     limits = next((row.rates for row in rows if row.library == CORE), [])
     batches = [r for r in rows if r.library == "lag_envs" and r.kind == "vector"]

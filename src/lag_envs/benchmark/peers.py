@@ -16,7 +16,7 @@ from lag_envs.benchmark.rounds import Run
 
 
 def cartpole(n: int) -> Run:
-    """Prepare Gymnasium's own vector environment of CartPole; its episodes soon end all over the place."""
+    """Prepare Gymnasium's own vector environment of CartPole; its episodes soon end at different times."""
     envs = gym.make_vec("CartPole-v1", num_envs=n, vectorization_mode="vector_entry_point")
     envs.reset(seed=0)
     run = batch(envs.step, [(a[:, 0] > 0.0).astype(np.int64) for a in random_actions(n)])
@@ -33,7 +33,7 @@ def envpool(n: int) -> Run:
 
 
 def gymnax(n: int, together: int = 8) -> Run:
-    """Prepare gymnax, several steps in one compiled call, as it is meant to be used."""
+    """Prepare gymnax, several steps in one compiled call, as intended by its authors."""
     jax = import_module("jax")
     env, params = import_module("gymnax").make("Pendulum-v1")
     reset = jax.vmap(env.reset, in_axes=(0, None))
@@ -83,7 +83,7 @@ def torchrl(n: int) -> Run:
     return run
 
 
-#: Peers with batches: library, what they run, how they are prepared.
+#: Peers with batches: library, environment, function that prepares it.
 PEERS: list[tuple[str, str, Callable[[int], Run]]] = [
     ("gymnasium", "CartPole-v1", cartpole),
     ("envpool", "Pendulum-v1", envpool),

@@ -1,4 +1,4 @@
-"""The process that measures, with cores of its own."""
+"""The process that measures, on its own cores."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lag_envs.host import ONE_THREAD
 
 
 def in_own_process(settings: Settings) -> int:
-    """Run `bench` in a process of its own, on as many cores as it has threads; return its exit status."""
+    """Run `bench` in a separate process, on as many cores as it has threads; return its exit status."""
     command = [sys.executable, "-P", "-m", "lag_envs.benchmark.process", json.dumps(asdict(settings))]
     child = subprocess.Popen(command, env=os.environ | ONE_THREAD)
 
     def pass_on(*_: Any) -> None:
-        if os.name == "posix":  # elsewhere the terminal tells the child itself
+        if os.name == "posix":  # on Windows, the terminal signals the child itself
             child.send_signal(signal.SIGINT)
 
     before = {number: signal.signal(number, pass_on) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -34,15 +34,15 @@ def in_own_process(settings: Settings) -> int:
 
 def _break_off(*_: Any) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)  # what was measured is still to be written
+        signal.signal(number, lambda *_: None)  # the results still have to be written
     raise KeyboardInterrupt
 
 
 def main() -> int:
-    """Measure as the settings on the command line say."""
+    """Measure with the settings from the command line."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _break_off)
-    warnings.simplefilter("ignore")  # of the peers
+    warnings.simplefilter("ignore")  # from the peers
     settings = Settings(**json.loads(sys.argv[1]))
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-settings.threads :])

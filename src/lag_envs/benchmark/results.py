@@ -23,7 +23,7 @@ def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def ratios(rates: Sequence[float], others: Sequence[float]) -> list[float]:
-    """Return the ratio within each round that both have.
+    """Return the ratio within each round, for rounds that both have.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def ratios(rates: Sequence[float], others: Sequence[float]) -> list[float]:
 
 
 def summary(row: Contestant, rows: Sequence[Contestant]) -> dict[str, Any]:
-    """Return a row with its statistics, and its ratio to CartPole-v1 of its size."""
+    """Return a row with its statistics, and its ratio to CartPole-v1 at the same size."""
     kind = "vector" if row.kind == "vector" else "made"
     rival = [
         r.rates

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from lag_envs.progress import progress
 
-#: Takes at least that many steps of every environment, and returns how many it took.
+#: Takes at least so many steps of every environment, and returns how many it took.
 Run = Callable[[int], int]
 Clock = Callable[[], float]
 CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -19,7 +19,7 @@ CLOCKS: dict[str, Clock] = {"wall": time.perf_counter, "cpu": time.process_time}
 class Contestant:
     """One row of the table.
 
-    ``rates`` holds the env-steps per second of each round; ``problem`` tells why there are no (more) of them.
+    ``rates`` holds the env-steps per second of each round; ``problem`` says why there are no (more) of them.
     """
 
     library: str
@@ -31,8 +31,8 @@ class Contestant:
     problem: str | None = None
 
 
-#: What stands for the library in rows of scenes of energies, of environments with other keywords, of those
-#: that several threads step, and of what the core can do.
+#: The library's place in rows of scenes defined by energies, of environments with other keywords, of several
+#: threads, and of the core's peak.
 ENERGIES, VARIED, THREADED = "lag_envs, energies", "lag_envs, varied", "lag_envs, threads"
 CORE = "this core"
 
@@ -40,7 +40,7 @@ CORE = "this core"
 def measure(
     rows: Sequence[Contestant], rounds: int, seconds: float, clock: Clock = time.perf_counter
 ) -> bool:
-    """Fill in the contestants' rates; return False where the user broke it off, keeping what there is."""
+    """Fill in the contestants' rates; return False if the user interrupted it, keeping the rates so far."""
     runs: dict[int, tuple[Run, int]] = {}
     with progress(len(rows) * (rounds + 1)) as advance:
         try:
@@ -62,7 +62,7 @@ def measure(
 
 @contextmanager
 def excused(row: Contestant) -> Iterator[None]:
-    """Note in the row what goes wrong with a contestant, so that the others can go on."""
+    """Record a contestant's error in its row, so that the others can go on."""
     try:
         yield
     except Exception as error:
@@ -72,7 +72,7 @@ def excused(row: Contestant) -> Iterator[None]:
 
 
 def calibrate(run: Run, seconds: float, clock: Clock) -> int:
-    """Return the number of steps that take about that long."""
+    """Return the number of steps that take about so long."""
     run(1)  # compiles
     steps = 1
     while True:
@@ -86,7 +86,7 @@ def calibrate(run: Run, seconds: float, clock: Clock) -> int:
 
 def rate(run: Run, steps: int, clock: Clock) -> float:
     """Return steps per second."""
-    run(1)  # what the others have pushed out of the caches comes back
+    run(1)  # refills the caches after the others
     start = clock()
     taken = run(steps)
     return taken / (clock() - start)

@@ -1,4 +1,4 @@
-"""The ratios and times that ours are to reach, and whether they do."""
+"""The ratios and times that ours should reach, and whether they do."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from lag_envs.tasks import TASKS
 
 
 class Target(NamedTuple):
-    """A ratio that ours is to reach, against Gymnasium's CartPole-v1 of the same kind and size.
+    """A target ratio against Gymnasium's CartPole-v1 of the same kind and size.
 
-    Without an id it is meant for all environments whose scene has a flow of its own, such as a driven
-    pendulum's. The general series does more work, so a target for it names what it is for.
+    Without an id, it applies to all environments whose scene has a dedicated flow, such as a driven
+    pendulum's. The general series does more work, so its targets name their environments.
     """
 
     kind: str
@@ -24,12 +24,12 @@ class Target(NamedTuple):
     id: str | None = None
 
     def __str__(self) -> str:
-        """Return what is compared."""
+        """Return a description of the comparison."""
         size = f"{self.kind}, {self.num_envs:,}" if self.kind == "vector" else f"single, {self.kind}"
         return size if self.id is None else f"{self.id}, {size}"
 
     def meant_for(self, row: dict[str, Any]) -> bool:
-        """Tell whether a row of a report is to reach it."""
+        """Tell whether the target applies to a row of a report."""
         if (row["kind"], row["num_envs"]) != (self.kind, self.num_envs):
             return False
         if self.id is not None:
@@ -37,7 +37,7 @@ class Target(NamedTuple):
         return row["library"] == "lag_envs" and has_own_flow(row["id"])
 
 
-#: For environments with a flow of their own: one for each column of the table.
+#: For environments with a dedicated flow: one for each column of the table.
 TARGETS = (
     Target("made", 1, 2.0),
     Target("vector", 64, 6.0),
@@ -52,17 +52,17 @@ COLD_TARGETS = {"empty": 2.5, "filled": 0.5}
 
 @cache
 def has_own_flow(env_id: str) -> bool:
-    """Tell whether an environment is stepped by its scene's own flow, and nothing but that."""
+    """Tell whether an environment is stepped by its scene's dedicated flow alone."""
     return env_id in TASKS and not TASKS[env_id].imperfections and TASKS[env_id]().scene._form is not None
 
 
 def reached(rows: Sequence[dict[str, Any]], target: Target) -> dict[str, float]:
-    """Return the median ratio of all that is to reach a target."""
+    """Return the median ratio of each row that should reach a target."""
     return {row["id"]: row["ratio"][1] for row in rows if "ratio" in row and target.meant_for(row)}
 
 
 def verdicts(rows: Sequence[dict[str, Any]], cold: dict[str, list[float]]) -> list[dict[str, Any]]:
-    """Hold what was measured against the targets; ``met`` is None where nothing was measured."""
+    """Compare the measurements with the targets; ``met`` is None if nothing was measured."""
     results = []
     for target in (*TARGETS, *SERIES_TARGETS):
         measured = reached(rows, target)

@@ -1,1 +1,1 @@
-"""The subcommands of ``lag-envs``. What one needs is imported where it runs: ``--help`` stays quick."""
+"""The subcommands of ``lag-envs``. Their imports are deferred until they run, so ``--help`` is quick."""

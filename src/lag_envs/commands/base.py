@@ -1,4 +1,4 @@
-"""What subcommands are, and what several of them need."""
+"""The base of subcommands, and helpers that several of them need."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from lag_envs.errors import UserError, hint
 if TYPE_CHECKING:
     from lag_envs.tasks.base import Task
 
-#: What `report`, `info`, `bench` and `play` take besides ids.
+#: Alternative to ids in `report`, `info`, `bench` and `play`.
 OWN = "a Python file of your own, FILE or FILE:Class, whose code is run"
 
 
 class Command(NamedTuple):
-    """A subcommand: how it is called, what it takes, what it does."""
+    """A subcommand: its name, its arguments, its function."""
 
     name: str
     help: str
@@ -40,32 +40,32 @@ def known(id: str) -> str:
 
 
 def task_of(id: str) -> Task:
-    """Return the task of an id that is known, as it is by default."""
+    """Return the task of a known id, with its defaults."""
     return TASKS[id]()
 
 
 def needs(extra: str, *packages: str) -> None:
-    """Raise a UserError that names what is missing, and its remedy."""
+    """Raise a UserError that names missing packages and how to install them."""
     for package in packages:
         if find_spec(package) is None:
             raise UserError(f'{package} is missing: pip install "lag-envs[{extra}]"')
 
 
 def declare_date(parser: argparse.ArgumentParser, where: str) -> None:
-    """Declare the option of a date, which is noted there."""
+    """Declare the option of a date to note in a result."""
     today = date.today().isoformat()
     parser.add_argument("--date", default=today, help=f"date to note {where} (default: today)")
 
 
 def count(text: str) -> int:
-    """Return an argument that is a number of things."""
+    """Return an argument as a positive integer."""
     if not text.strip().isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"a whole number of at least 1 is needed, got {text!r}")
     return int(text)
 
 
 def seconds(text: str) -> float:
-    """Return an argument that is a time [s]."""
+    """Return an argument as a time [s]."""
     try:
         value = float(text)
     except ValueError:

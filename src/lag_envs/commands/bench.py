@@ -72,7 +72,7 @@ def declare_bench(parser: argparse.ArgumentParser) -> None:
         "--clock",
         choices=["wall", "cpu"],
         default="wall",
-        help="cpu leaves out the time that other programs take (default: wall)",
+        help="cpu leaves out the time of other programs (default: wall)",
     )
     declare_date(parser, "in the file")
 
@@ -137,7 +137,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
 
     try:
         device = checked_device(args.device)
-    except (ValueError, RuntimeError) as error:  # torch's own, of a word that is no device
+    except (ValueError, RuntimeError) as error:  # torch's own, if the name is not a device
         raise UserError(f"--device: {error}") from error
     perfect = [env_id for env_id in ids if not (env_id in TASKS and TASKS[env_id].imperfections)]
     found = rates(perfect, args.sizes or (4096, 2**20), device, args.seconds or 0.2, args.rounds or 9)
@@ -146,7 +146,7 @@ def _on_device(args: argparse.Namespace, ids: Sequence[str]) -> int:
 
 
 def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the ids that are meant, and those of the names that are files."""
+    """Return the requested ids, and the names that are files."""
     from lag_envs import own_files
 
     files = tuple(dict.fromkeys(name for name in names if is_file(name)))
@@ -157,7 +157,7 @@ def _measured(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _check_writable(path: Path) -> None:
-    """Refuse before the measurement a file that could not be written after it."""
+    """Refuse, before the measurement, a file that could not be written after it."""
     if path.is_dir():
         raise UserError(f"--output must name a file, and {path} is a folder")
     if not path.absolute().parent.is_dir():
@@ -183,9 +183,9 @@ def _sizes(text: str) -> tuple[int, ...]:
 BENCH = Command(
     "bench",
     "compare the speed with other libraries",
-    """Compare steps per second with Gymnasium and, where installed, EnvPool, gymnax and TorchRL, in one
+    """Compare steps per second with Gymnasium and, if installed, EnvPool, gymnax and TorchRL, in one
 run on one core: each round takes a sample of every row, and ratios are taken within a round. Then time
-the cold start of whole processes. Ctrl-C ends the measurement and keeps what there is.
+the cold start of whole processes. Ctrl-C ends the measurement and keeps the results so far.
 
 examples:
   lag-envs bench --quick                             one environment, under a minute
@@ -193,11 +193,11 @@ examples:
   lag-envs bench --checkout .                        the same, into the documentation of a clone
   lag-envs bench PivotedBar-v0 --sizes 64,16384
   lag-envs bench --quick ball_on_beam.py             tasks of your own; this runs the file
-  lag-envs bench --quick --with action_delay=0.013   what keywords cost
-  lag-envs bench --quick --threads 2                 how much a second thread gains
+  lag-envs bench --quick --with action_delay=0.013   the cost of keywords
+  lag-envs bench --quick --threads 2                 the gain from a second thread
   lag-envs bench --quick --device cuda               on a GPU, in both precisions
   lag-envs bench --cold                              only the cold start
-  lag-envs bench --quick --clock cpu                 on a machine that has other work to do""",
+  lag-envs bench --quick --clock cpu                 on a machine that is busy with other work""",
     declare_bench,
     run_bench,
 )

@@ -40,12 +40,12 @@ def _leaderboard(module: str, function: str) -> Callable[[Any], Any]:
 EXPORT = Command(
     "export",
     "turn a trained model into a submission",
-    """Turn models of Stable-Baselines3 into a submission to the leaderboard, which is data only, and
-prove that both act alike. Loading a model runs code, so export your own only. Networks that
-`python -m agents.ppo` left are data already, and are taken as they are.
+    """Turn models of Stable-Baselines3 into a submission to the leaderboard, which contains only data, and
+prove that both act alike. Loading a model runs code, so export only your own. Networks from
+`python -m agents.ppo` are data already, and are taken as they are.
 
 examples:
-  lag-envs export runs/PivotedBar-v0/ppo --author "A. Author" --license MIT    all seeds of a training here
+  lag-envs export runs/PivotedBar-v0/ppo --author "A. Author" --license MIT    all seeds of a local training
   lag-envs export s0.zip s1.zip s2.zip s3.zip s4.zip --env PivotedBar-v0 --env-steps 500000 --seconds 600 \\
       --author "A. Author" --license MIT                                       models from elsewhere""",
     _leaderboard("export", "declare_export"),
@@ -60,7 +60,7 @@ nothing is changed.
 examples:
   lag-envs verify PivotedBar-v0-PPO                  1,000 episodes of each policy
   lag-envs verify PivotedBar-v0-PPO --episodes 50    a first look
-  lag-envs verify leaderboard/inbox/* --jobs 8       several side by side
+  lag-envs verify leaderboard/inbox/* --jobs 8       several in parallel
   lag-envs verify leaderboard/inbox/* --ray auto     on the machines of a Ray cluster""",
     _leaderboard("verify", "declare_verify"),
     _leaderboard("verify", "run_verify"),
@@ -68,28 +68,28 @@ examples:
 REPLAY = Command(
     "replay",
     "recompute a drive from its link",
-    """Recompute a drive, given as a link by the leaderboard's page, from its seed and keys, by
-arithmetic that has the same bits on every machine, and say whether the return that the link claims is true.
-The status is 0 where it is, 1 where it is not, 2 for a link that is damaged.
+    """Recompute a drive, given as a link from the leaderboard's page, from its seed and keys, with
+arithmetic that has the same bits on every machine, and tell whether the link claims the right return.
+The exit status is 0 if it does, 1 if it does not, 2 for a damaged link.
 
 examples:
   lag-envs replay 'https://example.org/board/PivotedBar-v0.html#drive=1~...'
-  lag-envs replay '#drive=1~...' --file mine.py      of an environment of your own""",
+  lag-envs replay '#drive=1~...' --file mine.py      for an environment of your own""",
     _replay("declare"),
     _replay("run"),
 )
 LEADERBOARD = Command(
     "leaderboard",
     "keep the leaderboard",
-    """Keep a leaderboard: take submissions in, recompute their scores, show and publish the ranking. A
-submission is verified with a nonce that was published after it was added: `add` takes it in, `nonce`
-publishes one and verifies what waits. After Ctrl-C, or a kill, `add` without a folder resumes.
+    """Keep a leaderboard: add submissions, recompute their scores, show and publish the ranking. A
+submission is verified with a nonce that was published after it was added: `add` adds it, `nonce`
+publishes one and verifies all that are waiting. After Ctrl-C, or a kill, `add` without a folder resumes.
 
 examples:
-  lag-envs leaderboard add my-submission             take it in; it waits for the next nonce
-  lag-envs leaderboard nonce 5f3c...                 publish a nonce, verify what waits for it
+  lag-envs leaderboard add my-submission             add it; it waits for the next nonce
+  lag-envs leaderboard nonce 5f3c...                 publish a nonce, verify all that waits for it
   lag-envs leaderboard add mine/* --nonce test-1     both at once, for a board of your own
-  lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of the others
+  lag-envs leaderboard list PivotedBar-v0            the ranking, and the state of all other submissions
   lag-envs leaderboard serve                         the page, at http://127.0.0.1:8000
   lag-envs leaderboard add --help                    more about one action""",
     _leaderboard("cli", "declare_leaderboard"),

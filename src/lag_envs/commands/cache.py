@@ -10,11 +10,11 @@ from lag_envs.tables import columns
 
 def declare_cache(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``cache``."""
-    parser.add_argument("--clear", action="store_true", help="remove everything that is kept")
+    parser.add_argument("--clear", action="store_true", help="remove all compiled code")
 
 
 def run_cache(args: argparse.Namespace) -> int:
-    """Show what compiled code is kept on disk and check it, or remove it."""
+    """Show and check the compiled code on disk, or remove it."""
     from lag_envs.stepping import cache
 
     place = cache.folder()
@@ -41,12 +41,12 @@ def run_cache(args: argparse.Namespace) -> int:
 CACHE = Command(
     "cache",
     "show or clear the compiled code",
-    """Show where compiled code is kept, how much of it there is, and whether it is whole. It is kept in
-the user's folder for caches, or in the one that the environment variable NUMBA_CACHE_DIR names.
+    """Show where compiled code is kept, how much of it there is, and whether it is intact. It is kept in
+the user's cache folder, or in the folder named by the environment variable NUMBA_CACHE_DIR.
 
 examples:
-  lag-envs cache            what there is
-  lag-envs cache --clear    remove it; what is needed is compiled again""",
+  lag-envs cache            show it
+  lag-envs cache --clear    remove it; code is compiled again when needed""",
     declare_cache,
     run_cache,
 )

@@ -9,7 +9,7 @@ from lag_envs import TASKS
 from lag_envs.commands.base import Command, needs
 
 SHELLS = ("bash", "zsh", "tcsh")
-#: Environments and a user's own files, for the shells in which functions complete.
+#: Completion of environments and users' own files, for shells that complete by functions.
 COMPLETE_ID = {"bash": "_lag_envs_ids", "zsh": "_lag_envs_ids", "tcsh": "f:*.py"}
 
 

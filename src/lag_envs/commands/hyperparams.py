@@ -29,8 +29,8 @@ def run_hyperparams(args: argparse.Namespace) -> int:
 HYPERPARAMS = Command(
     "hyperparams",
     "print hyperparameters for the RL Zoo",
-    """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the form of
-the RL Zoo (extra `zoo`). They are those that the agents of docs/agents.md were trained with. Those of
+    """Print the hyperparameters of a learner of Stable-Baselines3 for all environments, in the format of
+the RL Zoo (extra `zoo`). The agents of docs/agents.md were trained with them. Those of
 fast_ppo, shac and cloning are for `python -m agents.train`, in a clone.
 
 examples:

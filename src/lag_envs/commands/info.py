@@ -52,7 +52,7 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Print what there is to know about an environment."""
+    """Print a description of an environment."""
     from lag_envs.facts import facts
 
     if is_file(args.id):
@@ -69,7 +69,7 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def _agents(task: Task, name: str, given: str) -> list[str]:
-    """Return what there is to see of an environment."""
+    """Return a description of an environment's picture and agents."""
     from lag_envs.scores import known_returns
     from lag_envs.watch import known
 
@@ -90,7 +90,7 @@ def _rows(rows: Sequence[tuple[str, ...]]) -> list[str]:
 LIST = Command(
     "list",
     "list the environments",
-    """List the environments: what to do, control, control interval, steps and length of an episode.
+    """List the environments: objective, control, control interval, steps and length of an episode.
 
 examples:
   lag-envs list

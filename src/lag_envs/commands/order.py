@@ -18,7 +18,7 @@ def declare_order(parser: argparse.ArgumentParser) -> None:
 
 
 def run_order(args: argparse.Namespace) -> int:
-    """Print what each order of the series costs, and which to choose."""
+    """Print the cost of each order of the series, and the best choice."""
     from lag_envs import own_files
     from lag_envs.orders import ORDERS, lines, measure
     from lag_envs.progress import progress
@@ -37,8 +37,8 @@ def run_order(args: argparse.Namespace) -> int:
 ORDER = Command(
     "order",
     "find the order of the series that steps a task fastest",
-    """Measure the time of a step by each order of the series, under random actions in a task's own
-episodes, and tell which one to write into the task. Steps of any order are certified alike.
+    """Measure the time of a step at each order of the series, under random actions in a task's own
+episodes, and tell which order to write into the task. Steps are certified alike at any order.
 
 examples:
   lag-envs order ball_on_beam.py             a task of your own; this runs the file

@@ -28,7 +28,7 @@ def declare_report(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--processes", metavar="N", type=count, default=os.cpu_count() or 1,
-        help="jobs side by side (default: one per core); timings always run alone",
+        help="parallel jobs (default: one per core); timings always run alone",
     )  # fmt: skip
     declare_date(parser, "on the page")
     parser.add_argument("--docs", metavar="PROJECT", help="then write docs/accuracy in this checkout")
@@ -48,7 +48,7 @@ def run_report(args: argparse.Namespace) -> int:
                 raise UserError(
                     f"--{option} is for the report about this package: leave out --{option} or {file}"
                 )
-        own.subjects(file)  # what is wrong with the file is said before anything is measured
+        own.subjects(file)  # errors in the file are reported before anything is measured
         made = Settings(folder, args.quick, (own.SECTION,), args.processes, args.date, file)
         try:
             return 0 if make_report(made) else 130
@@ -74,7 +74,7 @@ def run_report(args: argparse.Namespace) -> int:
 
 
 def _places(places: Sequence[str]) -> tuple[str, str]:
-    """Return the file that is measured, or nothing, and the report's folder."""
+    """Return the user's file, empty if there is none, and the report's folder."""
     files = [place for place in places if is_file(place) and not Path(place).is_dir() and ".py" in place]
     folders = [place for place in places if place not in files]
     if len(files) > 1 or len(folders) > 1:
@@ -92,12 +92,12 @@ REPORT = Command(
     """Measure the error of every environment and scene against high precision, beside usual integrators
 and other libraries: error against run time, the bound, stability on stiff and extreme cases, conservation.
 Writes a folder with index.html, figures, tables as CSV and everything as JSON. Finished jobs are kept: after
-Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part where they are installed.
+Ctrl-C, re-run it to resume. heyoka, diffrax, torchdiffeq and MuJoCo take part if they are installed.
 
 examples:
   lag-envs report --quick                            a first look, under a minute
   lag-envs report                                    everything, about half an hour on two cores
-  lag-envs report --docs .                           the same, and what this checkout says of it
+  lag-envs report --docs .                           the same, and update this checkout's docs
   lag-envs report --sections bound,stability maps    two parts, into the folder maps
   lag-envs report ball_on_beam.py                    scenes of your own, into report-ball_on_beam;
                                                      this runs the file""",

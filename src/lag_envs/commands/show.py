@@ -36,16 +36,16 @@ def run_play(args: argparse.Namespace) -> int:
 
 def declare_watch(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``watch``."""
-    _declare_shown(parser, "seed of the first episode, the others' follow it")
+    _declare_shown(parser, "seed of the first episode; the next episodes count on from it")
     parser.add_argument(
         "--agent",
         metavar="NAME|FILE",
-        help="its name, as `lag-envs info ID` lists them, or on the board; a submission's folder; or a model"
+        help="its name, as listed by `lag-envs info ID` or on the board; a submission's folder; or a model"
         " of Stable-Baselines3 (a zip, or the folder of its training), whose code is run (default: the policy"
         " that comes with the package)",
     )
     parser.add_argument(
-        "--episodes", metavar="N", type=count, help="how many (default: 1 in a video, else endless)"
+        "--episodes", metavar="N", type=count, help="number of episodes (default: 1 in a video, else endless)"
     )
     parser.add_argument(
         "--video", metavar="FILE", type=Path, help="write an .mp4 or .gif instead of opening a window"
@@ -54,7 +54,7 @@ def declare_watch(parser: argparse.ArgumentParser) -> None:
         "--board",
         metavar="FOLDER",
         type=Path,
-        help="whose agents go by name too (default: the folder leaderboard, if there is one here)",
+        help="a board, to find agents by name (default: the folder leaderboard, if there is one here)",
     )
 
 
@@ -90,7 +90,7 @@ def run_watch(args: argparse.Namespace) -> int:
 
 
 def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
-    """Declare what all that shows an environment takes."""
+    """Declare the arguments of all commands that show an environment."""
     parser.add_argument("id", metavar="ID|FILE", help=f"an environment, such as PivotedBar-v0, or {OWN}")
     parser.add_argument("--seed", metavar="N", type=int, help=f"{seed} (default: another each time)")
     parser.add_argument("--steps", metavar="N", type=count, help="end after N steps")
@@ -102,12 +102,12 @@ def _declare_shown(parser: argparse.ArgumentParser, seed: str) -> None:
 
 
 def _look(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the keywords of an environment that say what is to be seen."""
+    """Return an environment's keywords for rendering."""
     return {"show_arrows": args.arrows, "show_trail": args.trail, "show_readout": args.readout}
 
 
 def _shown(args: argparse.Namespace) -> tuple[str, Task]:
-    """Return id and task of what is to be shown."""
+    """Return id and task of the environment to show."""
     from lag_envs import own_files
     from lag_envs.tasks.registration import make_task
 
@@ -139,7 +139,7 @@ WATCH = Command(
     "watch",
     "watch an agent, in a window or as a video",
     """Watch an agent drive an environment, in a window, or write a video. By default it is the policy
-that comes with the package, the best of the leaderboard; controllers go by name.
+that comes with the package, the best on the leaderboard; controllers are chosen by name.
 
 examples:
   lag-envs watch PivotedBar-v0

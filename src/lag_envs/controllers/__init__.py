@@ -1,6 +1,6 @@
 """Classical controllers, and trivial agents, all with Stable-Baselines3's `predict`.
 
-Every agent takes one observation or a batch, and returns the state that it needs in the next call::
+Every agent takes one observation or a batch, and returns the state to pass to the next call::
 
     action, state = agent.predict(observation, state, episode_start)
 
@@ -53,7 +53,7 @@ __all__ = [
     "plan_swing_up",
 ]
 
-#: The agents that every task has.
+#: Agents for every task.
 KNOW_NOTHING = {
     "zero": Controller("lag_envs.controllers.basic:do_nothing"),
     "random": Controller("lag_envs.controllers.basic:at_random"),
@@ -98,7 +98,7 @@ def make_controller(env_id: str, name: str, **env_options: Any) -> Any:
     name : str
         Name of the controller: "zero", "random" or one of the task's own.
     **env_options
-        Parameters of the environment, such as `mass` or `dt`, that differ from its own.
+        Parameters of the environment, such as `mass` or `dt`, that differ from the defaults.
 
     Raises
     ------

@@ -13,10 +13,10 @@ from lag_envs.tasks.base import Task
 
 
 class PublishedLQR(FeedbackController):
-    """The LQR of the double pendulum's project, about upright: its weights, on the frictionless model.
+    """The double pendulum project's LQR about upright: its weights, on the frictionless model.
 
-    It acts where its cost to go is below a threshold, and leaves the motor off elsewhere; what friction takes
-    in the driven joint is added, as on the project's machine.
+    It acts while its cost to go is below a threshold, and turns the motor off otherwise. Friction in the
+    driven joint is compensated, as on the project's machine.
 
     Parameters
     ----------

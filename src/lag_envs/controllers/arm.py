@@ -16,9 +16,9 @@ class Springs(FeedbackController):
     task : Reach
         The task, ``env.unwrapped.task``.
     stiffness : tuple of float
-        Of shoulder and elbow [N m/rad].
+        Stiffness for shoulder and elbow [N m/rad].
     damping : tuple of float
-        Of shoulder and elbow [N m s/rad].
+        Damping for shoulder and elbow [N m s/rad].
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Springs(FeedbackController):
         return self.stiffness * self.missing(state, target) - self.damping * state[..., 1::2]
 
     def missing(self, state: Array, target: Array) -> Array:
-        """Return by how much to turn the joints, to the posture that costs less to hold."""
+        """Return the rotations of the joints to the posture that costs less to hold."""
         postures = self.postures(target)
         holding = [self.holding(posture) for posture in postures]
         best = np.where((holding[0] <= holding[1])[..., None], *postures)
@@ -61,7 +61,7 @@ class Springs(FeedbackController):
         return np.abs(self.torques(still, np.zeros(posture.shape)) / self.task.limit_control).max(axis=-1)
 
     def torques(self, state: Array, wanted: Array) -> Array:
-        """Return the torques that accelerate the joints as wanted [rad/s²], by the equations of motion."""
+        """Return the torques for wanted joint accelerations [rad/s²], by the equations of motion."""
         scene = self.task.scene
         free = scene.acceleration(state, np.zeros(wanted.shape))
         more = wanted - np.stack([free[name] for name in scene.coordinates], axis=-1)
@@ -69,14 +69,14 @@ class Springs(FeedbackController):
 
 
 class ComputedTorque(Springs):
-    """Make each joint a damped spring by itself: gravity and the links' coupling are taken out.
+    """Make each joint an independent damped spring: gravity and the links' coupling are compensated.
 
     Parameters
     ----------
     task : Reach
         The task, ``env.unwrapped.task``.
     frequency : float
-        The springs' [rad/s].
+        The springs' frequencies [rad/s].
     damping : float
         Their damping ratio.
     """

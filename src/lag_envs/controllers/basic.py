@@ -1,4 +1,4 @@
-"""What controllers share, and a few that know nothing of the motion."""
+"""Shared parts of controllers, and a few that know nothing of the motion."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ Array = NDArray[np.float64]
 
 
 class Law(NamedTuple):
-    """What a controller is that is nothing but feedback: actions a - K (x - x₀), step by step.
+    """A controller that is pure feedback: actions a - K (x - x₀), step by step.
 
-    The last entries hold from then on. Clipped numbers, or the largest of them for choices, are the action.
+    The last entries hold from then on. The action is the clipped numbers, or for choices the index of the
+    largest.
     """
 
     states: Array  #: x₀, shape (steps, n)
     actions: Array  #: a, shape (steps, numbers)
     gains: Array  #: K, shape (steps, numbers, n)
-    read: ObservationDecoder | None  #: what finds x in the observation; None where it is the observation
+    read: ObservationDecoder | None  #: finds x in the observation; None if x is the observation
 
 
 class Constant:
@@ -68,7 +69,7 @@ class Feedback:
     task : Task
         The task.
     gain : array_like, shape (n_actions, n_observation)
-        What each entry of the observation is multiplied by.
+        Factor of each entry of the observation.
     """
 
     def __init__(self, task: Task, *, gain: ArrayLike) -> None:
@@ -89,7 +90,7 @@ class Feedback:
 
 
 def feedback(task: Task, **gains: float) -> Feedback:
-    """Return linear feedback for a task with one control; gains by the observation's entries."""
+    """Return linear feedback for a task with one control; gains are named by the observation's entries."""
     for name in gains:
         if name not in task.observation:
             raise ValueError(f"there is no observation {name!r}, only {', '.join(task.observation)}")
@@ -97,14 +98,14 @@ def feedback(task: Task, **gains: float) -> Feedback:
 
 
 class Switch:
-    """The largest control to one side or the other, by the sign of a sum of observations.
+    """The largest control in either direction, by the sign of a sum of observations.
 
     Parameters
     ----------
     task : Task
         The task, ``env.unwrapped.task``, with one control.
     weights : mapping
-        What each entry of the observation counts in the sum.
+        Weight of each entry of the observation in the sum.
     """
 
     def __init__(self, task: Task, *, weights: Mapping[str, float]) -> None:
@@ -120,13 +121,13 @@ class Switch:
 
 
 def do_nothing(of: gym.Env | Task) -> Constant | Choice:
-    """Return the agent of zero control: where the control is a brake, its action is -1."""
+    """Return the agent of zero control: if the control is a brake, its action is -1."""
     task = of if isinstance(of, Task) else of.unwrapped.task  # type: ignore[attr-defined]
     return Choice(task) if task.formulas.choices else Constant(task.rest_action)
 
 
 class Choice:
-    """In tasks whose actions are numbers of choices, always that of the least control.
+    """In tasks whose actions are choices, always the choice with the smallest control.
 
     Parameters
     ----------
@@ -159,7 +160,7 @@ class Random:
     seed : int
         Seed of the actions.
     count : int
-        How many controls an action has.
+        Number of controls of an action.
     largest : float
         The largest action.
     """
@@ -209,21 +210,21 @@ class FeedbackController(ABC):
 
 
 def remade(task: Task, kind: type[Task] | None = None, /, **changes: Any) -> Task:
-    """Return a task with the same parameters, but for those that change; perhaps of another class."""
+    """Return a task with the same parameters except for the changes; perhaps of another class."""
     fields = dataclasses.fields(task.scene)
     own = {field.name: getattr(task.scene, field.name) for field in fields if field.init}
     return (kind or type(task))(**({"dt": task.dt, "duration": task.duration} | own | changes))
 
 
 def actions_for(task: Task, controls: Array) -> NDArray:
-    """Return the actions that ask for controls, or for the nearest to them that there are.
+    """Return the actions for controls, or for the nearest possible ones.
 
     Parameters
     ----------
     task : Task
         The task.
     controls : ndarray, shape (...) or (..., n_actions)
-        The controls that actions set [SI units]: without a last axis where there is one only.
+        The controls that actions set [SI units]; without a last axis if there is only one.
     """
     formulas = task.formulas
     if formulas.choices:
@@ -237,9 +238,9 @@ def actions_for(task: Task, controls: Array) -> NDArray:
 
 
 def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
-    """Return (scale, offset) with which controls become numbers of actions, as `actions_for` makes them.
+    """Return (scale, offset) that turn controls into the numbers of actions, as in `actions_for`.
 
-    Of listed controls c the nearest to u is that with the largest 2 c u - c².
+    Among listed controls c, the nearest to u has the largest 2 c u - c².
     """
     if formulas.choices:
         (acting,) = formulas.acting
@@ -251,21 +252,21 @@ def per_control(formulas: TaskFormulas) -> tuple[Array, Array]:
 
 
 def hold_law(task: Task, rest: Array, gain: Array, read: ObservationDecoder) -> Law:
-    """Return what asks for controls -K (x - rest), K of shape (n_state,) or (n_actions, n_state)."""
+    """Return the feedback with controls -K (x - rest), K of shape (n_state,) or (n_actions, n_state)."""
     scale, offset = per_control(task.formulas)
     return Law(rest[None], offset[None], (scale[:, None] * np.atleast_2d(gain))[None], read)
 
 
 def as_actions(values: Array, largest: float = 1.0) -> NDArray[np.float32]:
-    """Return numbers (...) as actions (..., 1), none of them beyond the largest."""
+    """Return numbers (...) as actions (..., 1), clipped to the largest."""
     return np.clip(values, -largest, largest)[..., None].astype(np.float32)
 
 
 class ObservationDecoder:
     """Reads states and targets from observations.
 
-    What a task observes is linear in the state, in cosine and sine of its angles, and in the target; so it is
-    inverted from the values at zero and at the unit vectors, or shorter ones where an entry is clipped.
+    A task's observation is linear in the state, in cosine and sine of its angles, and in the target. So it is
+    inverted from its values at zero and at the unit vectors, or shorter ones if an entry is clipped.
 
     Parameters
     ----------
@@ -302,7 +303,7 @@ class ObservationDecoder:
         slopes = risen(size) / size
         self._slopes, self._angles = slopes, angles
         self._inverse = np.linalg.pinv(slopes)
-        #: The angles that are seen by cosine and sine only, and so lie in [-π, π], and where these are.
+        #: The angles that are observed only by cosine and sine, and so lie in [-π, π], and their places.
         pairs = [(i, self._n + 2 * j) for j, i in enumerate(angles) if not slopes[i].any()]
         self._pairs = [(i, j) for i, j in pairs if slopes[j].any() and slopes[j + 1].any()]
         self.wrapped = [i for i, _ in self._pairs]
@@ -310,7 +311,7 @@ class ObservationDecoder:
     def __call__(self, observation: NDArray) -> tuple[Array, Array]:
         """Return states (..., n_state) and targets for observations (..., n).
 
-        Targets have the shape (...), being 0 where there are none, or (..., n_targets) where there are more.
+        Targets have the shape (...), and are 0 if there are none, or (..., n_targets) if there are several.
         """
         values = np.asarray(observation, np.float64)
         if values.shape[-1:] != self._zero.shape:
@@ -326,7 +327,7 @@ class ObservationDecoder:
         return state, targets[..., 0] if targets.shape[-1] == 1 else targets
 
     def numbers(self) -> dict[str, Any]:
-        """Return what it computes with, in JSON types."""
+        """Return the data of the decoder, in JSON types."""
         return {
             "zero": self._zero.tolist(),
             "inverse": self._inverse.tolist(),
@@ -336,7 +337,7 @@ class ObservationDecoder:
         }
 
     def expected(self, states: Array) -> tuple[Array, Array]:
-        """Return what states (n, n_state) look like without targets, and its derivatives by them."""
+        """Return observations of states (n, n_state) without targets, and their derivatives by the states."""
         turned = states[:, self._angles]
         circles = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
         lifted = np.concatenate([states, circles.reshape(len(states), -1)], axis=1)
@@ -347,7 +348,7 @@ class ObservationDecoder:
         return self._zero + lifted @ self._slopes[: self._width], slopes
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return states (..., n_state) minus others, the shorter way around where only that is seen."""
+        """Return states (..., n_state) minus others; angles only seen by cos and sin the shorter way."""
         off = states - others
         for i in self.wrapped:
             off[..., i] -= 2.0 * np.pi * np.rint(off[..., i] / (2.0 * np.pi))

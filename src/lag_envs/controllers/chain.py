@@ -19,22 +19,22 @@ from lag_envs.tasks.chain import SwingUp
 def easier(
     task: SwingUp, *, effort: float, share: float = 0.9, edge: float = 0.9
 ) -> tuple[Task, Callable[[Array], Array]]:
-    """Return a task that is easier to plan for, and what its end costs.
+    """Return a task that is easier to plan for, and the final cost of a plan.
 
-    In place of the guard, which has kinks, it has a penalty that begins before the track's end. It pays for
-    the height's square, whose slope leads upward from anywhere, and hardly matters beside the end's cost. The
-    support is weaker, so that feedback has something left to correct the plan with.
+    Instead of the guard, which has kinks, it has a penalty that begins before the track's end. It rewards the
+    squared height, whose slope leads upward from anywhere and hardly matters beside the final cost. The
+    support is weaker, so that feedback has reserve to correct the plan with.
 
     Parameters
     ----------
     task : SwingUp
         The task.
     effort : float
-        Price of a step with the largest acceleration.
+        Cost of a step with the largest acceleration.
     share : float
         Largest acceleration, as a share of the task's.
     edge : float
-        Share of the track from which on a support that brakes as hard as it can is punished.
+        Share of the track beyond which a support that could not stop in time, braking fully, is penalised.
     """
     kind: Any = type(task)
 
@@ -62,17 +62,17 @@ def easier(
 
 
 def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1.6) -> ILQR:
-    """Return an iLQR that plans each episode anew, from what recorded plans would do.
+    """Return an iLQR that plans each episode again, starting from recorded plans.
 
     Parameters
     ----------
     task : SwingUp
         The task, ``env.unwrapped.task``.
     guesses : sequence of Tracking, optional
-        What to begin from; by default a plan that was recorded with the full control, its mirror image, and
-        the plan that is followed from any start.
+        Initial guesses; by default a plan that was recorded with the full control, its mirror image, and the
+        plan that is followed from any start.
     beyond : float
-        How far to plan, in lengths of the longest of them.
+        How far to plan, as a multiple of the longest guess.
     """
     if not guesses:
         quick = recorded(task, "quick")
@@ -82,9 +82,9 @@ def replan(task: SwingUp, *, guesses: Sequence[Tracking] = (), beyond: float = 1
 
 
 def loss(task: SwingUp) -> Callable[[Array], Array]:
-    """Return what the best regulator loses of the reward from states on, near upright; farther off, more."""
+    """Return the best regulator's loss of reward from given states, near upright; farther off, more."""
     read, rest = ObservationDecoder(task), np.array(task.plans.rest)
-    # The reward does not mind where on the track the bars stand; something has to call the support back.
+    # The reward ignores where on the track the bars stand; something has to draw the support back.
     _, cost = regulator(task, rest, extra={"s": 0.02 / task.length**2})
 
     def lost(states: Array) -> Array:
@@ -98,7 +98,7 @@ def loss(task: SwingUp) -> Callable[[Array], Array]:
 def anywhere(
     task: SwingUp, *, horizon: int = 90, good: float = 3.0, near: float = 0.5, **numbers: Any
 ) -> MPC:
-    """Return an MPC that plans at the start and after each kick, and leaves the hold to a regulator.
+    """Return an MPC that plans at the start and after each kick, and leaves holding to a regulator.
 
     Parameters
     ----------
@@ -107,11 +107,11 @@ def anywhere(
     horizon : int
         Steps to plan ahead.
     good : float
-        Loss after its end below which a plan counts as good.
+        Loss after the plan's end below which the plan counts as good.
     near : float
         Loss below which the regulator is in charge.
     **numbers
-        Others of `MPC`.
+        Other arguments of `MPC`.
     """
     lost = loss(task)
     return MPC(

@@ -13,14 +13,14 @@ from lag_envs.tasks.cylinder_in_cylinder import Damping, Pump, Tilt
 
 
 class TiltLQR(FeedbackController):
-    """Hold a cylinder at an angle by a linear-quadratic regulator about the shell's rate that holds it there.
+    """Hold a cylinder at an angle by a linear-quadratic regulator about the shell rate that holds it there.
 
-    That rate follows from the equation of motion at rest.
+    This rate follows from the equation of motion at rest.
 
     Parameters
     ----------
     task : Tilt
-        The task, ``env.unwrapped.task``; its medium must drag, else no rate holds the cylinder.
+        The task, ``env.unwrapped.task``; its medium must have drag, otherwise no rate holds the cylinder.
     effort : float
         Weight of (u/U)² that is added to the reward's 0.02.
     """
@@ -44,18 +44,19 @@ class TiltLQR(FeedbackController):
 
 
 class EnergyPump(FeedbackController):
-    """Pump the swing to the wanted energy, and make good what the drag takes.
+    """Pump the swing to the wanted energy, and compensate for the drag.
 
-    Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes by θ' (push u - drag (θ' - ψ')); so there
-    is a control that keeps it, and one in the direction of θ' raises it. The shell is drawn back to rest.
+    Per inertia the energy is E = θ'²/2 + ω₀² (1 - cosθ). It changes at the rate θ' (push u - drag (θ' - ψ')),
+    so one control keeps it constant, and an addition in the direction of θ' raises it. The shell is drawn
+    back to rest.
 
     Parameters
     ----------
     task : Pump
         The task, ``env.unwrapped.task``.
     pump : float
-        Acceleration of the shell per missing share of the energy and per highest rate of the cylinder, over
-        the largest acceleration.
+        Acceleration of the shell per missing share of the energy and per largest rate of the cylinder,
+        relative to the largest acceleration.
     centring : float
         Rate at which the shell is drawn back to rest [1/s].
     """
@@ -82,16 +83,16 @@ class EnergyPump(FeedbackController):
 
 
 def plan_pumping(task: Pump, *, opening: float = 0.25) -> ILQR:
-    """Return an iLQR that plans the pumping from two sides.
+    """Return an iLQR that plans the pumping from both directions.
 
-    It starts from a softer pump, from which it gets further.
+    It starts from a softer pump, which leads to better plans.
 
     Parameters
     ----------
     task : Pump
         The task, ``env.unwrapped.task``.
     opening : float
-        For how many periods of a small swing the shell is first pushed to one side or the other.
+        Duration of the first push of the shell to either side, in periods of a small swing.
     """
     follow = EnergyPump(task, pump=5.0, centring=0.3)
     steps = round(opening * 2.0 * math.pi / math.sqrt(follow.omega0_squared) / task.dt)
@@ -102,8 +103,8 @@ class BrakingLine(FeedbackController):
     """Brake hard away from the bottom, roll freely towards it, and brake along a line into it.
 
     Under full brake the cylinder is overdamped: near the bottom it creeps along the slow direction of its
-    linearised motion, or rushes along the fast one, θ' = -s θ. So it is let go until it is nearly as fast
-    as that, and then braked such that it gets onto the line and keeps to it.
+    linearised motion, or rushes along the fast one, θ' = -s θ. So it rolls freely until it is nearly that
+    fast, and is then braked onto the line and kept on it.
 
     Parameters
     ----------
@@ -112,14 +113,14 @@ class BrakingLine(FeedbackController):
     steepness : float
         Slope of the line over that of the fast direction.
     sharpness : float
-        Change of the brake, over its largest, per share by which the speed differs from the line's.
+        Change of the brake, relative to the largest, per relative deviation of the speed from the line's.
     """
 
     def __init__(self, task: Damping, *, steepness: float = 1.0, sharpness: float = 5.5) -> None:
         super().__init__(task)
         # Near the bottom θ'' = a θ + b θ', with b in proportion to the brake.
         (free, full) = (task.scene.linearise([0.0, 0.0], c)[0] for c in (0.0, task.limit_control))
-        # Where even the full brake leaves the cylinder swinging, the real part is the rate of its decay.
+        # If the cylinder swings even under full brake, the real part is the rate of its decay.
         self.slope = steepness * np.abs(np.linalg.eigvals(full).real).max()
         # θ' = -s θ is a solution for b = a/s - s.
         wanted = full[1, 0] / self.slope - self.slope

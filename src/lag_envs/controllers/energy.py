@@ -1,4 +1,4 @@
-"""Energy pumps that bring a system near a rest, where a linear regulator takes over."""
+"""Energy pumps that bring a system near an equilibrium, where a linear regulator takes over."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from lag_envs.tasks.base import Task
 
 
 class Pumped(Regulator):
-    """Base of the regulators that pump energy while they are far from their rest.
+    """Base of the regulators that pump energy while they are far from rest.
 
-    Nearness is the regulator's own cost to go; the thresholds at which it takes over and gives up differ.
+    Distance is measured by the regulator's cost to go; the thresholds for taking over and giving up differ.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Pumped(Regulator):
     catch, lose : float
         Cost to go below which the regulator takes over, and above which it gives up.
     **regulator
-        Those of `Regulator`.
+        Arguments of `Regulator`.
     """
 
     def __init__(self, task: Task, *, catch: float, lose: float, **regulator: Any) -> None:
@@ -34,7 +34,7 @@ class Pumped(Regulator):
 
     @abstractmethod
     def swing(self, state: Array) -> Array:
-        """Return the control far from the rest."""
+        """Return the control far from rest."""
 
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -48,16 +48,16 @@ class Pumped(Regulator):
         return actions_for(self.task, np.where(holds, self.control(x, target), self.swing(x))), holds
 
     def law(self, task: Task) -> None:
-        """Tell that this is more than feedback."""
+        """Tell that this is not pure feedback."""
         return
 
 
 class PivotEnergyLQR(Pumped):
     """Swing a pendulum up by accelerating its pivot, then hold it.
 
-    The pivot is accelerated in the direction in which that does work on the pendulum, in proportion to the
-    missing energy [1]_, and softly back to its middle. Pendulum alone means: with the pivot at rest. Which
-    force accelerates the pivot as wanted follows from the equations of motion, in which it is linear.
+    The pivot is accelerated in the direction that does work on the pendulum, in proportion to the missing
+    energy [1]_, and softly back to its middle. The energy is that of the pendulum alone, with the pivot at
+    rest. The force for the wanted acceleration follows from the equations of motion, which are linear in it.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class PivotEnergyLQR(Pumped):
     pivot, angle : str
         Coordinates of pivot and pendulum.
     pump : float
-        The pivot's acceleration per missing energy, divided by the energy between both rests.
+        The pivot's acceleration per missing energy, relative to the energy between both rests.
     centring : float
         Stiffness with which the pivot is drawn to its middle [1/s²].
     catch, lose, at, weights, effort

@@ -1,4 +1,4 @@
-"""Estimate the state from noisy observations by an extended Kalman filter, and act by the estimate."""
+"""Estimate the state from noisy observations by an extended Kalman filter, and act on the estimate."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from lag_envs.tasks.base import Task
 
 
 class Belief(NamedTuple):
-    """What is believed of each episode: its state before the last action, how surely, and that action."""
+    """The belief about each episode: its state before the last action, the uncertainty, and that action."""
 
     state: Array  # (n, n_state)
     covariance: Array  # (n, n_state, n_state)
     action: Array  # (n,)
-    memory: Any  # that of the controller
+    memory: Any  # of the controller
 
 
 class Filtered:
-    """Act by an estimate of the state, which an extended Kalman filter on the exact model makes [1]_.
+    """Act on a state estimate from an extended Kalman filter on the exact model [1]_.
 
-    Between observations the estimate moves as the model does, and its covariance by the model's exact
-    derivatives; that what a guard does depends on the state is left out. In the beginning the estimate is the
-    middle of the task's starts, as unsure as they are wide.
+    Between observations the estimate follows the model, and its covariance the model's exact derivatives; the
+    dependence of a guard's effect on the state is neglected. The first estimate is the centre of the task's
+    start distribution, with its spread as uncertainty.
 
     Parameters
     ----------
@@ -37,22 +37,22 @@ class Filtered:
         The task, ``env.unwrapped.task``, with one control, no targets and noise on every observation; actions
         and observations must not be late.
     controller : controller
-        Who acts on observations made of the estimate.
+        Acts on observations computed from the estimate.
     drift : float
-        Standard deviation that the estimate is given anew in each step, as a share of the state's spread at
-        the start: a filter that is too sure of itself stops listening.
+        Standard deviation that is added to the estimate in each step, as a share of the state's spread at the
+        start: an overconfident filter would ignore observations.
 
     Raises
     ------
     ValueError
-        For a task whose imperfections it does not reckon with.
+        For a task whose imperfections it does not model.
 
     References
     ----------
     .. [1] R. F. Stengel, "Optimal control and estimation", Dover 1994, section 4.7.
     """
 
-    #: What it believes is of steps of one length.
+    #: Its belief is about steps of one length.
     of_one_interval = True
 
     def __init__(self, task: Task, controller: Any, *, drift: float = 0.0) -> None:
@@ -72,7 +72,7 @@ class Filtered:
         self, observation: NDArray, state: Belief | None = None, episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Belief]:  # fmt: skip
-        """Return the action for each observation, and what is believed then."""
+        """Return the action for each observation, and the belief after it."""
         values = np.asarray(observation, np.float64)
         batch = values.reshape(-1, values.shape[-1])
         x = np.tile(np.asarray(self.task.centre, np.float64), (len(batch), 1))
@@ -93,7 +93,7 @@ class Filtered:
         return actions.reshape((*values.shape[:-1], 1)), known
 
     def _move(self, known: Belief) -> tuple[Array, Array]:
-        """Return estimate and covariance a step later."""
+        """Return estimate and covariance one step later."""
         form, x = self.task.scene._form, known.state
         lifted = list(form.lift(x) if form else x.T)
         applied = self.task.formulas.control(np, [known.action], lifted, [], self._k)
@@ -103,27 +103,27 @@ class Filtered:
         return self.model(x, known.action)[0], spread
 
     def _see(self, x: Array, covariance: Array, observation: Array) -> tuple[Array, Array]:
-        """Return estimate and covariance when that has been observed."""
+        """Return estimate and covariance after an observation."""
         expected, slopes = self.read.expected(x)
         across = slopes @ covariance
         gain = np.linalg.solve(across @ slopes.transpose(0, 2, 1) + self.noise, across).transpose(0, 2, 1)
-        # Joseph's form keeps the covariance symmetric and positive in spite of rounding.
+        # Joseph's form keeps the covariance symmetric and positive definite despite rounding.
         left = np.eye(x.shape[1]) - gain @ slopes
         covariance = left @ covariance @ left.transpose(0, 2, 1) + gain @ self.noise @ gain.transpose(0, 2, 1)
         return x + np.einsum("nij,nj->ni", gain, observation - expected), covariance
 
 
 def follow_filtered(task: Task, *, effort: float, drift: float) -> Filtered:
-    """Return what follows a task's recorded plan by the estimate.
+    """Return a controller that follows a task's recorded plan by the estimate.
 
     Parameters
     ----------
     task : Task
         The task, ``env.unwrapped.task``.
     effort : float
-        Weight of the square of an action's deviation: what is seen dimly is followed gently.
+        Weight of the squared deviation of an action: with noisy observations, plans are followed gently.
     drift : float
-        As `Filtered` has it.
+        As in `Filtered`.
     """
     plan, plans = recorded(task), dataclasses.replace(task.plans, effort=effort)
     return Filtered(task, follow(task, plan.states, plan.actions, plans), drift=drift)

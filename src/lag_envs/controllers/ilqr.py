@@ -14,46 +14,45 @@ from lag_envs.controllers.basic import Array, ObservationDecoder, as_actions
 from lag_envs.envs.model import REACH, Model
 from lag_envs.tasks.base import Task
 
-#: Shares of the full change of the controls that are tried side by side.
+#: Step sizes of the line search, tried in parallel.
 SHARES = 0.5 ** np.arange(0, 10, 1.5)
-#: Least curvature over an action that is believed [reward/action²], in a step of the task's own interval.
+#: Smallest trusted curvature over an action [reward/action²], in a step of the task's own interval.
 FLAT = 1e-4
 
 
 class Plan(NamedTuple):
-    """What is played: for each episode its step, and for each of its steps state, action and gain."""
+    """The plan being played: for each episode its step, and for each of its steps state, action and gain."""
 
     step: NDArray[np.intp]  # (n,)
     states: Array  # (n, steps, n_state)
     actions: Array  # (n, steps)
     gains: Array  # (n, steps, n_state)
-    memory: Any  # that of the controller which goes on where the plan ends
+    memory: Any  # of the controller that continues after the plan
 
 
 class ILQR:
     """Plan each episode at its start with the exact model, and follow the plan by time-varying feedback.
 
-    Starts from what another controller would do. Each iteration expands the model along the trajectory,
+    It starts from the actions of another controller. Each iteration expands the model along the trajectory,
     dynamics to first order and reward to second, and solves the linear-quadratic problem within the bounds of
-    the action [1]_; the best of several shares of the change is kept. So a plan is never worse than what it
-    starts from.
+    the action [1]_; the best of several step sizes is kept. So a plan is never worse than its initial guess.
 
     Parameters
     ----------
     task : Task
         The task with its parameters, ``env.unwrapped.task``; one without random kicks.
     guesses : sequence of controllers
-        What to start from; each is improved, and the best plan is played. `improve` alone needs none.
+        Initial guesses; each is improved, and the best plan is played. `improve` alone needs none.
     after : controller, optional
-        Who goes on where the plan ends before the episode; by default the first guess.
+        Takes over if the plan ends before the episode; by default the first guess.
     tail : callable, optional
-        From states (n, n_state) at the plan's end to what is lost from then on (n,).
+        Takes states (n, n_state) at the plan's end; returns the loss from then on (n,).
     steps : int, optional
         Steps to plan ahead; by default the whole episode, but at most 1000.
     iterations : int
-        At most so many improvements.
+        Largest number of iterations.
     tolerance : float
-        Improvement of the return that ends the iteration.
+        The iteration ends if the return improves by less.
 
     References
     ----------
@@ -107,7 +106,7 @@ class ILQR:
                 getattr(plan, name)[fresh] = getattr(new, name)
             plan.step[fresh] = 0
         rows, now = np.arange(n), np.minimum(plan.step, self.steps - 1)
-        off = self.read.difference(x, plan.states[rows, now])  # a plan goes on beyond ±π
+        off = self.read.difference(x, plan.states[rows, now])  # a plan's angles may exceed ±π
         action = plan.actions[rows, now] + np.einsum("ij,ij->i", plan.gains[rows, now], off)
         memory = plan.memory
         if (plan.step >= self.steps).any():
@@ -123,7 +122,7 @@ class ILQR:
     # --- planning ------------------------------------------------------------------------------------------
 
     def plan(self, starts: Array, targets: Array) -> tuple[Plan, Array]:
-        """Return the best plan for each start (n, n_state) and target (n,), and what `improve` says of it."""
+        """Return the best plan for each start (n, n_state) and target (n,), and its return from `improve`."""
         best: Plan | None = None
         most = np.full(len(starts), -math.inf)
         for guess in self.guesses:
@@ -147,11 +146,11 @@ class ILQR:
         return z.reshape(x.shape), reward.reshape(shape), ended.reshape(shape)
 
     def _goals(self, targets: Array, shape: tuple[int, ...]) -> Array | None:
-        """Return the targets of as many steps, or None where the task has none."""
+        """Return the targets of as many steps, or None if the task has none."""
         return None if self.task.target_range is None else np.broadcast_to(targets, shape).ravel()
 
     def _guess(self, guess: Any, starts: Array, targets: Array) -> Array:
-        """Return the actions (n, steps) of a controller."""
+        """Return a controller's actions (n, steps)."""
         x, memory, actions = starts, None, np.empty((len(starts), self.steps))
         for t in range(self.steps):
             form, formulas = self.task.scene._form, self.task.formulas
@@ -164,7 +163,7 @@ class ILQR:
         return actions
 
     def improve(self, starts: Array, targets: Array, actions: Array) -> tuple[Plan, Array]:
-        """Return plans improved from actions (n, steps), and their returns (n,), less what the tail costs."""
+        """Return plans improved from actions (n, steps), and their returns (n,), minus the final cost."""
         n = len(starts)
         plan = self._blank(n)
         states, actions, returns = self._play(
@@ -188,7 +187,7 @@ class ILQR:
             won = going[better]
             plan.states[won], plan.actions[won], returns[won] = states[better], actions[better], tried[better]
             damping[going] = np.clip(damping[going] * np.where(better, 0.3, 10.0), 1e-6, 1e3)
-            # An episode is done when it hardly gains, or when even the shortest steps gain nothing.
+            # An episode is done when it hardly gains, or when even the smallest step sizes gain nothing.
             done = np.where(better, gain < self.tolerance, damping[going] >= 1e3)
             going = going[~done]
             if not len(going):
@@ -199,7 +198,7 @@ class ILQR:
         self, starts: Array, targets: Array, states: Array, actions: Array, gains: Array, change: Array,
         shares: Array,
     ) -> tuple[Array, Array, Array]:  # fmt: skip
-        """Return states, actions and returns of the plans changed by the best of several shares."""
+        """Return states, actions and returns of the plans changed by the best of several step sizes."""
         n, lines = len(starts), len(shares)
         x = np.repeat(starts[:, None], lines, axis=1)
         goals = targets[:, None]
@@ -223,8 +222,8 @@ class ILQR:
     def _expand(self, states: Array, actions: Array, targets: Array) -> tuple[Array, ...]:
         """Return the model's slopes (n, T, m, n_state), the reward's (n, T, m) and curvature (n, T, m, m).
 
-        The m variables are the state's entries and the action. Last come the gradient (n, n_state) and the
-        curvature (n, n_state, n_state) of what the tail is worth.
+        The m variables are the state's entries and the action. The last two results are the gradient (n,
+        n_state) and the curvature (n, n_state, n_state) of the value at the plan's end.
         """
         n, steps, width = states.shape
         m = width + 1
@@ -232,7 +231,7 @@ class ILQR:
         gradient, curvature = np.empty((n, steps, m)), np.empty((n, steps, m, m))
         # The action is moved inward from its bounds, beyond which it has no effect.
         inner = np.clip(actions, REACH - self.largest, self.largest - REACH)
-        size = max(1, 4_000 // steps)  # what finds room in memory nearby
+        size = max(1, 4_000 // steps)  # fits into the cache
         for first in range(0, n, size):
             part = slice(first, first + size)
             x, u = states[part].reshape(-1, width), inner[part].ravel()
@@ -240,7 +239,7 @@ class ILQR:
             slopes[part] = found.slopes.transpose(0, 2, 1).reshape(slopes[part].shape)
             gradient[part] = found.gradient.reshape(gradient[part].shape)
             curvature[part] = found.curvature.reshape(curvature[part].shape)
-        # At a bound the reward is as steep as just inside, but for the curvature.
+        # At a bound the reward is as steep as just inside, except for the curvature.
         gradient[..., -1] += curvature[..., -1, -1] * (actions - inner)
         curvature = concave(curvature)
         if self.tail is None:
@@ -248,7 +247,7 @@ class ILQR:
         return slopes, gradient, curvature, *self._expand_tail(states, actions, targets)
 
     def _expand_tail(self, states: Array, actions: Array, targets: Array) -> tuple[Array, Array]:
-        """Return gradient and curvature of minus the tail at the plan's end."""
+        """Return gradient and curvature of minus the final cost at the plan's end."""
         assert self.tail is not None
         ends = self._step(states[:, -1], actions[:, -1], targets)[0]
         n, width = ends.shape
@@ -294,16 +293,16 @@ class ILQR:
 
 
 class Opening:
-    """One action for a while, then another controller: a guess that begins otherwise.
+    """One action for a while, then another controller: a guess with a different beginning.
 
     Parameters
     ----------
     action : float
         The action to begin with.
     steps : int
-        Steps for which it is kept.
+        Number of steps for which it is kept.
     then : controller
-        Who goes on.
+        The controller that takes over.
     """
 
     def __init__(self, action: float, steps: int, then: Any) -> None:
@@ -323,6 +322,6 @@ class Opening:
 
 
 def concave(matrices: Array) -> Array:
-    """Return symmetric matrices (..., m, m) without their upward curvature."""
+    """Return symmetric matrices (..., m, m) without their positive curvature."""
     values, vectors = np.linalg.eigh(matrices)
     return (vectors * np.minimum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)

@@ -19,16 +19,16 @@ class TiltCascade(FeedbackController):
     """Hold a cylinder at a mark: a linear-quadratic regulator, written as a cascade.
 
     The regulator's u = -K (x - x*, w, φ) is the same as a control of the tilt, u = K_φ (φ_wanted - φ), behind
-    one of the place, φ_wanted = -(K_x (x - x*) + K_w w)/K_φ. Written so, the wanted tilt can be kept
-    within what the plane can do. Far from the mark the place's part asks for no more speed than can be
-    braked: its error counts by its square root there.
+    one of the place, φ_wanted = -(K_x (x - x*) + K_w w)/K_φ. In this form, the wanted tilt can be limited to
+    the plane's range. Far from the mark, the place loop asks for no more speed than can be braked: there the
+    error enters by its square root.
 
     Parameters
     ----------
     task : Tilt
         The task, ``env.unwrapped.task``; with either control.
     braking : float
-        Share of the largest acceleration that braking is planned with.
+        Share of the largest acceleration that is planned for braking.
     effort : float
         Weight of (u/U)² that is added to the reward's 0.02.
     """
@@ -49,7 +49,7 @@ class TiltCascade(FeedbackController):
         """Return the tilt's rate, or the tilt."""
         gain = np.append(self.gain, 1.0) if self.task.quasi_static else self.gain
         off, w = state[..., 0] - target, state[..., 1]
-        # The speed wanted is proportional near the mark; where it could not be braked, a square root.
+        # The wanted speed is proportional near the mark, and a square root where it could not be braked.
         slope = gain[0] / gain[1]
         near = self.acceleration / slope**2
         size = np.abs(off)
@@ -63,35 +63,35 @@ class TiltCascade(FeedbackController):
 class SwitchingLine(FeedbackController):
     """Let a cylinder roll freely, then brake fully, along the curve that ends at the line at a wanted speed.
 
-    The curve is one run of the scene under full brake: its equation does not depend on the place. In the
-    step in which the curve is met, the brake is such that the step ends on it.
+    The curve is one run of the scene under full brake: the equation of motion does not depend on the place.
+    In the step that reaches the curve, the brake is chosen such that the step ends on it.
 
     Parameters
     ----------
     task : Brake
         The task, ``env.unwrapped.task``.
     speed : float, optional
-        Speed wanted at the line [m/s]; the task's by default.
+        Wanted speed at the line [m/s]; the task's by default.
     fastest : float
-        Highest speed that the curve is made for [m/s].
+        Highest speed covered by the curve [m/s].
     """
 
     def __init__(self, task: Brake, *, speed: float | None = None, fastest: float = 20.0) -> None:
         super().__init__(task)
         self.speed = task.gentle if speed is None else speed
         self.model = Model(task)
-        # No brake gets below the speed at which a full one settles.
+        # No brake gets below the terminal speed of a full one.
         pull, rate = task.coefficients([0.0, 0.0], [task.limit_control], np)
         settled = pull / rate
         self.speed, fastest = max(self.speed, 1.02 * settled), max(fastest, 3.0 * settled)
-        # In ten times 1/rate the excess of speed falls to 5e-5 of what it was.
+        # In ten times 1/rate the excess of speed falls to 5e-5 of its initial value.
         run = task.scene.simulate([0.0, fastest], [task.limit_control] * POINTS, 10.0 / rate / POINTS)
         run = run[: np.searchsorted(-run[:, 1], -self.speed)]
-        #: Rising speeds, and the way that braking down from them takes.
+        #: Increasing speeds, and the distance needed to brake down from them.
         self.curve = run[::-1, 1], run[-1, 0] - run[::-1, 0]
 
     def margin(self, x: Array, v: Array) -> Array:
-        """Return the way that is left when braked fully from now on; below 0 the line is crossed too fast."""
+        """Return the distance left after braking fully from now on; below 0 the line is crossed too fast."""
         return -x - np.interp(v, *self.curve, left=0.0)
 
     def control(self, state: Array, target: Array) -> Array:
@@ -102,20 +102,20 @@ class SwitchingLine(FeedbackController):
             ends = self.model(flat, np.full(len(flat), action))[0]
             left.append(self.margin(*ends.T))
         free, braked = left
-        # Between the two, the brake that ends the step on the curve, as if all were linear.
+        # In between, the brake that ends the step on the curve, in linear approximation.
         between = free / np.minimum(free - braked, -1e-300)
         share = np.where(free >= 0.0, 0.0, np.where(braked <= 0.0, 1.0, between))
         return (self.task.limit_control * share).reshape(state.shape[:-1])
 
 
 def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
-    """Return the largest return of the braking task: what no policy exceeds, however often it acts.
+    """Return the largest return of the braking task, which no policy exceeds, however often it acts.
 
-    Of all motions that cross the line at a given speed, the one that rolls freely and then brakes fully is
-    the fastest at every place: before the switch nothing is faster, and after it nothing that still gets
-    down to that speed. So only the place of the switch is sought. The later it is, the more speed is left at
-    the line, and the less a further m/s there saves, while its price stays: one place is best. A policy that
-    holds its brake for a step at a time comes close, by braking partly in the step with the switch.
+    Of all motions that cross the line at a given speed, rolling freely and then braking fully is the fastest
+    at every place: before the switch nothing is faster, and after it nothing faster can still slow down to
+    that speed. So only the place of the switch has to be found. A later switch leaves more speed at the line,
+    where each further m/s saves less time at the same cost, so there is one best place. A policy that holds
+    its brake for a step at a time comes close, by braking partly in the step of the switch.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     Returns
     -------
     ndarray
-        The returns; minus the episode's seconds where it is better to be late for the line.
+        The returns; minus the episode's seconds if it is better not to reach the line in time.
 
     Raises
     ------
     ValueError
-        Where nothing pulls the cylinder to the line.
+        If nothing pulls the cylinder to the line.
 
     Examples
     --------
@@ -151,17 +151,17 @@ def optimal_return(task: Brake, x: ArrayLike, v: ArrayLike) -> Array:
     x, v = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(v, np.float64))
 
     def crossing(place: Array, speed: Array, force: FixedSlope) -> tuple[Array, Array]:
-        """Return when 0 is passed, and how fast: the integral of x'' = pull - drag x' over the way."""
+        """Return time and speed of passing 0: the integral of x'' = pull - drag x' over the way."""
         time = crossing_time(place, speed, force, np.inf, np)
         return time, speed + force.acceleration * time + force.damping_rate * place
 
     early, late = x, np.zeros_like(x)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # in branches that are not taken
-        for _ in range(50):  # until a rounding lies between the two
+        for _ in range(50):  # until the two differ by a rounding
             switch = 0.5 * (early + late)
             _, fast = crossing(x - switch, v, free)
             time, slow = crossing(switch, fast, full)
-            # Seconds saved by a m/s more at the line, where the brake sets in that much later.
+            # Seconds saved per m/s more at the line, for a later start of the brake.
             saved = (slow / fast * np.exp(full.damping_rate * time) - 1.0) / full.acceleration
             later = (slow <= task.gentle) | (saved > task.price)
             early, late = np.where(later, switch, early), np.where(later, late, switch)

@@ -1,7 +1,6 @@
-"""Linear-quadratic regulators of any scene, from the exact derivatives of its control step.
+"""Linear-quadratic regulators for any scene, from the exact derivatives of its control step.
 
-A task's cost is its own reward, to second order, from the formula that the environment is made of, passed
-through SymPy.
+A task's cost is its own reward to second order, from the environment's own formula, evaluated with SymPy.
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ def regulator(
     Parameters
     ----------
     task : Task
-        The task; its reward to second order is what the regulator optimises.
+        The task; the regulator optimises its reward to second order.
     state, control, target : sequence of float, float, float
         The equilibrium.
     extra : mapping of str to float, optional
-        What a step of the task's own interval is to cost besides: weights of the squares of states, by name,
-        and of "u".
+        Additional costs of a step of the task's own interval: weights of the squares of states, by name, and
+        of "u".
     """
     c = cost(task, state, control, target)
     names = [*task.scene.state_names, "u"]
@@ -82,9 +81,9 @@ def time_varying(
     weights: Mapping[str, float],
     effort: float,
 ) -> tuple[Array, Array]:
-    """Return the feedback that keeps a task to a plan, and that which holds it at rest.
+    """Return the feedback that keeps a task on a plan, and the one that holds it at rest.
 
-    Both minimise the sum of weighted squares of deviations from the plan, the first from its end backwards,
+    Both minimise the weighted sum of squared deviations from the plan, the first one backwards from its end,
     where the second takes over.
 
     Parameters
@@ -141,11 +140,11 @@ class Regulator(FeedbackController):
     task : Task
         The task, ``env.unwrapped.task``.
     at : mapping, optional
-        Entries of the state at the rest that are not 0.
+        Nonzero entries of the state at rest.
     weights : mapping
-        What the square of an entry of the state costs in a step.
+        Cost of the square of each state entry in a step.
     effort : float
-        What the square of a control costs, as a share of the largest.
+        Cost of the squared control, as a share of the largest control.
     """
 
     def __init__(
@@ -168,29 +167,29 @@ class Regulator(FeedbackController):
         self.gain = np.linalg.solve(r + b.T @ self.cost @ b, b.T @ self.cost @ a)
 
     def off(self, state: Array) -> Array:
-        """Return states relative to the rest, by the shorter way around."""
+        """Return states relative to rest, by the shorter way around."""
         return self.read.difference(state, self.rest)
 
     def cost_to_go(self, state: Array) -> Array:
-        """Return what the regulator expects to pay from states on."""
+        """Return the regulator's expected cost from given states."""
         off = self.off(state)
         return np.einsum("...i,ij,...j->...", off, self.cost, off)
 
     def control(self, state: Array, target: Array) -> Array:
-        """Return -K times the distance from the rest."""
+        """Return -K times the distance from rest."""
         u = -self.off(state) @ self.gain.T
         return u[..., 0] if self.gain.shape[0] == 1 else u
 
     def law(self, task: Task) -> Law | None:
-        """Return the controller as feedback; None for one that makes more of it."""
+        """Return the controller as feedback; None for a subclass that does more."""
         return hold_law(task, self.rest, self.gain, self.read)
 
 
 class BalanceLQR(FeedbackController):
-    """Keep what moves on a support upright by a linear-quadratic regulator, in spite of kicks.
+    """Keep bodies on a moving support upright by a linear-quadratic regulator, in spite of kicks.
 
-    The reward alone would have the control as hard as can be; what is added has the regulator ready for
-    the next kick. The weights are what ``python -m agents.tune`` finds.
+    The reward alone would make the control as hard as possible; the added weights keep the regulator ready
+    for the next kick. ``python -m agents.tune`` found them.
 
     Parameters
     ----------

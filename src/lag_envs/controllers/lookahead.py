@@ -31,18 +31,18 @@ class Clocked(ABC):
         self.read = ObservationDecoder(task)
         self._chooses = bool(task.formulas.choices)
         self.largest = task.formulas.largest
-        #: What the clock goes on by at each `predict`: less than 1 for one who acts more often.
+        #: Advance of the clock at each `predict`: less than 1 when acting more often.
         self.pace = 1.0
 
     @abstractmethod
     def act(self, states: Array, targets: Array, taken: Array) -> Array:
         """Return actions, not clipped yet, for states (n, n_state), targets and steps taken (n,).
 
-        Their shape is (n,) where an action has one number, and (n, n_actions) otherwise.
+        Their shape is (n,) if an action has one number, and (n, n_actions) otherwise.
         """
 
     def finish(self, values: Array) -> NDArray:
-        """Return what `act` returned as the environment takes it."""
+        """Return the result of `act` in the form that the environment takes."""
         if self._chooses:
             return values.astype(np.int64)
         clipped = np.clip(values, -self.largest, self.largest).astype(np.float32)
@@ -55,7 +55,7 @@ class Clocked(ABC):
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray, Array]:
-        """Return the action for each observation, and the steps taken then."""
+        """Return the action for each observation, and the steps taken by then."""
         values = np.asarray(observation, np.float64)
         batch = np.atleast_2d(values)
         taken = np.broadcast_to(np.asarray(0.0 if state is None else state, np.float64), len(batch))
@@ -69,17 +69,17 @@ class Clocked(ABC):
 class LookAhead(Clocked):
     """Takes the action with the largest reward + value after one step of the exact, undisturbed model.
 
-    It tries a set of actions, and then, unless they are listed, finer ones around the best.
+    It tries a set of actions, and then finer ones around the best, unless the actions are listed.
 
     Parameters
     ----------
     task : Task
         The task, with one control.
     value : callable
-        Given where steps end (n, n_state), targets (n,) and the steps taken before them (n,), it returns the
-        mean return that is still to be had (n,).
+        Takes the ends of steps (n, n_state), targets (n,) and the steps taken before them (n,); returns the
+        mean return still to come (n,).
     actions : ndarray
-        The first actions to try, evenly spaced; all that are listed.
+        The number of evenly spaced actions to try first; listed actions are all tried.
     """
 
     def __init__(self, task: Task, value: Callable[[Array, Array, Array], Array], actions: Array) -> None:

@@ -1,4 +1,4 @@
-"""Model-predictive control: plan on the exact model, and anew whenever something else has happened."""
+"""Model-predictive control: plan on the exact model, and again whenever the outcome differs."""
 
 from __future__ import annotations
 
@@ -18,50 +18,50 @@ Tail = Callable[[Array], Array]
 
 
 class Ahead(NamedTuple):
-    """What is planned: for each episode its step, and for each of its steps state, action and gain."""
+    """The plan of each episode: its step, and for each of its steps state, action and gain."""
 
     step: NDArray[np.intp]  # (n,)
-    wait: NDArray[np.intp]  # (n,), steps until it may search again
+    wait: NDArray[np.intp]  # (n,), steps until the next search is allowed
     states: Array  # (n, horizon, n_state)
     actions: Array  # (n, horizon)
     gains: Array  # (n, horizon, n_state)
 
 
 class MPC:
-    """Plan ahead on the exact model, follow the plan, and plan anew every few steps or after a surprise.
+    """Plan ahead on the exact model, follow the plan, and plan again every few steps or after a surprise.
 
-    A new plan begins from the rest of the old one, which is followed with its feedback and improved by a few
-    iterations of iLQR. If it still ends badly, as one does at first and after hard kicks, plans are searched
-    for from random guesses. That kicks come at random is left aside.
+    A new plan begins with the rest of the old one, followed with its feedback and improved by a few
+    iterations of iLQR. If it still ends badly, as a first plan does, or one after hard kicks, plans are
+    searched for from random guesses. The chance of future kicks is ignored.
 
     Parameters
     ----------
     task : Task
-        The task that is controlled, with one control.
+        The task to control, with one control.
     tail : callable, optional
-        What the end of a plan costs, from states (n, n_state) to numbers (n,).
+        Final cost of a plan, from states (n, n_state) to numbers (n,).
     horizon : int
         Steps to plan ahead.
     every : int
         Steps after which a plan is renewed.
     iterations : int
-        Iterations of iLQR that this may take.
+        Iterations of iLQR for a renewal.
     budget : int
-        Steps of the model that a search may take.
+        Steps of the model for a search.
     guesses : int
-        How many guesses a search improves.
+        Number of guesses that a search improves.
     good : float
-        Cost of the end below which a plan counts as good. By default there is one search, at the start.
+        Final cost below which a plan counts as good. By default there is one search, at the start.
     pause : int
-        Steps from one search to the next, at least.
+        Smallest number of steps between searches.
     surprise : float
         Deviation of an entry of the state from the plan that counts as a surprise.
     easier : (Task, callable), optional
-        A task that searches are made on, and what the end costs there: see `Plans.place`.
+        A task for searches, and its final cost: see `Plans.place`.
     hold : Tracking, optional
-        Feedback with which a plan is continued beyond its end, and who acts where `holds`.
+        Feedback that continues a plan beyond its end, and that acts where `holds`.
     holds : callable, optional
-        Where no plan is needed, from states (n, n_state) to booleans (n,).
+        Tells where no plan is needed, from states (n, n_state) to booleans (n,).
     seed : int
         Seed of the guesses.
     """
@@ -142,7 +142,7 @@ class MPC:
         return as_actions(action.reshape(values.shape[:-1]), self.largest), plan
 
     def _renew(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array, fresh: Any) -> None:
-        """Plan anew for some of the episodes."""
+        """Plan again for some of the episodes."""
         guess = self._continued(plan, rows, x[rows], targets[rows])
         found, value = self.planner.improve(x[rows], targets[rows], guess)
         bad = (fresh[rows] | self._ends_badly(found.states, found.actions, targets[rows])) & (
@@ -160,7 +160,7 @@ class MPC:
         plan.step[rows] = 0
 
     def _continued(self, plan: Ahead, rows: NDArray[np.intp], x: Array, targets: Array) -> Array:
-        """Return the actions (n, horizon) when plans are followed to their ends, and held there."""
+        """Return the actions (n, horizon) from following plans to their ends and holding there."""
         actions = np.zeros((len(rows), self.horizon))
         for t in range(self.horizon):
             step = plan.step[rows] + t
@@ -179,7 +179,7 @@ class MPC:
         return self.tail(self.planner._step(states[:, -1], actions[:, -1], targets)[0]) > self.good
 
     def _search(self, x: Array, targets: Array) -> tuple[Any, Array]:
-        """Return the best of plans from random guesses, and what it is worth."""
+        """Return the best of plans from random guesses, and its value."""
         n, m = len(x), self.guesses
         guesses = self.largest * waves(self.rng, n * m, self.horizon, self.task.dt)
         found, values = self.searcher.improve(np.repeat(x, m, axis=0), np.repeat(targets, m), guesses)

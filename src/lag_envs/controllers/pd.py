@@ -8,15 +8,15 @@ from lag_envs.controllers.basic import Array, FeedbackController
 from lag_envs.tasks.cylinder_in_cylinder import Tilt as ShellTilt
 from lag_envs.tasks.incline import Tilt as InclineTilt
 
-#: Frequency [rad/s] and lag of what is moved [s], as `tune` found them.
+#: Frequency [rad/s] and time constant of the moved part [s], as found by `tune`.
 TUNED = {InclineTilt: (2.5, 0.07), ShellTilt: (17.0, 0.49)}
 
 
 class PD(FeedbackController):
-    """Bring place or angle to its target like a critically damped spring.
+    """Bring a place or an angle to its target like a critically damped spring.
 
-    The acceleration ω² (q* - q) - 2ω q' is asked for. What is moved, the tilt of the plane or the rate of the
-    shell, has to be at a value that follows from the equation of motion; the control brings it there.
+    The wanted acceleration is ω² (q* - q) - 2ω q'. The tilt of the plane or the rate of the shell that gives
+    it follows from the equation of motion, and the control brings it there.
 
     Parameters
     ----------
@@ -25,7 +25,8 @@ class PD(FeedbackController):
     frequency : float, optional
         The spring's ω [rad/s].
     lag : float, optional
-        Time in which the control brings what is moved to where it is wanted [s]; at least a step.
+        Time constant with which the control brings tilt or shell rate to the wanted value [s]; at least a
+        step.
     """
 
     task: InclineTilt | ShellTilt

@@ -12,7 +12,7 @@ from lag_envs.tasks.pendulum import PendulumRegret
 
 
 class PendulumEnergyLQR(Pumped):
-    """Turn a rod the way it turns until its energy is that of the upright rest, then hold it.
+    """Turn a rod the way it already turns until it has the energy of the upright rest, then hold it.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class PendulumEnergyLQR(Pumped):
 
 
 class OwnLaw(FeedbackController):
-    """Act by the law that a task has itself.
+    """Act by the task's own optimal law.
 
     Parameters
     ----------
@@ -51,11 +51,11 @@ class OwnLaw(FeedbackController):
 
 
 def value_at_start(task: PendulumRegret, *state: Array) -> Array:
-    """Return V of states, given by their entries (n,): what no policy exceeds."""
+    """Return V of states, given by their entries (n,), which no policy exceeds."""
     return task.value(_named(task, np.stack(state, axis=-1)), np)
 
 
 def _named(task: Task, states: Array) -> Values:
-    """Return states as formulas have them."""
+    """Return states in the form that formulas take."""
     columns = np.moveaxis(np.asarray(states, np.float64), -1, 0)
     return Values("entry of the state", dict(zip(task.scene.state_names, columns, strict=True)))

@@ -14,21 +14,21 @@ from lag_envs.controllers.ilqr import ILQR, Opening
 from lag_envs.controllers.linear import regulator
 from lag_envs.tasks.pivoted_bar import SwingUp
 
-#: What upright is, behind the support's place and speed, if those are states.
+#: The upright rest, after the support's place and speed, if those are states.
 UPRIGHT = (0.0, 0.0, math.pi, 0.0)
 
-#: Where the LQR takes over, and strength of pumping, with a track and without.
+#: Thresholds of the LQR, and strength of pumping, with a track and without.
 TUNED = {True: (2.5, 1.5), False: (5.8, 3.8)}
 
 
 class EnergyShapingLQR:
     """Pump a bar up to the energy of the upright rest, then hold it by a linear-quadratic regulator.
 
-    Far from upright the support is accelerated in the direction in which it does work on the bar [1]_, and,
-    on a track, softly back to its middle. Near upright the LQR takes over, and hands back only when out of
-    its depth: nearness is the LQR's own cost to go, and the two thresholds differ.
+    Far from upright, the support is accelerated in the direction that does work on the bar [1]_, and, on a
+    track, softly back to its middle. Near upright the LQR takes over, and gives up only far outside its
+    range: distance is measured by the LQR's cost to go, and the two thresholds differ.
 
-    The numbers are what ``python -m agents.tune`` found, with a track and without.
+    ``python -m agents.tune`` found the numbers, with a track and without.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class EnergyShapingLQR:
         return as_actions(self.task.formulas.action(u)), holds
 
     def cost_to_go(self, x: Array) -> Array:
-        """Return what the LQR expects to lose of the reward from states on, near upright."""
+        """Return the LQR's expected loss of reward from given states, near upright."""
         off = from_upright(x)
         return np.einsum("...i,ij,...j->...", off, self.cost, off)
 
@@ -91,7 +91,7 @@ class EnergyShapingLQR:
         """
         theta_dot, cosine = x[..., -1], np.cos(x[..., -2])
         missing = self.omega0_squared - (0.5 * theta_dot * theta_dot - self.omega0_squared * cosine)
-        work = np.where(theta_dot * cosine < 0.0, 1.0, -1.0)  # never 0: a bar at rest must be set going
+        work = np.where(theta_dot * cosine < 0.0, 1.0, -1.0)  # never 0: a bar at rest has to be set in motion
         u = self.pump * missing * work
         if self.task.has_track:
             u -= self.centring * x[..., 0] + 2.0 * math.sqrt(self.centring) * x[..., 1]
@@ -99,18 +99,18 @@ class EnergyShapingLQR:
 
 
 class Estimate(NamedTuple):
-    """What `AdaptiveEnergyShapingLQR` remembers of n episodes.
+    """The memory of `AdaptiveEnergyShapingLQR` for n episodes.
 
     Attributes
     ----------
     seen : ndarray, shape (n, 4)
-        The last state that was observed.
+        The last observed state.
     applied : ndarray, shape (n,)
         The control [m/s²] that acts from then on.
     under_way : ndarray, shape (n, steps of delay)
-        The controls that were asked for and do not act yet, the oldest first.
+        The requested controls that do not act yet, the oldest first.
     faded : ndarray, shape (n, 3)
-        Sums over the steps that fade: of the regressors of q and γ, and of the change of θ'.
+        Sums over the steps with fading weights: of the regressors of q and γ, and of the change of θ'.
     information, weighed : ndarray, shapes (n, 2, 2) and (n, 2)
         Matrix and right side of the least squares for q and γ.
     holds : ndarray of bool, shape (n,)
@@ -129,12 +129,12 @@ class Estimate(NamedTuple):
 class AdaptiveEnergyShapingLQR:
     """Swing up a bar of unknown length and friction: estimate both on the way, and control by the estimate.
 
-    The bar moves by θ'' = -q (g sinθ + u cosθ) - γ θ', where q = m L/(m L² + I) follows from its length. Both
-    unknowns are linear in it, so least squares find them: θ' changes over a step by q and γ times integrals
-    of what is observed. Changes are summed with weights that fade, which is exact, and makes the noise of
-    single readings matter less. Regulators are designed beforehand for some lengths in the range that is
-    drawn, and interpolated in q. Actions that are late are no surprise: the state is predicted to where the
-    next one will act.
+    The bar moves by θ'' = -q (g sinθ + u cosθ) - γ θ', where q = m L/(m L² + I) follows from its length. This
+    is linear in both unknowns, so least squares find them: over a step, θ' changes by q and γ times integrals
+    of observed quantities. Changes are summed with fading weights, which is exact and reduces the effect of
+    noise in single readings. Regulators are designed beforehand for several lengths in the drawn range, and
+    interpolated in q. Delayed actions are taken into account: the state is predicted to the time at which the
+    next one acts.
 
     Parameters
     ----------
@@ -147,19 +147,19 @@ class AdaptiveEnergyShapingLQR:
     centring : float
         Stiffness with which pumping draws the support to the middle of its track [1/s²].
     fade : float
-        What is left of a step's weight in the sums after another step.
+        Factor of a step's weight in the sums after each further step.
     noise : float
-        Standard deviation of an observed θ' [rad/s], against which the prior range is weighed.
+        Standard deviation of an observed θ' [rad/s], which sets the weight of the prior range.
     designs : int
-        Number of lengths that regulators are designed for.
+        Number of lengths for which regulators are designed.
 
     Raises
     ------
     ValueError
-        Where no length is drawn, or actions are late by other than whole control steps.
+        If no length is drawn, or actions are not late by a whole number of control steps.
     """
 
-    #: Largest γ [1/s] that is believed, and how sure the prior is of its value, 0.
+    #: Largest γ [1/s] that is plausible, and the weight of the prior value 0.
     LARGEST_FRICTION, SPREAD = 3.0, 0.3
 
     def __init__(
@@ -195,7 +195,7 @@ class AdaptiveEnergyShapingLQR:
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = False
     ) -> tuple[NDArray[np.float32], Estimate]:
-        """Return the action for each observation; the state is what was estimated so far."""
+        """Return the action for each observation; the state is the estimate so far."""
         seen = self.read(observation)[0]
         x = seen.reshape(-1, seen.shape[-1])
         known = self._begin(x)
@@ -207,7 +207,7 @@ class AdaptiveEnergyShapingLQR:
         found = np.linalg.solve(known.information, known.weighed[..., None])[..., 0]
         q = np.clip(found[:, 0], self.q[0], self.q[-1])
         friction = np.clip(found[:, 1], 0.0, self.LARGEST_FRICTION)
-        # What is under way acts first.
+        # Pending controls act first.
         applied = None
         for i in range(self.delay):
             u = self._guarded(known.under_way[:, i], x)
@@ -222,7 +222,7 @@ class AdaptiveEnergyShapingLQR:
         return action.reshape(*seen.shape[:-1], 1), memory
 
     def _begin(self, x: Array) -> Estimate:
-        """Return what is known before anything has moved."""
+        """Return the estimate before anything has moved."""
         n, middle, half = len(x), 0.5 * (self.q[0] + self.q[-1]), 0.5 * (self.q[-1] - self.q[0])
         sure = np.array([1.0 / half**2, 1.0 / self.SPREAD**2])
         return Estimate(
@@ -236,7 +236,7 @@ class AdaptiveEnergyShapingLQR:
         )
 
     def _learn(self, known: Estimate, x: Array) -> Estimate:
-        """Return what is known when the states x have been observed."""
+        """Return the estimate after the states x have been observed."""
         old, u = known.seen, known.applied
         turned = np.remainder(x[:, 2] - old[:, 2] + math.pi, 2.0 * math.pi) - math.pi
         pull = -0.5 * self.task.dt * (self._pull(old, u) + self._pull(x, u))
@@ -253,12 +253,12 @@ class AdaptiveEnergyShapingLQR:
         return self.task.scene.gravity * np.sin(x[:, 2]) + u * np.cos(x[:, 2])
 
     def _guarded(self, u: Array, x: Array) -> Array:
-        """Return the control that is applied where u is asked for."""
+        """Return the applied control for a requested u."""
         lifted = [*x.T, np.cos(x[:, 2]), np.sin(x[:, 2])]
         return np.asarray(self.task.formulas.guarded(np, [u], lifted, self._k)[0])
 
     def _step(self, x: Array, u: Array, q: Array, friction: Array) -> Array:
-        """Predict a control step by the midpoint rule: what is estimated is less exact."""
+        """Predict a control step by the midpoint rule: the estimates are less accurate than that."""
         dt = self.task.dt
 
         def slope(y: Array) -> Array:
@@ -282,7 +282,7 @@ class AdaptiveEnergyShapingLQR:
 
 
 def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16) -> ILQR:
-    """Return an iLQR that plans the swing-up from two sides, and leaves the hold to the LQR.
+    """Return an iLQR that plans the swing-up from both directions, and leaves holding to the LQR.
 
     Parameters
     ----------
@@ -291,8 +291,8 @@ def plan_swing_up(task: SwingUp, *, periods: float = 3.2, opening: float = 0.16)
     periods : float
         How far ahead to plan, in periods of a small swing of the hanging bar.
     opening : float
-        For how many of them the support is first pushed to one side or the other. Which one is better
-        depends on the start, and iLQR does not get from one to the other.
+        Duration of the first push of the support to either side, in such periods. The better side depends on
+        the start, and iLQR does not get from one to the other.
     """
     follow = EnergyShapingLQR(task)
     steps = 2.0 * math.pi / math.sqrt(max(follow.omega0_squared, 1.0)) / task.dt
@@ -315,9 +315,9 @@ def from_upright(x: Array) -> Array:
 def lqr(task: SwingUp) -> tuple[Array, Array]:
     """Return the gain K of u = -K x and P of the cost to go x'Px, near upright.
 
-    There x = (s, s', e, θ') with e = θ - π. A step costs what the reward h² - 0.02 (u/U)² loses there to
-    second order, e²/2 + 0.02 (u/U)², and for the track, which the reward does not mind, 0.02 (s/S)²: else
-    nothing would call the support back.
+    There x = (s, s', e, θ') with e = θ - π. A step costs the reward's loss h² - 0.02 (u/U)² to second order,
+    e²/2 + 0.02 (u/U)², plus 0.02 (s/S)² for the track, which the reward ignores: otherwise nothing would draw
+    the support back.
     """
     extra = {"s": 0.02 / task.length**2} if task.has_track else {}
     return regulator(task, UPRIGHT[-len(task.scene.state_names) :], extra=extra)

@@ -1,4 +1,4 @@
-"""Plans that swing something up: a task that is easier to plan for than those with a height to the fourth."""
+"""Plans for swing-ups: on a task that is easier to plan for than one rewarding the fourth power of height."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ def easier(
     walls: Mapping[str, float] | None = None,
     every: int = 1,
 ) -> tuple[Task, Callable[[Array], Array]]:
-    """Return a task that is easier to plan for, and what its end costs.
+    """Return a task that is easier to plan for, and the final cost of a plan.
 
-    All that counts is where a plan ends, and a little how. The control is weaker, so that feedback has
-    something left to correct the plan with.
+    Almost only a plan's end counts, and its course only a little. The control is weaker, so that feedback has
+    reserve to correct the plan with.
 
     Parameters
     ----------
     task : Task
-        The task; its `plans` tell the rest at which a plan should end.
+        The task; its `plans` give the rest at which a plan should end.
     end : mapping
-        What an entry of the state costs at the end: by the square of its distance from the rest, for angles
-        twice 1 less the cosine of it.
+        Final cost of each state entry: its squared distance from rest times this, for angles twice 1 minus
+        its cosine.
     effort : float
-        Price of a step with the largest control.
+        Cost of a step with the largest control.
     share : float
         Largest control, as a share of the task's.
     walls : mapping, optional
-        For entries of the state, sizes from nine tenths of which on a step is punished.
+        Sizes of state entries; beyond nine tenths of them a step is penalised.
     every : int
-        How many of the task's steps each control is held.
+        For how many of the task's steps each control is held.
     """
     kind: Any = type(task)
     (name,) = kind.action
@@ -66,16 +66,16 @@ def easier(
 
 
 def away(task: Task, weights: Mapping[str, float], rest: Mapping[str, float]) -> Callable[[Array], Array]:
-    """Return what states (n, n_state) cost by their distance from a rest.
+    """Return the cost of states (n, n_state) by their distance from rest.
 
     Parameters
     ----------
     task : Task
         The task.
     weights : mapping
-        For entries of the state, what the square of the distance costs, for angles twice 1 less its cosine.
+        For state entries, the weight of the squared distance, for angles of twice 1 minus its cosine.
     rest : mapping
-        Where the entries are at rest; 0 where it has none.
+        The entries at rest; 0 if not given.
     """
     names, units = task.scene.state_names, task.scene.state_units
 

@@ -19,28 +19,28 @@ from lag_envs.tasks.record import Plans
 
 Array = NDArray[np.float64]
 
-#: Where recorded plans are: a file per environment, which ``python -m agents.optimum`` writes.
+#: Folder of recorded plans: a file per environment, written by ``python -m agents.optimum``.
 FOLDER = Path(__file__).with_name("plans")
 
 
 class Tracking(Clocked):
-    """Follow a plan by time-varying linear feedback, and hold where it ends by constant feedback.
+    """Follow a plan by time-varying linear feedback, and hold its end by constant feedback.
 
-    Near the plan's state x_t the action is a_t - K_t (x - x_t), from the plan's end on -K (x - rest); angles
-    that are only seen by cosine and sine are compared the shorter way around. All of it is data.
+    Along the plan's states x_t the action is a_t - K_t (x - x_t), after the plan's end -K (x - rest); angles
+    that are observed only by cosine and sine are compared the shorter way around. All of it is data.
 
     Parameters
     ----------
     task : Task
         The task.
     states : array_like, shape (steps + 1, n_state)
-        The plan's states. Without any step, the feedback at rest is all there is.
+        The plan's states. Without any step, there is only the feedback at rest.
     actions : array_like, shape (steps,) or (steps, n_actions)
-        Its actions, without the last axis where they have one number.
+        Its actions, without the last axis if they have one number.
     gains : array_like, shape (steps, n_state) or (steps, n_actions, n_state)
         The feedback K_t, actions per deviation.
     rest : array_like, shape (n_state,)
-        The equilibrium that is held, by the action 0.
+        The equilibrium to hold, with the action 0.
     hold : array_like, shape (n_state,) or (n_actions, n_state)
         The feedback K there.
     """
@@ -86,7 +86,7 @@ class Tracking(Clocked):
         Raises
         ------
         ValueError
-            Where there is none, or where it is of a task with another state.
+            If there is none, or if it is for a task with another state.
         """
         if not file.is_file():
             raise ValueError(f"there is no plan {file}; python -m agents.optimum {task.id} makes one")
@@ -103,7 +103,7 @@ class Tracking(Clocked):
         )
 
     def mirrored(self) -> Tracking:
-        """Return the plan to the other side, for a task that looks the same from behind."""
+        """Return the plan's mirror image, for a task that looks the same from behind."""
         return Tracking(
             self.task, states=-self.states, actions=-self.actions, gains=self.gains, rest=-self.rest,
             hold=self.hold,
@@ -134,17 +134,17 @@ class Tracking(Clocked):
 
 
 def file_of(task: Task, kind: str = "followed", folder: Path | None = None) -> Path:
-    """Return where a task's plan is kept: the one to follow, or the "quick" one to begin planning from."""
+    """Return the place of a task's plan: the one to follow, or the "quick" one as an initial guess."""
     return (folder or FOLDER) / f"{task.plans.of or task.id}-{kind}.npz"
 
 
 def recorded(task: Task, kind: str = "followed") -> Tracking:
-    """Return the controller that follows the plan that was recorded for a task's id."""
+    """Return the controller that follows the recorded plan of a task's id."""
     return Tracking.load(task, file_of(task, kind))
 
 
 def hold(task: Task) -> Tracking:
-    """Return the regulator that holds a task's plans where they end, `Task.plans` says how."""
+    """Return the regulator that holds the end of a task's plans, as `Task.plans` specifies."""
     return follow(task, [task.plans.rest], np.empty(0), task.plans)
 
 
@@ -164,18 +164,18 @@ def waves(rng: np.random.Generator, n: int, steps: int, dt: float) -> Array:
 
 
 def search(task: Task, seed: int = 0, **changes: Any) -> Iterator[Tracking]:
-    """Plan from random guesses at once, by iLQR on an easier task, and yield what follows each plan.
+    """Plan from many random guesses at once, by iLQR on an easier task; yield a controller for each plan.
 
     The most promising plan comes first.
 
     Parameters
     ----------
     task : Task
-        The task; its `plans` say how.
+        The task; its `plans` specify how.
     seed : int
         Seed of the guesses.
     **changes
-        What is different, see `Plans.quick`.
+        Changes to the numbers, see `Plans.quick`.
     """
     plans: Plans = task.plans
     size = {name: changes.pop(name, getattr(plans, name)) for name in ("steps", "batch", "iterations")}

@@ -113,7 +113,7 @@ class Reverse:
     def _in_parts(
         self, out: list[Array], kicked: bool, rows: Any, y: Array, a: Array, g: Array, z: Array, *rest: Array
     ) -> None:
-        """Do the same as `pull`, into `out`, with the motion as a separate part; errors name the rows by `rows`."""
+        """Do the same as `pull`, into `out`, with the motion by itself; errors name the rows by `rows`."""
         (u,) = self._lanes("control", self._control_of, "y", "a", "g")(self._numbers, y, a, g)
         own_y, own_z, *own = self._after(kicked)(self._numbers, y, u, g, z, *rest)
         moved = pulled(self._task.scene, y, u, self._task.dt, own_z, self._parameters, rows)

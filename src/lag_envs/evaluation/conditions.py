@@ -14,24 +14,24 @@ from numpy.typing import ArrayLike, NDArray
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.imperfections import MOST_DRAWN
 
-#: Names of the environment as it is, and of acting ten times as often.
+#: Names of the unchanged environment, and of acting ten times as often.
 NOMINAL, OFTEN = "nominal", "ten times as often"
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What differs from the environment as it is.
+    """Changes to an environment.
 
     Parameters
     ----------
     name : str
-        As tables call it.
+        Its name in tables.
     options : mapping
-        The environment's arguments.
+        The environment's keyword arguments.
     noise : float
-        Standard deviation of the observation's noise, relative to its own under random actions.
+        Standard deviation of the observation noise, relative to the observation's own under random actions.
     late : bool
-        Whether the agent sees the observation before.
+        Whether the agent sees the previous observation.
     """
 
     name: str = NOMINAL
@@ -40,17 +40,17 @@ class Condition:
     late: bool = False
 
     def steps(self, env_id: str) -> int:
-        """Return the steps of an environment's episode at most."""
+        """Return the largest number of steps of an environment's episode."""
         return int(TASKS[env_id](**self.options).limit)
 
     def suits(self, agent: Any, plans: bool) -> bool:
-        """Tell whether an agent can act under it: one that plans or remembers does so for one interval.
+        """Tell whether an agent can act under this: planning or a memory is tied to one control interval.
 
         Parameters
         ----------
         agent : object
-            The agent; with a `pace` it counts steps, and can be told how long they are. It says by
-            `of_one_interval` that it remembers what it saw at such steps.
+            The agent. If it has a `pace`, it counts steps and can be told their length; `of_one_interval`
+            says that its memory is of steps of one length.
         plans : bool
             Whether it plans.
         """
@@ -59,12 +59,12 @@ class Condition:
 
 
 def often(env_id: str) -> Condition:
-    """Return the condition of acting ten times as often; a second is worth the same."""
+    """Return the condition of acting ten times as often; the reward per second stays the same."""
     return Condition(OFTEN, {"dt": TASKS[env_id]().interval / 10.0})
 
 
 def disturbances(env_id: str) -> list[Condition]:
-    """Return a condition for each of the environment's numbers off by 20 %; policies don't know of it."""
+    """Return a condition for each of the environment's numbers off by 20 %, unknown to policies."""
     return [
         Condition(f"{name} {sign}20 %", {name: share * value})
         for name, value in _positive(env_id).items()
@@ -73,7 +73,7 @@ def disturbances(env_id: str) -> list[Condition]:
 
 
 def _positive(env_id: str) -> dict[str, float]:
-    """Return the environment's numbers that are above 0 and finite."""
+    """Return the environment's positive, finite numbers."""
     scene = TASKS[env_id]().scene
     values = {f.name: getattr(scene, f.name) for f in dataclasses.fields(scene)}
     return {k: x for k, x in values.items() if isinstance(x, float) and 0.0 < x < math.inf}
@@ -82,10 +82,10 @@ def _positive(env_id: str) -> dict[str, float]:
 def imperfections(env_id: str) -> list[Condition]:
     """Return conditions of imperfect sensors and actuators, and of hidden parameters.
 
-    Noise of 0.01 on the observation, whose entries tasks scale to about 1; actions that are one control
-    interval late; actuators with a lag of two; now and then a push of 2 % of the largest rate; the
-    environment's numbers, the first `MOST_DRAWN` of them, drawn anew within 20 %. What the environment has of
-    them anyway stays as it is.
+    Observation noise of 0.01, where tasks scale entries to about 1; actions that are one control interval
+    late; actuators with a lag of two intervals; occasional pushes of 2 % of the largest rate; the
+    environment's numbers, the first `MOST_DRAWN` of them, drawn within 20 % in each episode. Imperfections
+    that the environment already has stay as they are.
     """
     task = TASKS[env_id]()
     turning = {
@@ -115,20 +115,20 @@ def on_board(env_id: str) -> list[Condition]:
 
 
 def conditions(env_id: str) -> list[Condition]:
-    """Return all conditions: the board takes the first few kinds, the agents' results noise and delay too."""
+    """Return all conditions: the board uses the first few kinds, the agents' results noise and delay too."""
     noise = [Condition(f"noise {level} %", noise=0.01 * level) for level in (1, 5)]
     return [Condition(), often(env_id), *disturbances(env_id), *noise, Condition("late", late=True)]
 
 
 class Sensor:
-    """What an agent gets to see of a batch of episodes: with noise, or late.
+    """The agent's view of a batch of episodes: with noise, or late.
 
     Parameters
     ----------
     noise : array_like, shape (n_observation,)
-        Standard deviation of Gaussian noise, drawn anew for each entry at each step.
+        Standard deviation of Gaussian noise, drawn independently for each entry at each step.
     late : bool
-        Whether the agent sees the observation before; at the start there is only the first.
+        Whether the agent sees the previous observation; at the start it sees the first.
     seed : int
         Seed of the noise.
     """
@@ -139,7 +139,7 @@ class Sensor:
         self.before: NDArray | None = None
 
     def __call__(self, observation: NDArray) -> NDArray:
-        """Return what is seen of observations (episodes, n)."""
+        """Return the agent's view of observations (episodes, n)."""
         seen = observation if self.before is None else self.before
         if self.late:
             self.before = observation.copy()

@@ -1,4 +1,4 @@
-"""The episode loop: an agent in episodes that are stepped together, and what is noted of them on the way."""
+"""The episode loop: an agent in episodes that are stepped together, and observers of what happens."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ Mask = NDArray[np.bool_]
 
 
 class PolicyError(Exception):
-    """An agent that fails, or whose action is none; the text says how, and is safe to print."""
+    """An agent fails or returns an invalid action; the text says how, and is safe to print."""
 
 
 class Step(NamedTuple):
-    """What happened to a batch of episodes in one step.
+    """The events of one step in a batch of episodes.
 
     Attributes
     ----------
     observation : ndarray, shape (episodes, n_observation)
-        What the agent saw.
+        The agent's observation.
     action : ndarray, shape (episodes, ...)
-        What it did.
+        Its action.
     reward : ndarray, shape (episodes,)
-        What it got.
+        Its reward.
     terminated, truncated : ndarray of bool, shape (episodes,)
         Which episodes ended.
     running : ndarray of bool, shape (episodes,)
-        Which had not ended before; of the others nothing counts.
+        Which had not ended before; the others do not count.
     """
 
     observation: NDArray
@@ -51,19 +51,19 @@ class Step(NamedTuple):
 class Rollout:
     """One episode for each seed, all stepped together.
 
-    Iterating takes a step at a time; meanwhile `state` is where it led. `run` takes all of them.
+    Iterating takes one step at a time; `state` then holds the state after it. `run` takes all steps.
 
     Parameters
     ----------
     env_id : str
         Id of the environment.
     agent : object
-        Anything with the `predict` of Stable-Baselines3, taking batches; it is asked for its deterministic
-        action. Of an agent that counts steps the `pace` is set: what its clock advances by at each of them.
+        Anything with the `predict` of Stable-Baselines3 for batches; its deterministic action is used. If an
+        agent counts steps, its `pace` is set: the advance of its clock per step.
     seeds : sequence of int
-        What the episodes are reset with.
+        Reset seeds of the episodes.
     sensor : callable, optional
-        Given the observations, it returns what the agent gets to see, see `conditions.Sensor`.
+        Takes the observations and returns the agent's view of them, see `conditions.Sensor`.
     **options
         Parameters of the environment.
     """
@@ -76,7 +76,7 @@ class Rollout:
         sensor: Callable[[NDArray], NDArray] | None = None,
         **options: Any,
     ) -> None:
-        # An environment keeps its last state for one step before it begins anew; what follows does not count.
+        # An environment keeps its last state for one step before it restarts; later states do not count.
         envs: Any = gym.make_vec(env_id, len(seeds), autoreset_mode="NextStep", **options)
         self.envs = envs.unwrapped
         self.task: Task = self.envs.task
@@ -90,7 +90,7 @@ class Rollout:
 
     @property
     def state(self) -> Array:
-        """Where the episodes are, shape (episodes, n_state)."""
+        """The states of the episodes, shape (episodes, n_state)."""
         return self.envs.state
 
     @property
@@ -125,14 +125,14 @@ def play(env_id: str, agent: Any, seeds: Sequence[int], **options: Any) -> Array
 
 
 class Meter:
-    """Watches roll-outs one after the other, and tells how far they are.
+    """Watches successive roll-outs and reports their progress.
 
     Parameters
     ----------
     total : int
-        Steps that all take at most.
+        Upper limit of the steps of all of them.
     show : callable
-        Called now and then with the steps taken, and the total.
+        Called now and then with the steps taken so far, and the total.
     """
 
     def __init__(self, total: int, show: Callable[[int, int], Any]) -> None:
@@ -150,12 +150,12 @@ class Meter:
 
 
 def act(agent: Any, observation: Any, memory: Any, start: Mask, shape: tuple[int, ...]) -> tuple[Any, Any]:
-    """Return actions of a shape and what the agent remembers; raise PolicyError where there are none."""
+    """Return actions of a shape and the agent's memory; raise PolicyError if there are none."""
     try:
         with np.errstate(all="ignore"):
             action, memory = agent.predict(observation, memory, start, deterministic=True)
         good = np.shape(action) == shape and np.isfinite(action).all()
-    except Exception as error:  # whatever nonsensical numbers cause
+    except Exception as error:  # nonsensical numbers may raise anything
         raise PolicyError(f"it fails with {ascii(f'{type(error).__name__}: {error}')[:200]}") from error
     if not good:
         raise PolicyError("it returned an action that is not a finite number")
@@ -174,7 +174,7 @@ def observation_std(env_id: str, seeds: Sequence[int]) -> Array:
 
 
 def arrivals(inside: Mask, steps: NDArray) -> tuple[Array, NDArray[np.int64]]:
-    """Return after which step something holds for the first time, and from which on without a break.
+    """Return the step after which something first holds, and the one from which on it holds for good.
 
     Parameters
     ----------
@@ -186,9 +186,9 @@ def arrivals(inside: Mask, steps: NDArray) -> tuple[Array, NDArray[np.int64]]:
     Returns
     -------
     first : ndarray
-        Infinite where it never holds.
+        Infinite if it never holds.
     last : ndarray of int
-        Above `steps` where it does not hold at the end.
+        Above `steps` if it does not hold at the end.
     """
     counts = np.arange(len(inside))[:, None] <= steps
     yes, no = inside & counts, ~inside & counts
@@ -197,7 +197,7 @@ def arrivals(inside: Mask, steps: NDArray) -> tuple[Array, NDArray[np.int64]]:
 
 
 class Outcome:
-    """Watches episodes: when the task's goal is reached, the effort, and a hash of all that happens.
+    """Watches episodes: when the task's goal is reached, the effort, and a hash of everything that happens.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ class Outcome:
             self.hash.update(np.where(rows, array, array.dtype.type(0)).tobytes())
 
     def result(self) -> dict[str, Any]:
-        """Return of each episode success, time [s] and effort, and the hash."""
+        """Return each episode's success, time [s] and effort, and the hash."""
         goal, dt = self.task.goal, self.task.dt
         assert goal is not None
         first, last = arrivals(np.array(self.inside), self.steps)
@@ -249,24 +249,24 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Episodes:
-    """All that happened in episodes that were stepped together.
+    """A record of episodes that were stepped together.
 
     Parameters
     ----------
     task : Task
         Their task.
     observations : ndarray, shape (steps, episodes, n_observation)
-        What the agent saw.
+        The agent's observations.
     states : ndarray, shape (steps + 1, episodes, n_state)
-        Where each step began, and the last one ended; after an episode's end what its last step left.
+        States at the start of each step, and at the end of the last; after an episode's end, its last state.
     actions : ndarray, shape (steps, episodes, ...)
-        What the agent did.
+        The agent's actions.
     rewards : ndarray, shape (steps, episodes)
-        What it got; 0 after an episode's end.
+        The rewards; 0 after an episode's end.
     steps : ndarray of int, shape (episodes,)
         Steps of each episode.
     targets : ndarray, shape (episodes,) or (episodes, n_targets), optional
-        Targets, where the task has them.
+        Targets, if the task has them.
     """
 
     task: Task
@@ -283,14 +283,14 @@ class Episodes:
         return np.arange(len(self.rewards))[:, None] < self.steps
 
     def settled(self) -> Array:
-        """Return after how many seconds the task's goal holds for good; inf where it does not at the end."""
+        """Return the seconds after which the task's goal holds for good; inf if it does not at the end."""
         inside = np.array([self.task.goal_holds(state, self.targets) for state in self.states])
         _, last = arrivals(inside, self.steps)
         return np.where(last > self.steps, np.inf, last * self.task.dt)
 
 
 def record(rollout: Rollout, *watchers: Callable[[Step], Any]) -> Episodes:
-    """Take all steps of a roll-out, show each to the watchers, and return what happened."""
+    """Take all steps of a roll-out, show each to the watchers, and return a record of it."""
     states, steps = [rollout.state.copy()], []
     for step in rollout:
         for watch in watchers:

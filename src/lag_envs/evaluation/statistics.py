@@ -1,7 +1,7 @@
-"""Statistics of returns: scores, means with errors, what luck leaves, bootstrap intervals.
+"""Statistics of returns: scores, means with errors, correction for luck, bootstrap intervals.
 
 Several training seeds are summarised by their interquartile mean (IQM), with percentile bootstrap intervals
-for which each stratum is resampled by itself, as rliable does it [1]_.
+that resample each stratum by itself, as in rliable [1]_.
 
 References
 ----------
@@ -21,9 +21,9 @@ from scipy.stats import binomtest, trim_mean
 
 Array = NDArray[np.float64]
 
-#: Bootstrap samples of an interval, as many as rliable draws, and how likely an interval is to cover.
+#: Bootstrap samples of an interval, as in rliable, and the interval's coverage probability.
 RESAMPLES, LEVEL = 2000, 0.95
-#: Standard errors to either side of a mean that make up such an interval.
+#: Half the width of such an interval, in standard errors of a mean.
 SIGMAS = 1.96
 #: Scores at which performance profiles are given.
 THRESHOLDS: Array = np.linspace(-0.25, 1.25, 61)
@@ -33,7 +33,7 @@ THRESHOLDS: Array = np.linspace(-0.25, 1.25, 61)
 
 
 def optimality_gap(means: ArrayLike) -> float:
-    """Return how much policies lack to a score of 1 on average; what is above 1 makes up for nothing.
+    """Return the mean shortfall of policies from a score of 1; scores above 1 do not compensate.
 
     Examples
     --------
@@ -49,13 +49,13 @@ def profile(scores: ArrayLike) -> Array:
     return 1.0 - np.searchsorted(ordered, THRESHOLDS, side="right") / ordered.size
 
 
-# --- what stands for several numbers ------------------------------------------------------------------------
+# --- summaries ----------------------------------------------------------------------------------------------
 
 
 def iqm(values: ArrayLike, axis: int | None = -1) -> Any:
     """Return the interquartile mean: of the values without the lowest and the highest quarter.
 
-    Of five values that is the mean of the middle three, of fewer than four the mean of all.
+    For five values, that is the mean of the middle three; for fewer than four, the mean of all.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def pooled_iqm(*strata: ArrayLike) -> Any:
 
 
 def improvement(x: ArrayLike, y: ArrayLike) -> Any:
-    """Return the probability that one of the elements of x is above one of y; equal ones count half.
+    """Return the probability that an element of x is above one of y; equal ones count half.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def improvement(x: ArrayLike, y: ArrayLike) -> Any:
 
 
 def median_time(times: Sequence[float | None]) -> float | None:
-    """Return the median of times, None standing for never; None where half or more are never.
+    """Return the median of times, None meaning never; None if half or more are never.
 
     Examples
     --------
@@ -103,7 +103,7 @@ def median_time(times: Sequence[float | None]) -> float | None:
 
 
 def luck_slope(returns: ArrayLike, luck: ArrayLike) -> float:
-    """Return by how much returns go with another agent's in the same episodes; 0 where those are all equal.
+    """Return the slope of returns over another agent's in the same episodes; 0 if those are all equal.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def luck_slope(returns: ArrayLike, luck: ArrayLike) -> float:
 
 
 def without_luck(returns: ArrayLike, reference: ArrayLike | None) -> tuple[float, float]:
-    """Return mean and standard error of returns in the first of the episodes that a reference played.
+    """Return mean and standard error of returns in the first episodes that a reference played.
 
-    What the reference gets in these episodes above its mean in all of them is taken off, times `luck_slope`
-    (a control variate).
+    The reference's excess in these episodes over its mean in all of them is subtracted, times `luck_slope` (a
+    control variate).
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def redraw(rng: np.random.Generator, sample: ArrayLike) -> Array:
 
 
 def ends(samples: ArrayLike) -> tuple[float, float]:
-    """Return the ends of the interval that bootstrap samples of a number give."""
+    """Return the ends of the interval from bootstrap samples of a number."""
     low, high = np.quantile(np.asarray(samples), [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
     return float(low), float(high)
 
@@ -175,14 +175,14 @@ def interval(statistic: Callable[..., Any], *strata: ArrayLike) -> list[float] |
     Parameters
     ----------
     statistic : callable
-        Takes the strata; works along the last axis.
+        Takes the strata; reduces along the last axis.
     *strata : array_like, shape (n_i,)
         The samples.
 
     Returns
     -------
     list of float, or None
-        Lower and upper end; None where a stratum has a single element, which tells nothing of the spread.
+        Lower and upper end; None if a stratum has a single element, which shows nothing of the spread.
     """
     if any(np.size(s) < 2 for s in strata):
         return None
@@ -191,7 +191,7 @@ def interval(statistic: Callable[..., Any], *strata: ArrayLike) -> list[float] |
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return Wilson's interval of a probability, of 95 %; every trial counts as independent.
+    """Return Wilson's 95 % interval of a probability; every trial counts as independent.
 
     Examples
     --------
@@ -203,19 +203,19 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def estimate(groups: Sequence[ArrayLike]) -> dict[str, Any]:
-    """Return what several policies of one agent reach, from each one's results.
+    """Return a summary of several policies of one agent, from the results of each.
 
     Parameters
     ----------
     groups : sequence of array_like, shape (episodes,)
-        One for each training seed; one only for an agent that was not trained.
+        One for each training seed; a single one for an agent that was not trained.
 
     Returns
     -------
     dict
         ``value`` and the ends of its interval ``low`` and ``high``: the interquartile mean over seeds with a
         bootstrap over them, or for a single policy the mean with 1.96 standard errors over episodes. ``mean``
-        and its standard ``error``, over seeds or else over episodes; ``each`` policy's mean.
+        and its standard ``error``, over seeds or otherwise over episodes; ``each`` policy's mean.
     """
     means = np.array([np.asarray(g, np.float64).mean() for g in groups])
     several = len(means) > 1
@@ -226,7 +226,7 @@ def estimate(groups: Sequence[ArrayLike]) -> dict[str, Any]:
 
 
 def rounded(value: Any) -> Any:
-    """Return JSON-like data with numbers of 6 digits; what is beyond is noise and makes files large."""
+    """Return JSON-like data with numbers rounded to 6 digits; more would be noise and make files large."""
     if isinstance(value, dict):
         return {k: rounded(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""The leaderboard: submissions that are data only, scores that are recomputed, a board and a page.
+"""The leaderboard: submissions that contain only data, recomputed scores, a board and a page.
 
 Nothing here is imported by ``import lag_envs``.
 """

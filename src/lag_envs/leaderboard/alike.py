@@ -1,12 +1,12 @@
-"""Find policies that act alike, however their numbers differ.
+"""Find policies that act alike, however different their numbers are.
 
-Both play the same episodes, which follow from the nonce. Each is also asked, at the states on the other's
-path, what it would do there. Two policies are alike if the root mean square of the differences is below
-`ACTIONS` for the clipped actions at the states on both paths, or below `RETURNS` standard errors of a mean
-return for the returns of the episodes.
+Both play the same episodes, which follow from the nonce. Each is also asked what it would do at the states on
+the other's path. Two policies are alike if their clipped actions at the states on both paths differ by less
+than `ACTIONS` (root mean square), or if their episodes' returns differ by less than `RETURNS` standard errors
+of a mean return (root mean square).
 
 Noise of 1e-4 on all numbers of our networks moves their actions by up to 4e-3; the closest two of our
-policies that were made separately are 1.4e-2 apart.
+separately trained policies are 1.4e-2 apart.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from lag_envs.leaderboard.submission import Refused, Submission
 
 Array = NDArray[Any]
 
-#: Episodes that both play, and states on a path at which a policy without memory is asked.
+#: Episodes that both play, and states per path at which a policy without memory is asked.
 EPISODES, STATES = 16, 1024
-#: Below which differences two policies are alike: of actions in [-1, 1], of returns in standard errors.
+#: Two policies are alike below these differences: of actions in [-1, 1], of returns in standard errors.
 ACTIONS, RETURNS = 7e-3, 0.1
-#: Below which difference of actions two policies of one learner are the same training.
+#: Two policies of one learner count as the same training below this difference of actions.
 TWINS = 1e-3
 
 
@@ -45,7 +45,7 @@ class Distance(NamedTuple):
         return min(self.actions / ACTIONS, self.returns / RETURNS)
 
 
-#: Of one that fails, in place of infinity, which JSON does not have.
+#: Distance to a policy that fails; JSON has no infinity.
 FAR = Distance(2.0, 1e9)
 
 
@@ -60,7 +60,7 @@ class Track:
     played : Episodes
         The episodes.
     returns : ndarray, shape (episodes,)
-        What it got.
+        What it got in each.
     quick : bool
         Whether it has no memory, so that it can be asked at many states at once.
     """
@@ -71,7 +71,7 @@ class Track:
     quick: bool
 
     def asked(self, other: Track) -> float:
-        """Return the mean square of how another's actions differ on this path, the largest where it fails."""
+        """Return the mean square difference of another's actions on this path, or the largest if it fails."""
         agent, seen, did = other.policy.agent(), self.played.observations, self.played.actions
         start = np.ones(len(self.returns), np.bool_)
         try:
@@ -88,7 +88,7 @@ class Track:
         return total / float(self.played.steps.sum()) / off.shape[-1]
 
     def _off(self, action: Array, own: Array) -> Array:
-        """Return how far actions are from the own ones, shape (n, numbers): 1 where others are chosen."""
+        """Return how far actions are from its own, shape (n, numbers): 1 for another choice from a list."""
         off = np.asarray(action, np.float64) - own
         if self.played.task.formulas.choices:
             off = np.sign(np.abs(off))
@@ -96,7 +96,7 @@ class Track:
 
     def _asked_at_once(self, agent: Any) -> float:
         where = np.flatnonzero(self.played.running.ravel())
-        # Evenly over all times and episodes; which episodes these are follows from the nonce.
+        # Evenly over all times and episodes. The nonce decides which episodes these are.
         where = where[np.linspace(0, len(where) - 1, min(STATES, len(where))).astype(np.int64)]
         arrays = self.played.observations, self.played.actions
         seen, did = (array.reshape(-1, *array.shape[2:])[where] for array in arrays)
@@ -106,7 +106,7 @@ class Track:
 
 
 def track(env_id: str, policy: Policy, nonce: str) -> Track:
-    """Let a policy play the episodes that follow from a nonce; raise Refused where it fails."""
+    """Let a policy play the episodes that follow from a nonce; raise Refused if it fails."""
     first = protocol.first_seed(f"alike {env_id}", nonce, 0)
     rollout = Rollout(env_id, policy.agent(), range(first, first + EPISODES))
     try:
@@ -117,7 +117,7 @@ def track(env_id: str, policy: Policy, nonce: str) -> Track:
 
 
 def distance(a: Track, b: Track, error: float) -> Distance:
-    """Return how far apart two policies are, in actions at least so far where that is too far.
+    """Return how far apart two policies are; for actions that are clearly apart, only a lower bound.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def distance(a: Track, b: Track, error: float) -> Distance:
     """
     off = float(np.sqrt(np.mean((a.returns - b.returns) ** 2)))
     returns = min(off / error, FAR.returns) if error > 0.0 else FAR.returns * (off > 0.0)
-    # First the one that is asked at once: the other may be slow.
+    # First the one that can be asked at all states at once: the other may be slow.
     first, second = (a, b) if b.quick else (b, a)
     actions = 0.5 * first.asked(second)
     if actions < ACTIONS**2:
@@ -164,7 +164,7 @@ class Likeness:
         return self._tracks[submission.digest]
 
     def __call__(self, newer: Submission, older: Submission, error: float) -> Distance:
-        """Return how far a submission is from an older one: half of its policies are so near, or nearer.
+        """Return the distance of a submission from an older one: half of its policies are at most so far.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class Likeness:
 
 
 def check_twins(submission: Submission, nonce: str) -> None:
-    """Raise Refused where two policies of a learner act the same, so that one was made from the other."""
+    """Raise Refused if two policies of a learner act the same, so that one was made from the other."""
     if submission.kind != "learned":
         return
     tracks = [track(submission.env, policy, nonce) for _, policy in submission.policies]

@@ -1,4 +1,4 @@
-"""What an architecture of a submission is: it takes a table, names the arrays it needs, and acts by them."""
+"""The base of all architectures: one reads a table, names the arrays it needs, and makes an agent of them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lag_envs.leaderboard.fields import Strict
 from lag_envs.tasks.base import Task
 
 Array = NDArray[np.float64]
-#: Lengths of an array's axes. A name stands for any length of at least 2, the same wherever it occurs, and
-#: "name + 1" for one more.
+#: Lengths of an array's axes. A name stands for any length of at least 2, the same everywhere; "name + 1" for
+#: one more.
 Shape = tuple[int | str, ...]
 
-#: How messages call the table.
+#: The table's name in messages.
 POLICY = "[policy]"
 
 
@@ -40,16 +40,17 @@ class Architecture(ABC):
     Raises
     ------
     Refused
-        For anything wrong in the table.
+        If anything in the table is wrong.
     """
 
     #: What the table ``[policy]`` must be.
     table: type[Strict] = PolicyTable
-    #: Version of ``submission.toml`` that it came with.
+    #: First version of ``submission.toml`` that has it.
     schema = 1
-    #: The kind of such policies; empty where they are learned with a training, and else controllers.
+    #: The kind of such policies; if empty, they are learned if there is a training, and controllers
+    #: otherwise.
     counts_as = ""
-    #: Names and shapes of the arrays in each policy's file; nothing where there are no files.
+    #: Names and shapes of the arrays in each policy's file; empty if there are no files.
     arrays: dict[str, Shape]
     #: Whether it searches for a plan in each episode, see `protocol.PLANNED`.
     plans = False
@@ -59,11 +60,11 @@ class Architecture(ABC):
 
     @abstractmethod
     def agent(self, arrays: Mapping[str, Array]) -> Any:
-        """Return what acts; raise Refused where values do not fit."""
+        """Return the agent; raise Refused if the arrays' values do not fit."""
 
 
 class Head:
-    """How numbers become actions of a task: clipped where they lie in a range, else the largest chooses.
+    """Turns numbers into actions of a task: clipped to their range, or the largest number picks from a list.
 
     Parameters
     ----------
@@ -73,9 +74,9 @@ class Head:
     Attributes
     ----------
     choices : tuple of int
-        Lengths of the lists from which actions are chosen; empty where they lie in a range.
+        Lengths of the lists from which actions are chosen; empty if actions lie in a range.
     size : int
-        How many numbers it takes: one for each number of an action, or one for each value of each list.
+        How many numbers it takes: one per component of an action, or one per value of each list.
     """
 
     def __init__(self, task: Task) -> None:
@@ -91,7 +92,7 @@ class Head:
         if not self.choices:
             return np.clip(numbers, -self.largest, self.largest).astype(np.float32)
         if not np.isfinite(numbers).all():
-            raise ValueError("what chooses its actions is not finite")
+            raise ValueError("the numbers that decide its actions are not finite")
         chosen = [part.argmax(axis=1) for part in np.split(numbers, self._ends, axis=1)]
         return chosen[0] if self._single else np.stack(chosen, axis=1)
 
@@ -102,7 +103,7 @@ class Agent(ABC):
     Parameters
     ----------
     head : Head
-        What makes actions of numbers.
+        Turns numbers into actions.
     """
 
     def __init__(self, head: Head) -> None:
@@ -117,22 +118,22 @@ class Agent(ABC):
     ) -> tuple[NDArray, Any]:
         """Return the action for each observation."""
         values = np.asarray(observation, np.float64)
-        # Whatever overflows ends in an action that is no number, which the verification refuses.
+        # An overflow ends as a non-finite action, which verification refuses.
         with np.errstate(all="ignore"):
             actions = self.head(self.act(np.atleast_2d(values)))
         return actions.reshape((*values.shape[:-1], *actions.shape[1:])), state
 
 
 class Remembering(ABC):
-    """Base of the agents that remember so many numbers in each episode; a subclass defines `begin` and `act`.
+    """Base of the agents with a memory in each episode; a subclass defines `begin` and `act`.
 
     Parameters
     ----------
     head : Head
-        What makes actions of numbers.
+        Turns numbers into actions.
     """
 
-    #: What it remembers is of steps of one length.
+    #: Its memory belongs to steps of one length.
     of_one_interval = True
 
     def __init__(self, head: Head) -> None:
@@ -149,7 +150,7 @@ class Remembering(ABC):
     def predict(
         self, observation: NDArray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[NDArray, Array]:
-        """Return the action for each observation, and what is remembered of each episode."""
+        """Return the action for each observation, and the memory of each episode."""
         values = np.asarray(observation, np.float64)
         batch = np.atleast_2d(values)
         with np.errstate(all="ignore"):

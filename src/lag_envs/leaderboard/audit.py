@@ -1,12 +1,12 @@
-"""Hold a board against itself: all on it must be what was noted when it came to be there.
+"""Check a board against its own log: everything on it must be as it was logged.
 
-What is cheap (`sound`) is checked wherever the board is shown: the log's chain, the release's pin, the log in
-earlier commits, each submission against its digest and the log, each result against its hash and what it
-says of itself. `audit` adds what takes time: each nonce against its public source, and results against the
+The cheap checks (`sound`) run wherever the board is shown: the log's chain, the release's pin, the log in
+earlier commits, each submission against its digest and the log, each result against its hash and its own
+statements. `audit` adds the slow ones: each nonce against its public source, and results against the
 submissions, by playing episodes again.
 
-What cannot be found: a history that was written anew as a whole, commits and all, where nobody has an older
-copy, a release or its pin to hold against it.
+One thing cannot be found: a history rewritten as a whole, commits and all, when nobody has an older copy, a
+release or its pin to compare with.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ from lag_envs.store import write
 if TYPE_CHECKING:
     from lag_envs.leaderboard.submission import About
 
-#: What a release knows of the repository's board.
+#: The release's record of the repository's board.
 PIN = Path(__file__).with_name("pin.json")
 #: Episodes of each policy that `audit` plays again.
 SAMPLE = 4
-#: Episodes of each reference that it plays, and how many standard errors their mean may be off.
+#: Episodes of each reference that it plays, and by how many standard errors their mean may be off.
 REFERENCE_EPISODES, SIGMAS = 8192, 5.0
 
 Results = dict[tuple[int, str], dict[str, Any]]
 
 
 class Pin(Strict):
-    """The head of a log's chain: the hash of its first line, and of its first so many lines."""
+    """The head of a log's chain: its number of lines, the hash of the first line, and that of all of them."""
 
     board: Hash
     lines: Annotated[int, Field(ge=1)]
@@ -75,7 +75,7 @@ class Pin(Strict):
 
 @dataclass
 class Finding:
-    """What a check found: what is as it should be, and what is not."""
+    """What a check found: a summary if all is well, and everything that is wrong."""
 
     name: str
     told: str = ""
@@ -88,26 +88,26 @@ class Finding:
 
 
 def sound(board: Board, pin: Path | None = None) -> tuple[State, Results]:
-    """Return a board's state and all its results, by protocol and id, where all that is cheap holds.
+    """Return a board's state and its results, by protocol and id, if all cheap checks pass.
 
     Parameters
     ----------
     board : Board
         The board.
     pin : Path, optional
-        What to hold the log against; by default the release's own, if it is of this board.
+        Pin to compare the log with; by default the release's own, if it is of this board.
 
     Raises
     ------
     BoardError
-        For the first thing that does not; the text names the line and the remedy.
+        For the first check that fails; the text names the line and the remedy.
     """
     found = cheap(board, pin)
-    # What history tells names the line that was changed, and not only the next that does not follow.
+    # History names the line that was changed; the chain only the next line that does not follow.
     findings = sorted(found.findings, key=lambda finding: finding.name != "history")
     wrong = [text for finding in findings for text in finding.wrong]
     if wrong:
-        more = f" ({len(wrong) - 1} more: `lag-envs leaderboard audit` tells all)" if wrong[1:] else ""
+        more = f" ({len(wrong) - 1} more: `lag-envs leaderboard audit` lists them all)" if wrong[1:] else ""
         raise BoardError(wrong[0] + more)
     return found.state, found.results
 
@@ -121,16 +121,16 @@ class Cheap:
     lines: list[Line] = field(default_factory=list)
     state: State = field(default_factory=State)
     results: Results = field(default_factory=dict)
-    #: What the submissions say of themselves, by id.
+    #: What each submission says of itself, by id.
     abouts: dict[str, About] = field(default_factory=dict)
 
     def chained(self, number: int) -> bool:
-        """Tell whether a line of the log holds the hash of what is before it."""
+        """Tell whether a line of the log holds the hash of the lines before it."""
         return any(line.number == number and line.event.prev is not None for line in self.lines)
 
 
 def cheap(board: Board, pin: Path | None = None) -> Cheap:
-    """Make all checks that take no time."""
+    """Make all cheap checks."""
     chain = Finding("log")
     found = Cheap([chain])
     try:
@@ -147,7 +147,7 @@ def cheap(board: Board, pin: Path | None = None) -> Cheap:
     if whole:
         chain.told += f", head {hashlib.sha256(whole).hexdigest()}"
     if torn:
-        chain.told += "; a last line is torn off, the next to write removes it"
+        chain.told += "; the last line is torn off, the next write removes it"
     found.findings += [
         _pinned(board, whole, pin),
         _history(board, whole),
@@ -158,13 +158,13 @@ def cheap(board: Board, pin: Path | None = None) -> Cheap:
 
 
 def pin_of(log: bytes) -> Pin:
-    """Return what a release is to know of a log."""
+    """Return a release's pin of a log."""
     first = hashlib.sha256(log[: log.index(b"\n") + 1]).hexdigest()
     return Pin(board=first, lines=log.count(b"\n"), head=hashlib.sha256(log).hexdigest())
 
 
 def write_pin(board: Board, file: Path) -> Pin:
-    """Write a file that pins a board's log as it is; raise a BoardError where it is not sound."""
+    """Write a file that pins a board's log as it is; raise a BoardError unless the board is sound."""
     sound(board)
     log = read_log(board.log)
     log = log[: log.rfind(b"\n") + 1]
@@ -176,7 +176,7 @@ def write_pin(board: Board, file: Path) -> Pin:
 
 
 def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
-    """Hold the log against a pin; against that of the release only if it is of the same board."""
+    """Compare the log with a pin; with the release's own only if it is of the same board."""
     found = Finding("pin")
     path = file or PIN
     try:
@@ -191,7 +191,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
         return found
     lines = log.split(b"\n")
     if file is None and hashlib.sha256(lines[0] + b"\n").hexdigest() != pin.board:
-        found.open = "this is not the board that this release knows: the log's first line is another"
+        found.open = "this is not the board that this release knows: the log begins with another line"
         return found
     begun = b"\n".join(lines[: pin.lines]) + b"\n"
     if len(lines) <= pin.lines:
@@ -208,7 +208,7 @@ def _pinned(board: Board, log: bytes, file: Path | None) -> Finding:
 
 
 def _submissions(board: Board, found: Cheap) -> Finding:
-    """Hold each submission's files against what the log says of them."""
+    """Compare each submission's files with the log."""
     from lag_envs.leaderboard.submission import Refused, about, digest_of, read_files
 
     finding = Finding("submissions")
@@ -230,7 +230,7 @@ def _submissions(board: Board, found: Cheap) -> Finding:
         try:
             told = found.abouts[entry.id] = about(files)
         except Refused:
-            continue  # it was accepted once: its environment, say, is gone since
+            continue  # it was accepted once; since then its environment, say, has gone
         for name in ("env", "name", "authors", "kind"):
             if (noted := getattr(entry, name)) != (said := getattr(told, name)):
                 finding.wrong.append(f"{where} says {name} {shown(said)}, the log {shown(noted)}; {REMEDY}")
@@ -239,7 +239,7 @@ def _submissions(board: Board, found: Cheap) -> Finding:
 
 
 def _results(board: Board, found: Cheap) -> Finding:
-    """Hold each result against the log, the submission, and itself."""
+    """Compare each result with the log, with the submission, and with itself."""
     finding = Finding("results")
     for entry in found.state.all:
         if not entry.sha256:
@@ -251,7 +251,7 @@ def _results(board: Board, found: Cheap) -> Finding:
             continue
         where = f"{board.log}, line {_verified_at(found, entry)}: {board.result_file(entry)}"
         odd = [f"{where} {what}; {REMEDY}" for what in _odd(found, entry, result)]
-        # Of the time before there was a chain.
+        # Results without a build are older than the chain.
         if result.get("build") is None and found.chained(_verified_at(found, entry)):
             odd.append(f"{where} does not say with which build it was made; {REMEDY}")
         finding.wrong += odd
@@ -271,7 +271,7 @@ def _verified_at(found: Cheap, entry: Entry) -> int:
 
 
 def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what a result says that it cannot."""
+    """Yield statements of a result that cannot be true."""
     for name in ("env", "digest", "nonce"):
         if result[name] != getattr(entry, name):
             yield f"is of {name} {shown(result[name])}, not {shown(getattr(entry, name))}"
@@ -281,7 +281,7 @@ def _odd(found: Cheap, entry: Entry, result: Mapping[str, Any]) -> Iterator[str]
         wanted = entry.env in told.references
         if any((policy.get("reference") is not None) != wanted for policy in result["policies"]):
             yield f"{'lacks' if wanted else 'has'} the returns of a reference"
-    if (submission := found.abouts.get(entry.id)) is not None:  # otherwise that is told already
+    if (submission := found.abouts.get(entry.id)) is not None:  # otherwise already reported
         if tuple(policy["seed"] for policy in result["policies"]) != submission.seeds:
             yield "has other policies than the submission"
         if result.get("claimed") != claimed(submission):
@@ -307,8 +307,8 @@ class NoHistory(Exception):
 
 
 def git(folder: Path, *arguments: str) -> bytes:
-    """Return what git says in a folder; raise NoHistory where it fails, or is missing."""
-    # Nothing of the caller's repository, and no replaced objects.
+    """Return git's output in a folder; raise NoHistory if it fails or is missing."""
+    # Ignore the caller's repository settings and replaced objects.
     env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     env |= {"GIT_NO_REPLACE_OBJECTS": "1", "GIT_OPTIONAL_LOCKS": "0", "LC_ALL": "C"}
     try:
@@ -324,7 +324,7 @@ def git(folder: Path, *arguments: str) -> bytes:
 
 
 def log_at(folder: Path, commit: str) -> bytes:
-    """Return the log in a commit; nothing where it has none."""
+    """Return the log in a commit; empty if it has none."""
     name = f"{commit}:./{LOG}"
     try:
         return git(folder, "cat-file", "blob", name)
@@ -334,7 +334,7 @@ def log_at(folder: Path, commit: str) -> bytes:
 
 
 def _history(board: Board, log: bytes) -> Finding:
-    """Hold the log against itself in earlier commits, which must have the beginning of today's."""
+    """Compare the log with its versions in earlier commits: each must be the beginning of today's."""
     found = Finding("history")
     folder = board.folder
     try:
@@ -346,7 +346,7 @@ def _history(board: Board, log: bytes) -> Finding:
         before = 0
         for commit in tagged:
             then = log_at(folder, commit)
-            # A release may be later than what is checked out.
+            # A tagged release may be newer than the checkout.
             if log.startswith(then) or (commit not in local and then.startswith(log)):
                 continue
             if b'"prev"' not in then:
@@ -374,19 +374,19 @@ def _pairs(then: bytes, now: bytes) -> Iterator[tuple[bytes | None, bytes | None
 
 
 def head_of(board: Board) -> str:
-    """Return the commit that is checked out, which has to hold the log as it is.
+    """Return the commit that is checked out, which must contain the log as it is.
 
     Raises
     ------
     BoardError
-        Where it does not, or there is none.
+        If it does not, or there is none.
     """
     try:
         commit = git(board.folder, "rev-parse", "--verify", "HEAD^{commit}").decode().strip()
         then = log_at(board.folder, commit)
     except NoHistory as error:
         raise BoardError(
-            f"no commit holds the board ({error}); name a nonce and, with --source, where anybody finds it"
+            f"no commit holds the board ({error}); name a nonce and, with --source, where anybody can find it"
         ) from None
     if then != read_log(board.log):
         raise BoardError("the board has changed since the last commit; commit and push first")
@@ -394,7 +394,7 @@ def head_of(board: Board) -> str:
 
 
 def _nonces(board: Board, found: Cheap) -> Finding:
-    """Hold each nonce against its source: a commit must have held all that it decides, and be in history."""
+    """Check each nonce's source: its commit must hold everything the nonce decides, and be in the history."""
     finding = Finding("nonces")
     held, elsewhere = 0, []
     for number, value, source in found.state.nonces:
@@ -454,21 +454,21 @@ def audit(
     tell: Callable[[Finding], Any] = lambda finding: None,
     progress: Callable[[Entry], Any] = lambda entry: None,
 ) -> bool:
-    """Make all checks, and return whether nothing is wrong.
+    """Make all checks; return True if nothing is wrong.
 
     Parameters
     ----------
     board : Board
         The board.
     pin : Path, optional
-        What to hold the log against; by default the release's own, if it is of this board.
+        Pin to compare the log with; by default the release's own, if it is of this board.
     everything : bool
         Whether to verify every result again, as a whole, and to compare all submissions with each other. By
-        default `SAMPLE` episodes of each policy are played again, and those that were recorded.
+        default, `SAMPLE` episodes of each policy and the recorded ones are played again.
     tell : callable
-        Told each finding.
+        Called with each finding.
     progress : callable
-        Told each entry before its result is looked at.
+        Called with each entry before its result is checked.
     """
     found = cheap(board, pin)
     findings = list(found.findings)
@@ -484,7 +484,7 @@ def audit(
 
 
 def _playable(board: Board, found: Cheap) -> Iterator[tuple[Entry, dict[str, Any], float, str]]:
-    """Yield what can be verified again: entry, result, way from random to best, and where messages point."""
+    """Yield all that can be verified again: entry, result, best return minus random, place for messages."""
     for (number, id), result in found.results.items():
         entry = found.state.boards[number][id]
         told = found.state.protocols.get(number)
@@ -502,11 +502,11 @@ def _load(board: Board, entry: Entry) -> Any:
         submission = load(board.submission(entry.id))
     except Refused:
         return None
-    return submission if submission.digest == entry.digest else None  # otherwise that is told already
+    return submission if submission.digest == entry.digest else None  # otherwise already reported
 
 
 def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Finding:
-    """Play some episodes of each policy again, which nobody can foresee, and those that were recorded."""
+    """Play the recorded episodes of each policy again, and some more that nobody can foresee."""
     from lag_envs.evaluation.rollout import PolicyError
     from lag_envs.leaderboard.submission import Refused
     from lag_envs.leaderboard.verify import replay
@@ -518,7 +518,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
             continue
         middle, recorded = shown_episodes(result)
         odd: list[str] = []
-        # On another build, one of so few may be another episode altogether.
+        # On another build, one of these few episodes may be a different one altogether.
         tolerated = int(result.get("build") != build())
         plans = submission.architecture.plans
         for number, policy in enumerate(result["policies"]):
@@ -554,7 +554,7 @@ def _sample(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Fin
 
 
 def _same_episode(kept: Mapping[str, Any], made: Mapping[str, Any]) -> bool:
-    """Tell whether a recorded episode is one that was made again, to the digits in which it was recorded."""
+    """Tell whether two episodes are the same, to the digits that are recorded."""
     if any(len(kept[name]) != len(made[name]) for name in ("states", "actions", "rewards")):
         return False
     if any(kept[name] != made[name] for name in ("seed", "reset_seed", "dt", "target")):
@@ -593,12 +593,12 @@ def _all(board: Board, found: Cheap, progress: Callable[[Entry], Any]) -> Findin
 
 
 def _links(board: Board, found: Cheap) -> Iterator[str]:
-    """Yield what acts alike and is not noted, or is noted and does not."""
+    """Yield policies that act alike without being noted, or are noted and do not."""
     neighbours = Neighbours(board)
     for entry in found.state.entries.values():
         if (entry.protocol, entry.id) not in found.results:
             continue
-        # It was compared with what had been verified by then.
+        # It was compared with all that had been verified by then.
         line = _verified_at(found, entry)
         noted = {like.id: like for like in entry.alike}
         for other in others(found.state, entry):
@@ -614,7 +614,7 @@ def _links(board: Board, found: Cheap) -> Iterator[str]:
 
 
 def _references(found: Cheap) -> Iterator[str]:
-    """Yield what is stated of a reference's mean and is not what it gets."""
+    """Yield references whose mean return is not the one that the log states."""
     from lag_envs.controllers import make_controller
     from lag_envs.evaluation.rollout import play
 
@@ -624,7 +624,7 @@ def _references(found: Cheap) -> Iterator[str]:
         returns = play(
             env_id, make_controller(env_id, reference.controller), range(first, first + REFERENCE_EPISODES)
         )
-        # Where falls are rare, the episodes at hand may show none: the spread is at least that of the many.
+        # Rare falls may be missing from these episodes: take at least the spread of the many in the log.
         spread = max(returns.std(), reference.error * reference.episodes**0.5)
         error = (spread**2 / len(returns) + reference.error**2) ** 0.5
         if abs(returns.mean() - reference.mean) > SIGMAS * error:

@@ -1,17 +1,17 @@
-"""The board: which submissions there are, what was verified of them, and what became of each.
+"""The board: its submissions, their verified results, and the state of each.
 
 A folder, meant to lie in a git repository::
 
     board.jsonl                    the log: a line of JSON for every event, only ever appended to
     submissions/ID/                the submissions' files
-    results/ID.json.gz             what was verified under protocol 1, and some recorded episodes
-    results/protocol-N/ID.json.gz  the same under later ones
+    results/ID.json.gz             the verified result under protocol 1, and some recorded episodes
+    results/protocol-N/ID.json.gz  the same under later protocols
     values/ENV.json                a coarse value function for the page, where there is one (optional)
 
-The state of everything follows from the log. A file is complete before the event that speaks of it is
-written, and an event is one write under a lock, followed by fsync. So a kill at any moment loses nothing that
-was acknowledged, and leaves a board that can be read; at worst a last line is torn off, which readers pass
-over and the next writer removes.
+All state follows from the log. A file is complete before the event about it is written, and an event is one
+write under a lock, followed by fsync. So a kill at any moment loses nothing that was acknowledged, and leaves
+a readable board; at worst the last line is torn off. Readers skip such a line, and the next writer removes
+it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 def closed(env_id: str, number: int, current: int) -> str:
-    """Return why the board of an environment and protocol is frozen; empty for one that is open.
+    """Return why the board of an environment and protocol is frozen; empty if it is open.
 
     Examples
     --------
@@ -98,7 +98,7 @@ class Board:
         self.log = self.folder / LOG
 
     def read(self) -> State:
-        """Return what follows from the log, which others may be writing."""
+        """Return the state that follows from the log; others may be writing to it."""
         return fold(parse(read_log(self.log))[0])
 
     def submission(self, id: str) -> Path:
@@ -106,7 +106,7 @@ class Board:
         return self.folder / "submissions" / id
 
     def result(self, entry: Entry) -> dict[str, Any]:
-        """Return what was verified, or raise a BoardError where it is not what was written then."""
+        """Return a verified result; raise a BoardError if the file is not the one that was written then."""
         path = self.result_file(entry)
         try:
             content = read_plain(path, PACKED)
@@ -122,7 +122,7 @@ class Board:
             raise BoardError(f"{path} is not a result: {error}; verify {entry.id} again") from None
 
     def result_file(self, entry: Entry) -> Path:
-        """Return the place of a submission's result under a protocol."""
+        """Return the path of a submission's result under a protocol."""
         folder = self.folder / "results"
         if entry.protocol > 1:
             folder /= f"protocol-{entry.protocol}"
@@ -132,7 +132,7 @@ class Board:
     def change(self) -> Iterator[tuple[State, Callable[..., None]]]:
         """Hold the board's lock; give its state and a function that appends an event to the log.
 
-        What others do meanwhile waits. Temporary files that a kill has left are removed.
+        Others wait meanwhile. Temporary files left by a kill are removed.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with locked(self.log) as log:
@@ -143,7 +143,7 @@ class Board:
             last = state.last
 
             def append(event: str, **told: Any) -> None:
-                # Later than all that is there, even where the clock was set back.
+                # Later than all logged times, even if the clock was set back.
                 nonlocal last
                 now = datetime.now(UTC)
                 if last:
@@ -154,12 +154,12 @@ class Board:
             yield state, append
 
     def open(self) -> int:
-        """Open boards that there are none of yet, or begin the next protocol; return the protocol's number.
+        """Open the missing boards, or begin the next protocol; return the protocol's number.
 
-        Where environments have no board under the current protocol, theirs join it, with the scale of now,
-        and nothing else changes. Otherwise, or where the rules of the others have changed, the next protocol
-        freezes the scale of now, and all that is verified or pending goes over to it, to be verified anew. In
-        a log in which nothing tells the scale of its current protocol, that is told instead.
+        Environments without a board under the current protocol join it, with today's scale, and nothing else
+        changes. If there are none, or if the rules of the others have changed, the next protocol begins: it
+        freezes today's scale, and all that is verified or pending has to be verified under it. If the log
+        does not state the scale of its current protocol, that is added instead.
         """
         with self.change() as (state, append):
             return self._open(state, append)
@@ -188,19 +188,19 @@ class Board:
         return number
 
     def add(self, submission: Submission) -> Entry:
-        """Take a submission in, unless it is there already, and return its entry.
+        """Add a submission, unless it is there already, and return its entry.
 
-        On a board without a protocol, the first begins with it.
+        A board without a protocol begins the first one.
 
         Parameters
         ----------
         submission : Submission
-            A submission, as `load` gives it; so it has been checked.
+            A submission, as `load` returns it, so it has been checked.
 
         Raises
         ------
         BoardError
-            Where its board is frozen, or its files change while they are copied.
+            If its board is frozen, or its files change while they are copied.
         """
         id = id_of(submission)
         with self.change() as (state, append):
@@ -221,7 +221,7 @@ class Board:
         return self.read().entry(id)
 
     def _copy(self, submission: Submission, place: Path) -> None:
-        """Copy the files; whole or not at all, and only those bytes that were checked."""
+        """Copy the files, all or none, and only the bytes that were checked."""
         from lag_envs.leaderboard.submission import load
 
         new = place.parent / ".new"
@@ -233,25 +233,25 @@ class Board:
         for path in new.iterdir():
             store.to_disk(path)
         store.to_disk(new)
-        _remove(place)  # of no entry: its adding was broken off, or it was turned away
+        _remove(place)  # has no entry: adding it was interrupted, or it was rejected
         os.rename(new, place)
         store.to_disk(place.parent)
 
     def publish(self, nonce: str, source: str = "") -> None:
-        """Publish a nonce, with which all that was added before can be verified.
+        """Publish a nonce, which decides the episodes of all that was added before.
 
         Parameters
         ----------
         nonce : str
             The nonce.
         source : str
-            Where anybody finds it: "commit" for the hash of a commit of the repository in which the board
-            lies, or an address.
+            Where anybody can find it: "commit" for the hash of a commit of the repository that contains the
+            board, or an address.
 
         Raises
         ------
         BoardError
-            Where the nonce is empty, not plain text, or was published before: then it was known.
+            If the nonce is empty, not plain text, or was published before, so that it was known.
         """
         if not re.fullmatch(r"[!-~]{1,200}", nonce):
             raise BoardError(
@@ -269,8 +269,8 @@ class Board:
     ) -> list[Entry]:
         """Keep a result, unless the submission is no longer pending.
 
-        It takes the place of what the same authors have under the same name on the same board, unless it acts
-        like an earlier one: nobody gets other luck by submitting the same again.
+        It replaces the result of the same authors under the same name on the same board, unless the
+        submission acts like an earlier one: submitting the same again gives nobody a second chance at luck.
 
         Parameters
         ----------
@@ -279,12 +279,12 @@ class Board:
         result : mapping
             What was verified.
         alike : mapping of str to Alike or None
-            The others with which it was compared, by id, and how near they are, None for not alike.
+            The submissions it was compared with, by id, and how near they are; None if not alike.
 
         Returns
         -------
         list of Entry
-            Those with which it still has to be compared; nothing is kept then.
+            Those it still has to be compared with; then nothing is kept.
         """
         alike = alike or {}
         content = gzip.compress(json.dumps(result, separators=(",", ":")).encode(), mtime=0)
@@ -309,7 +309,7 @@ class Board:
         return []
 
     def rejected(self, id: str, reason: str) -> None:
-        """Turn a pending submission away."""
+        """Reject a pending submission."""
         with self.change() as (state, append):
             if state.entry(id).state == "pending":
                 append("rejected", id=id, reason=reason[:1000])
@@ -331,12 +331,12 @@ class Board:
                 stack.callback(os.close, file)
                 free = lock(file, wait=False)
             except OSError:
-                free = True  # verifying it will tell
+                free = True  # verifying it will find the error
             yield free
 
 
 def current(state: State, what: str) -> Protocol:
-    """Return the current protocol, or raise a BoardError where this package has other rules than it."""
+    """Return the current protocol; raise a BoardError if this package has other rules."""
     found = state.protocols.get(state.number)
     if found is None:
         raise BoardError(
@@ -352,7 +352,7 @@ def current(state: State, what: str) -> Protocol:
 
 
 def others(state: State, entry: Entry) -> list[Entry]:
-    """Return what has been verified beside a submission on its board, whatever became of it."""
+    """Return all submissions verified on the same board, whatever became of them."""
     return [
         other
         for other in state.boards[entry.protocol].values()

@@ -17,7 +17,7 @@ from lag_envs.leaderboard.pending import Check, finish
 from lag_envs.leaderboard.standings import board_data, page_data
 from lag_envs.tables import columns
 
-#: How each action is called; the first line of each is its plainest use.
+#: Examples of each action, the simplest use first.
 EXAMPLES = {
     "add": """lag-envs leaderboard add my-submission               it waits for the next nonce
 lag-envs leaderboard add mine/* --nonce test-1       on a board of your own, verified at once""",
@@ -62,7 +62,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
 
     def source(one: argparse.ArgumentParser) -> None:
         one.add_argument(
-            "--source", metavar="URL", default="", help="https address where anybody finds the nonce"
+            "--source", metavar="URL", default="", help="https address where anybody can find the nonce"
         )
 
     def parallel_options(one: argparse.ArgumentParser) -> None:
@@ -79,22 +79,22 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
             help="verify on a Ray cluster: its address, auto for a running one, local for one made here",
         )
 
-    one = action("add", "take submissions in, and verify all that is pending and has a nonce", _add)
+    one = action("add", "add submissions, and verify all pending ones that have a nonce", _add)
     one.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="a submission")
     one.add_argument("--nonce", metavar="VALUE", help="publish this nonce after they are added")
     source(one)
     parallel_options(one)
-    one = action("nonce", "publish a nonce, and verify what was added before", _nonce)
+    one = action("nonce", "publish a nonce, and verify all that was added before", _nonce)
     one.add_argument(
         "value",
         metavar="VALUE",
         nargs="?",
         help="ideally one that nobody can choose, such as the next pulse of a public beacon (default: the"
-        " hash of the last commit, which has to hold the board as it is)",
+        " hash of the last commit, which must contain the board as it is)",
     )
     source(one)
     parallel_options(one)
-    one = action("list", "show the ranking, and the state of all others", _list)
+    one = action("list", "show the ranking, and the state of all other submissions", _list)
     one.add_argument("env", metavar="ENV", nargs="?", help="only this environment")
     one = action("show", "show all about one submission", _show)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
@@ -105,19 +105,19 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
     one = action("withdraw", "take a submission off the board", _withdraw)
     one.add_argument("id", metavar="ID", help="as `list` shows it")
     one.add_argument("--reason", metavar="TEXT", required=True, help="shown on the page")
-    one = action("audit", "check that nothing has changed since it came onto the board", _audit)
+    one = action("audit", "check that nothing on the board has changed since it was added", _audit)
     one.add_argument(
         "--all", action="store_true", help="verify every result again, instead of a few episodes (minutes)"
     )
     one.add_argument(
-        "--pin", metavar="FILE", type=Path, help="what to check the log against (default: the release's)"
+        "--pin", metavar="FILE", type=Path, help="pin to check the log against (default: the release's)"
     )
-    one = action("pin", "write the log's head into a file that a release carries", _pin)
+    one = action("pin", "write the log's head into a file that ships with a release", _pin)
     one.add_argument("file", metavar="FILE", nargs="?", type=Path, help="default: that of this package")
     one = action(
         "open",
-        "open boards of environments that have none; else begin the next protocol: freeze the scale as "
-        "it is now, and verify all again under it",
+        "open boards for environments that have none; otherwise begin the next protocol: freeze the scale as "
+        "it is now, and verify everything again under it",
         _open,
     )
     one = action("build", "write the page", _build)
@@ -125,7 +125,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
         "out", metavar="OUT", nargs="?", type=Path, default=Path("site"), help="folder (default: site)"
     )
     one.add_argument(
-        "--url", metavar="ADDRESS", default="", help="where it will be found; link previews and feed name it"
+        "--url", metavar="ADDRESS", default="", help="its future address, for link previews and the feed"
     )
     one = action("serve", "write the page into a temporary folder and show it to this machine", _serve)
     one.add_argument(
@@ -134,7 +134,7 @@ def declare_leaderboard(parser: argparse.ArgumentParser) -> None:
 
 
 def run_leaderboard(args: argparse.Namespace) -> int:
-    """Do what is asked, or raise a BoardError or SpreadError."""
+    """Run the requested action; raise a BoardError or SpreadError if it fails."""
     return args.act(args)
 
 
@@ -166,7 +166,7 @@ def _add(args: argparse.Namespace) -> int:
     if args.nonce is not None:
         state = board.read()
         waiting = [e for e in state.waiting() if state.nonce(e) is None]
-        # Where the same command was broken off before, the nonce is published already.
+        # If the same command was interrupted before, the nonce is already published.
         if any(not args.folders or e.id in added for e in waiting):
             _publish(board, args.nonce, args.source)
     return 1 if _finish(board, args) + failed else 0
@@ -181,7 +181,7 @@ def _nonce(args: argparse.Namespace) -> int:
 
 
 def _publish(board: Board, value: str | None, source: str) -> None:
-    """Publish a nonce, a commit's hash as such."""
+    """Publish a nonce; a commit's hash as such."""
     from lag_envs.leaderboard.audit import head_of
 
     if value is None:
@@ -214,7 +214,7 @@ def _open(args: argparse.Namespace) -> int:
 
 
 def _finish(board: Board, args: argparse.Namespace) -> int:
-    """Verify what is pending, with progress on a terminal; return how many could not be."""
+    """Verify pending submissions, with progress on a terminal; return how many could not be verified."""
 
     def tell(entry: Entry, what: str) -> None:
         print(f"{entry.id}: {what}", flush=True)
@@ -287,7 +287,7 @@ def _remark(row: dict[str, Any]) -> str:
 
 
 def _some(board: Board) -> State:
-    """Return the board's state, or raise a BoardError where there is nothing on it."""
+    """Return the board's state; raise a BoardError if nothing is on it."""
     from lag_envs.leaderboard.audit import sound
 
     try:
@@ -355,7 +355,7 @@ def _withdraw(args: argparse.Namespace) -> int:
 
 
 def _plain(value: Any) -> str:
-    """Return text that does nothing to a terminal."""
+    """Return text without anything that a terminal would act on."""
     text = f"{value:.6g}" if isinstance(value, float) else str(value)
     return "".join(c if c.isprintable() else "?" for c in text)
 
@@ -364,7 +364,7 @@ def _plain(value: Any) -> str:
 
 
 def _audit(args: argparse.Namespace) -> int:
-    """Print each finding; return 1 where something is wrong."""
+    """Print each finding; return 1 if something is wrong."""
     from tqdm import tqdm
 
     from lag_envs.leaderboard.audit import Finding, audit

@@ -1,11 +1,11 @@
-"""One number for an agent on all boards: the mean of its scores, where it did not take part 0.
+"""One number for an agent over all boards: the mean of its scores, 0 for boards it is not on.
 
-A score counts from 0, what random actions get, to 1, the best policy known: a record on one board, or ruin on
-another, weighs no more than a board. A board on which an agent is missing counts 0, as if it had acted at
-random there, so nobody gains by leaving out what is hard. How many boards it is on is shown beside it, and
-its profile: on what share of the boards its score is at least so much.
+A score counts from 0 (random actions) to 1 (the best policy known), so a record or a disaster on one board
+weighs no more than that board. A board without the agent counts 0, as if it had acted at random there, so
+nobody gains by leaving out the hard ones. The number of its boards is shown beside it, and its profile: the
+share of the boards on which it reaches each score.
 
-Boards count once somebody is ranked on them. An agent is known by name and authors.
+A board counts once somebody is ranked on it. An agent is identified by name and authors.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ LEVELS = (0.5, 0.9, 0.99)
 
 
 class Agent(NamedTuple):
-    """Who it is that acts."""
+    """An agent: its name and authors."""
 
     name: str
     authors: tuple[str, ...]
 
 
 class Result(NamedTuple):
-    """What an agent reached on a board: the score, bootstrap samples of it, and the row's kind."""
+    """An agent's result on a board: the score, bootstrap samples of it, and the row's kind."""
 
     score: float
     drawn: Array
@@ -49,9 +49,9 @@ def combined(boards: Mapping[str, Mapping[Agent, Result]]) -> list[dict[str, Any
     Returns
     -------
     list of dict
-        ``name``, ``authors``, ``kind``; ``score`` and its bootstrap ``interval`` of 95 %; ``boards``, on how
-        many it is, ``of`` how many; ``there``, its mean score on those; ``profile``, pairs of a score and the
-        share of all boards on which it has at least that.
+        ``name``, ``authors``, ``kind``; ``score`` and its bootstrap ``interval`` of 95 %; ``boards``, the
+        number it is on, ``of`` the number there are; ``there``, its mean score on those it is on;
+        ``profile``, pairs of a score and the share of all boards on which it has at least that.
     """
     counted = {env_id: found for env_id, found in boards.items() if found}
     rows = []

@@ -1,8 +1,8 @@
 """The leaderboard in README and docs: ``python -m lag_envs.leaderboard.docs PROJECT``.
 
-From a checkout's folder ``leaderboard`` it writes the agents with the best combined scores into README.md,
-and the best of each board and what counts as success into ``docs/leaderboard.md``. The texts follow from the
-files alone, so a test makes them again and compares.
+From a checkout's folder ``leaderboard``, it writes the agents with the best combined scores into README.md,
+and each board's best agents and success criterion into ``docs/leaderboard.md``. The texts depend on the files
+alone, so a test makes them again and compares.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def generated(project: Path) -> dict[Path, str]:
-    """Return the generated files, as they ought to be."""
+    """Return the generated files as they should be."""
     readme, page = project / "README.md", project / "docs" / "leaderboard.md"
     data = board_data(Board(project / "leaderboard"))
     text = replaced(page.read_text(encoding="utf-8"), "goals", goals())
@@ -45,7 +45,7 @@ def generated(project: Path) -> dict[Path, str]:
 
 
 def together(data: dict[str, Any]) -> str:
-    """Return a table of the best agents over all boards, and the best learned one if it is none of them."""
+    """Return a table of the best agents over all boards, and of the best learned one if it is not in it."""
     every = list(enumerate(data["combined"], 1))
     shown = every[:BEST] + [one for one in every[BEST:] if one[1]["kind"] == "learned"][:1]
     if not shown:
@@ -64,7 +64,7 @@ def together(data: dict[str, Any]) -> str:
 
 
 def top(data: dict[str, Any]) -> str:
-    """Return a table: for every open board all agents that share first place, and the best learned one."""
+    """Return a table of all agents that share first place on each open board, and the best learned one."""
     rows = []
     for environment in data["environments"]:
         if environment["frozen"]:
@@ -92,14 +92,14 @@ def _scored(row: dict[str, Any], digits: int = 4) -> str:
 
 
 def goals() -> str:
-    """Return a table of what counts as success."""
+    """Return a table of the success criteria."""
     texts = {env_id: TASKS[env_id].goal.text for env_id in boards()}
     rows = [(env_id, text[0].upper() + text[1:]) for env_id, text in texts.items()]
     return markdown_table(("environment", "success and time"), rows)
 
 
 def plain(text: str) -> str:
-    """Return text that means nothing but itself in Markdown and HTML."""
+    """Return text that Markdown and HTML show as it is."""
     escaped = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return "".join("\\" + c if c in "\\`*_{}[]()#!~" else c for c in " ".join(escaped.split()))
 

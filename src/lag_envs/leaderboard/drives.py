@@ -1,7 +1,7 @@
-"""The best drives by hand: links in the board's ``drives.txt``, each recomputed whenever the page is built.
+"""The best drives by hand: links in the board's ``drives.txt``, recomputed whenever the page is built.
 
-A line is a link and the name of who drove, with white space between. Empty lines, and those that begin with
-``# ``, count for nothing.
+A line is a link and the driver's name, with white space between. Empty lines and those that begin with ``# ``
+are ignored.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from lag_envs.leaderboard.log import BoardError
 from lag_envs.replay import LinkError, read_link, replay
 
 FILE = "drives.txt"
-#: Bytes of the file, characters of a name, and drives of one environment that are shown.
+#: Largest file [bytes], longest name [characters], and how many drives of one environment are shown.
 MOST, NAME, SHOWN = 2**22, 60, 10
 
 
 def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Return for each environment its best drives, the best first.
+    """Return each environment's best drives, the best first.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ def best_drives(folder: Path) -> dict[str, list[dict[str, Any]]]:
     Raises
     ------
     BoardError
-        For the first line that is no link and name, or whose claim is not true.
+        For the first line that is not a link and a name, or whose claim is false.
     """
     path = folder / FILE
     try:

@@ -1,4 +1,4 @@
-"""Check data that nobody vouches for with strict models of pydantic; what is wrong is said in a safe line."""
+"""Check untrusted data with strict pydantic models; errors become one line that is safe to print."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from lag_envs.leaderboard.names import unreadable
 from lag_envs.leaderboard.protocol import Refused
 
-#: What pydantic says less plainly.
+#: Plainer words for pydantic's messages.
 _PLAINER = {"missing": "is missing", "extra_forbidden": "is an unknown key; leave it out"}
 
 
 class Strict(BaseModel):
-    """Data of exactly these types and finite numbers, without anything besides."""
+    """Data of exactly these types, with finite numbers and no extra keys."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def line(longest: int, least: int = 0) -> AfterValidator:
-    """Ask for one line of readable text: no control characters, no invisible ones."""
+    """Require one line of readable text: no control characters, no invisible ones."""
 
     def check(text: str) -> str:
         if not least <= len(text) <= longest:
@@ -33,17 +33,17 @@ def line(longest: int, least: int = 0) -> AfterValidator:
 
 
 def between(low: float, high: float) -> Any:
-    """Ask for a number from low to high."""
+    """Require a number from low to high."""
     return Field(ge=low, le=high)
 
 
 def many(least: int, most: int) -> Any:
-    """Ask for so many in a list."""
+    """Require a list's length to be from least to most."""
     return Field(min_length=least, max_length=most)
 
 
 def checked(kind: Any, value: Any) -> Any:
-    """Return a value as a model, or a `TypeAdapter`, has it; raise a ValueError of one line otherwise."""
+    """Return a value validated by a model or a `TypeAdapter`; otherwise raise a ValueError of one line."""
     adapter = kind if isinstance(kind, TypeAdapter) else TypeAdapter(kind)
     try:
         return adapter.validate_python(value)
@@ -57,7 +57,7 @@ def checked(kind: Any, value: Any) -> Any:
 
 
 def accepted(kind: Any, value: Any, where: str) -> Any:
-    """Return what `checked` returns; raise Refused, which names where the value stands, otherwise."""
+    """Return the result of `checked`; raise Refused, which names the value's place, if it is invalid."""
     try:
         return checked(kind, value)
     except ValueError as error:

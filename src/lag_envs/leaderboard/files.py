@@ -1,4 +1,4 @@
-"""Read files that somebody else may have put there: plain ones only, and no more of them than fits."""
+"""Read untrusted files: only plain ones, and only up to a size."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from pathlib import Path
 def read_plain(path: Path, most: int) -> bytes:
     """Return a file's content.
 
-    Nothing but a plain file is read: a pipe would wait for ever, a device would never end, and a link may
-    lead anywhere.
+    Only plain files are read: a pipe would block for ever, a device would never end, and a link may lead
+    anywhere.
 
     Parameters
     ----------
     path : Path
         The file.
     most : int
-        Bytes that are accepted.
+        The largest size accepted.
 
     Raises
     ------
     FileNotFoundError
-        Where there is none.
+        If there is none.
     OSError
-        Where it is no plain file, is larger, or cannot be read.
+        If it is not a plain file, is larger, or cannot be read.
     """
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         file = os.open(path, flags | getattr(os, "O_BINARY", 0))
     except OSError as error:
-        # What O_NOFOLLOW says of a link, and Linux of a socket.
+        # O_NOFOLLOW's error for a link, and Linux's for a socket.
         if error.errno in (errno.ELOOP, errno.ENXIO):
             raise _not_plain() from None
         raise

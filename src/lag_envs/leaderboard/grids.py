@@ -20,7 +20,7 @@ from lag_envs.tasks.base import Task
 
 
 class GridTable(PolicyTable):
-    """The table of numbers on a grid."""
+    """The table ``[policy]`` of numbers on a grid."""
 
     axes: Annotated[list[Annotated[str, line(40)]], many(1, 5)]
     kind: Literal["action", "value"]
@@ -39,21 +39,21 @@ class GridTable(PolicyTable):
 
 
 class Table(Architecture):
-    """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, as at the edge.
+    """Numbers at the nodes of a grid, interpolated linearly along every axis; outside, those of the edge.
 
-    In the table: `axes`, a list of what the axes are: a state by its name (`lag-envs info ID`), ``target``,
-    a state relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start. An angle
-    that is observed by its cosine and sine lies in [-π, π].
+    In the table: `axes`, a list of the axes: a state by its name (`lag-envs info ID`), ``target``, a state
+    relative to the target as ``"x - target"``, or ``time`` [s] since the episode's start. An angle that is
+    observed by its cosine and sine lies in [-π, π].
 
-    `kind` is "action" or "value". A table of actions is read off. One of values tells what is still to be had
-    from where a step's motion ends (the mean over the random kick that may follow): the action is the one
-    with the largest reward + value one step ahead, by the exact model of the undisturbed environment; of
-    `actions` evenly spaced ones, and then of finer ones around the best; or of those that are listed.
+    `kind` is "action" or "value". A table of actions is read off. A table of values gives the return still to
+    come from the state in which a step's motion ends (the mean over a random kick that may follow). The
+    action is the one with the largest reward + value one step ahead, by the exact model of the undisturbed
+    environment: the best of `actions` evenly spaced ones, refined around it, or the best of the listed ones.
 
-    `mirror`, optional, names an axis; where it is negative, the mirror image is looked up: all signs but that
-    of time changed, and that of the action, unless the control is a drag, which has no sign.
+    `mirror`, optional, names an axis. If its coordinate is negative, the mirror image is looked up: all signs
+    change except that of time, and so does the action's, unless the control is a drag, which has no sign.
 
-    Arrays: ``axis_0`` (n0,), ``axis_1`` (n1,) and so on, growing, and ``table`` (n0, n1, ...).
+    Arrays: ``axis_0`` (n0,), ``axis_1`` (n1,) and so on, increasing, and ``table`` (n0, n1, ...).
     """
 
     table = GridTable
@@ -80,7 +80,7 @@ class Table(Architecture):
             if axis not in known:
                 raise Refused(f"{POLICY}: axes must be of {', '.join(known)}; got {shown(axis)}")
         self.kind, self.actions, mirror = table.kind, table.actions, table.mirror
-        #: For each axis the signs of (*states, target, time) of which it is the sum.
+        #: For each axis, its coefficients of (*states, target, time): 0, 1 or -1.
         self.sums = np.zeros((len(self.axes), len(names) + 2))
         for row, axis in zip(self.sums, self.axes, strict=True):
             first, _, minus = axis.partition(" - ")
@@ -88,13 +88,13 @@ class Table(Architecture):
             if minus:
                 row[-2] = -1.0
         self.mirror = self.axes.index(mirror) if mirror else None
-        #: Of an action in the mirror image; a control that is zero at an end of its range has no sign.
+        #: Sign of an action in the mirror image; a control that is zero at an end of its range has no sign.
         self.sign = 1.0 if abs(self.task.rest_action) == 1.0 else -1.0
         self.arrays = {f"axis_{j}": (f"n{j}",) for j in range(len(self.axes))}
         self.arrays["table"] = tuple(f"n{j}" for j in range(len(self.axes)))
 
     def agent(self, arrays: Mapping[str, Array]) -> Clocked:
-        """Return what acts by the numbers."""
+        """Return the agent of these numbers."""
         axes = [arrays[f"axis_{j}"] for j in range(len(self.axes))]
         for j, axis in enumerate(axes):
             if not (axis[1:] > axis[:-1]).all():
@@ -116,11 +116,11 @@ class _Grid:
         self.values = np.ascontiguousarray(values).reshape(-1)
 
     def value(self, states: Array, targets: Array, taken: Array) -> Array:
-        """Return the numbers (n,) where steps end that began with so many taken."""
+        """Return the numbers (n,) at the ends of steps; `taken` steps came before each."""
         return self.look_up(states, targets, taken + 1.0)[0]
 
     def look_up(self, states: Array, targets: Array, taken: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the numbers (n,), and where they are those of the mirror image."""
+        """Return the numbers (n,), and which of them are of the mirror image."""
         from lag_envs.leaderboard.kernels import interpolate
 
         time = taken * self.about.task.interval
@@ -129,7 +129,7 @@ class _Grid:
         for angle in self.wrapped:
             states[:, angle] = np.remainder(states[:, angle] + math.pi, 2.0 * math.pi) - math.pi
         given = [*states.T, targets, time]
-        # Sums by hand: a matrix product's bits may depend on the number of rows.
+        # Sums by hand: the bits of a matrix product may depend on the number of rows.
         points = [sum(s * g for s, g in zip(row, given, strict=True) if s) for row in self.about.sums]
         mirrored = np.zeros(len(states), np.bool_)
         if self.about.mirror is not None:

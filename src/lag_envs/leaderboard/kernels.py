@@ -1,7 +1,7 @@
 """Compiled loops of the policies: each row's result depends on that row alone, to the bit.
 
-A library's matrix product does not promise that, nor the same bits for another number of rows or threads.
-Sums go in order and are not fused, so that they are the same on every machine.
+A library's matrix product promises neither that, nor the same bits for another number of rows or threads.
+Sums are taken in order and not fused, so that they are the same on every machine.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def affine(x: Any, weight: Any, bias: Any) -> Any:
 def interpolate(values: Any, strides: Any, cells: Any, places: Any) -> Any:
     """Return the multilinear interpolation of flat values.
 
-    Each row has its cell's first node, as numbers along the axes in cells (n, d), and the place in the cell
-    from 0 to 1 in places (n, d).
+    For each row, cells (n, d) has its cell's first node, as indices along the axes, and places (n, d) the
+    position in the cell, from 0 to 1.
     """
     n, d = cells.shape
     out = np.empty(n)

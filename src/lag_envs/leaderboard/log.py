@@ -1,8 +1,8 @@
-"""The board's log: a file of events, a line of JSON for each, only ever appended to.
+"""The board's log: a file with one line of JSON for each event, only ever appended to.
 
-Each event holds, as ``prev``, the SHA-256 of all that stands before its line. So nothing in the log can be
-changed without changing every later line, and the log's own SHA-256 (``sha256sum board.jsonl``), its head,
-stands for all of it. The lines of protocol 1 are older than this; the first line with a hash covers them.
+Each event holds, as ``prev``, the SHA-256 of all that precedes its line. So nothing in the log can be changed
+without changing every later line, and the log's own SHA-256 (``sha256sum board.jsonl``), its head, stands for
+all of it. The lines of protocol 1 are older than this; the first line with a hash covers them.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from lag_envs.leaderboard.fields import Strict, between, checked, shown
 from lag_envs.leaderboard.files import read_plain
 
 LOG = "board.jsonl"
-#: Bytes of a log.
+#: Largest log [bytes].
 MOST = 2**26
 STATES = ("pending", "verified", "rejected", "superseded", "withdrawn")
 KINDS = ("learned", "controller", "optimal")
 REMEDY = "restore it from version control"
-#: All of one length and in UTC, so that they sort as text; none that a clock could not go beyond.
+#: All of one length and in UTC, so that they sort as text, and none in a future that a clock cannot pass.
 TIME = r"(19|20|21)[0-9]{2}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}\.[0-9]{6}\+00:00"
 
 
 class BoardError(Exception):
-    """What is asked of the board cannot be done; the text says why, and what to do."""
+    """A request that the board cannot fulfil; the text says why, and what to do."""
 
 
 # --- events -------------------------------------------------------------------------------------------------
@@ -54,16 +54,16 @@ EnvId = Annotated[str, Field(pattern=r"^[A-Za-z0-9]+-v(0|[1-9][0-9]{0,3})$", max
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, fields.line(80, least=1)]
 Text = Annotated[str, fields.line(1_000)]
-#: Far from where sums overflow.
+#: Sums of such numbers cannot overflow.
 Number = Annotated[float, between(-1e15, 1e15)]
 Positive = Annotated[float, between(0.0, 1e15)]
 Moment = Annotated[str, AfterValidator(_moment)]
-#: What `nonce` names as its source where it is a commit of the repository in which the board lies.
+#: A nonce's source if it is a commit of the repository that contains the board.
 COMMIT = "commit"
 
 
 class Event(Strict):
-    """What all events say: when (UTC), and the hash of the log before it."""
+    """The fields of all events: the time (UTC), and the hash of the log before it."""
 
     at: Moment
     prev: Hash | None = None
@@ -93,7 +93,7 @@ class Reference(Strict):
 
 
 class Rules(Strict):
-    """What a verification is: how many episodes, how many policies of a learner, and what success means."""
+    """The rules of a verification: episodes, policies of a learner, and what counts as success."""
 
     episodes: Annotated[int, between(1, 10**6)]
     disturbed_episodes: Annotated[int, between(1, 10**6)]
@@ -102,7 +102,7 @@ class Rules(Strict):
 
 
 class Protocol(Event):
-    """A protocol begins: what a score means from here on. All that counts is to be verified anew."""
+    """A protocol begins: the meaning of a score from here on. All that counts must be verified again."""
 
     event: Literal["protocol"]
     number: Annotated[int, between(1, 10**6)]
@@ -112,7 +112,7 @@ class Protocol(Event):
 
 
 class Opened(Event):
-    """Boards that there were none of join the current protocol; what was verified on others stays."""
+    """New boards join the current protocol; results on the others stay."""
 
     event: Literal["opened"]
     number: Annotated[int, between(1, 10**6)]
@@ -122,7 +122,7 @@ class Opened(Event):
 
 
 class Added(Event):
-    """A submission was taken in, or taken in again after it was rejected or withdrawn."""
+    """A submission was added, perhaps again after it was rejected or withdrawn."""
 
     event: Literal["added"]
     id: Id
@@ -135,7 +135,7 @@ class Added(Event):
 
 
 class Nonce(Event):
-    """A nonce was published: `COMMIT`, an address, or nothing says where it came from."""
+    """A nonce was published; its source is `COMMIT`, an address, or empty."""
 
     event: Literal["nonce"]
     value: Annotated[str, Field(pattern=r"^[!-~]{1,200}$")]
@@ -151,7 +151,7 @@ class Alike(Strict):
 
 
 class Verified(Event):
-    """A submission was verified, and its result kept; the same authors' ones of that name step back."""
+    """A submission was verified and its result kept; it replaces its authors' others of the same name."""
 
     event: Literal["verified"]
     id: Id
@@ -162,7 +162,7 @@ class Verified(Event):
 
 
 class Rejected(Event):
-    """Verification found a reason to turn a submission away."""
+    """Verification found a reason to reject a submission."""
 
     event: Literal["rejected"]
     id: Id
@@ -184,12 +184,12 @@ _EVENTS: TypeAdapter[Any] = TypeAdapter(AnyEvent)
 
 
 def load_json(content: bytes) -> Any:
-    """Return what JSON in UTF-8 holds; keys that occur twice, NaN and infinity are refused.
+    """Return the data in JSON text (UTF-8); refuse repeated keys, NaN and infinity.
 
     Raises
     ------
     ValueError
-        For what is none, or nested too deep.
+        If it is not JSON, or nested too deeply.
     """
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -216,13 +216,13 @@ class Line:
 
 
 def parse(log: bytes) -> tuple[list[Line], bytes]:
-    """Return the events of a log, and the end that was torn off by a kill.
+    """Return the events of a log, and the torn end that a kill may have left.
 
     Raises
     ------
     BoardError
-        Where another line than the last is no event, which no kill does, or does not hold the hash of what
-        stands before it.
+        If any line but the last is not an event, which no kill causes, or does not hold the hash of the lines
+        before it.
     """
     *whole, tail = log.split(b"\n")
     before, chained = hashlib.sha256(), False
@@ -261,25 +261,25 @@ class Entry:
     Parameters
     ----------
     id, env, name, kind, digest : str
-        Its id on the board, and what its files say.
+        Its id on the board, and statements of its files.
     protocol : int
         The protocol's number.
     authors : tuple of str
         Who submitted it.
     added : str
-        When it was added first, in UTC.
+        When it was first added, in UTC.
     line : int
-        The line of the log that added it first.
+        The line of the log that first added it.
     since : int
-        The line after which a nonce counts for it: that one, or the one that began the protocol.
+        Nonces after this line count for it: the line that added it, or the one that began the protocol.
     state : str
         One of `STATES`.
     reason : str
         Why it was rejected, superseded or withdrawn.
     nonce, sha256 : str
-        With which nonce it was verified first, and the SHA-256 of the result's file.
+        The nonce of its first verification, and the SHA-256 of the result's file.
     alike : tuple of Alike
-        Those of which it was found when it was verified that they act alike.
+        Submissions that act alike, as found when it was verified.
     """
 
     id: str
@@ -301,12 +301,12 @@ class Entry:
 
 @dataclass
 class State:
-    """What follows from the log."""
+    """The state that follows from the log."""
 
     #: The current protocol; 0 where there is none yet.
     number: int = 0
-    #: What each protocol fixed, with the boards that joined it. Protocol 1 of an old log says it late, or not
-    #: yet.
+    #: What each protocol fixed, with the boards that joined it. In an old log, protocol 1 states it late or
+    #: not yet.
     protocols: dict[int, Protocol] = field(default_factory=dict)
     #: The submissions under each protocol, by id.
     boards: dict[int, dict[str, Entry]] = field(default_factory=dict)
@@ -339,10 +339,10 @@ class State:
         return [entry for entry in self.entries.values() if entry.state == "pending"]
 
     def first(self, entry: Entry) -> Entry | None:
-        """Return the first submission that acts like this one, where it is not the first itself.
+        """Return the first submission that acts like this one, None if that is this one.
 
-        Likeness is noted with the one that was verified later; the one that was added later is linked. A link
-        leads on to what the linked one is linked to.
+        Likeness is noted with the one that was verified later; the one that was added later is linked. Links
+        are followed to their end.
         """
         board = self.boards[entry.protocol]
         others = {like.id for like in entry.alike}
@@ -355,12 +355,12 @@ class State:
 
 
 def fold(lines: Sequence[Line]) -> State:
-    """Return what follows from events.
+    """Return the state that follows from events.
 
     Raises
     ------
     BoardError
-        Where an event contradicts those before it; the text names its line.
+        If an event contradicts those before it; the text names its line.
     """
     state = State()
     for line in lines:
@@ -372,7 +372,7 @@ def fold(lines: Sequence[Line]) -> State:
 
 
 def _apply(state: State, event: Any, line: int) -> None:
-    """Let one event follow the others; raise a ValueError where it cannot."""
+    """Apply one event to the state; raise a ValueError if it cannot follow."""
     if event.at < state.last:
         raise ValueError(f"{event.at} is earlier than the line before it")
     state.last = event.at
@@ -396,7 +396,7 @@ def _begin(state: State, event: Protocol, line: int) -> None:
     if event.number != wanted:
         raise ValueError(f"protocol {event.number} begins where {wanted} would be the next")
     state.protocols[event.number] = event
-    if not known:  # the first of all, or one that began before its line was written
+    if not known:  # the first protocol, or one that began before its line was written
         state.number = event.number
         return
     carried = {}
@@ -443,7 +443,7 @@ def _add(state: State, event: Added, line: int) -> None:
         raise ValueError(f"{event.id} is added, and is there already, {known.state}")
     if any(getattr(known, key) != value for key, value in told.items()):
         raise ValueError(f"{event.id} is added again as another than it was")
-    # Whoever comes back finds the episodes, and the result, of the first time.
+    # Coming back does not change the episodes, nor the result if there is one.
     back = replace(known, state="verified" if known.sha256 else "pending", reason="")
     newer = [
         other.id
@@ -494,12 +494,12 @@ def same_agent(entry: Entry, other: Entry) -> bool:
 
 
 def read_log(path: Path) -> bytes:
-    """Return a log's content; nothing where there is none.
+    """Return a log's content; empty if there is none.
 
     Raises
     ------
     BoardError
-        Where it is no plain file.
+        If it is not a plain file.
     """
     try:
         return read_plain(path, MOST)
@@ -514,11 +514,11 @@ def locked(path: Path) -> Iterator[int]:
     """Open a file for reading and appending, and hold its lock, which ends with the process at the latest."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
     while True:
-        read_log(path)  # what is no plain file is refused before it is opened for writing
+        read_log(path)  # refuses anything but a plain file before it is opened for writing
         log = os.open(path, flags, 0o644)
         try:
             lock(log)
-            # Version control may have put another file there while we waited.
+            # Version control may have replaced the file while we waited.
             try:
                 same = os.path.samestat(os.fstat(log), os.stat(path))
             except FileNotFoundError:
@@ -531,12 +531,12 @@ def locked(path: Path) -> Iterator[int]:
 
 
 def lock(file: int, wait: bool = True) -> bool:
-    """Lock an open file until it is closed; return whether it could be had."""
+    """Lock an open file until it is closed; return whether that worked."""
     try:
         if sys.platform == "win32":
             import msvcrt
 
-            # There a lock keeps others from reading what it covers, so it covers a byte far beyond the end.
+            # A lock on Windows also blocks reading the locked bytes, so lock one far beyond the end.
             os.lseek(file, 2**62, os.SEEK_SET)
             mode = msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK
             msvcrt.locking(file, mode, 1)
@@ -561,12 +561,12 @@ def read_all(file: int) -> bytes:
 
 
 def write_event(log: int, told: dict[str, Any]) -> Line:
-    """Append an event as a line, and see it to the disk; all of it or nothing.
+    """Append an event as a line and flush it to the disk, all or nothing.
 
     Raises
     ------
     BoardError
-        For an event that could not be read again.
+        For an event that could not be read back.
     """
     content = read_all(log)
     _, torn = parse(content)

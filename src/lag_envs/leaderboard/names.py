@@ -1,4 +1,4 @@
-"""Names that people read: without invisible characters, and told apart from those that look the same."""
+"""Names for people to read: no invisible characters, and no confusion of names that look the same."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ import unicodedata
 from collections.abc import Iterable
 from functools import cache
 
-#: Unicode's Default_Ignorable_Code_Point, as far as Python calls them printable, and blanks of other kinds.
+#: Unicode's Default_Ignorable_Code_Point, where Python calls them printable, and other blanks.
 INVISIBLE = frozenset(
     chr(code)
     for first, last in (
         (0x034F, 0x034F),  # combining grapheme joiner
         (0x115F, 0x1160), (0x3164, 0x3164), (0xFFA0, 0xFFA0),  # Hangul fillers
-        (0x17B4, 0x17B5), (0x180B, 0x180F),  # Khmer's and Mongolian's
+        (0x17B4, 0x17B5), (0x180B, 0x180F),  # Khmer and Mongolian
         (0x2800, 0x2800),  # Braille without a dot
         (0xFE00, 0xFE0F), (0xE0100, 0xE01EF),  # variation selectors
         (0x1D159, 0x1D159), (0x16FE4, 0x16FE4),  # a musical symbol and a filler without ink
     )
     for code in range(first, last + 1)
 )  # fmt: skip
-#: Marks that may stand on one letter: more climb over the lines above.
+#: Marks that may stand on one letter: more of them overlap the lines above.
 MOST_MARKS = 2
 
 
 def unreadable(text: str) -> str:
-    r"""Return why a text is not shown as it is; empty for one that may be.
+    r"""Return why a text cannot be shown as it is; empty if it can.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def unreadable(text: str) -> str:
     marks = 0
     for char in text:
         category = unicodedata.category(char)
-        # Of controls, formats, surrogates, unassigned and foreign spaces Python says that they don't print.
+        # Python calls controls, formats, surrogates, unassigned characters and foreign spaces not printable.
         if not char.isprintable() or char in INVISIBLE:
             return f"it holds the invisible U+{ord(char):04X}"
         marks = marks + 1 if category.startswith("M") else 0
@@ -57,10 +57,10 @@ def wordless(text: str) -> bool:
 
 @cache
 def _prototypes() -> dict[str, str]:
-    """Return for each character that looks like others what stands for all of them.
+    """Return, for each character that has look-alikes, the representative of their class.
 
-    From Unicode's list of confusables: what looks alike forms a class, for which one of it stands, a sequence
-    such as "rn" before a character such as "m".
+    From Unicode's list of confusables: characters that look alike form a class with one representative, a
+    sequence such as "rn" before a character such as "m".
     """
     from confusable_homoglyphs.confusables import confusables_data
 
@@ -73,7 +73,7 @@ def _prototypes() -> dict[str, str]:
 
     for char, others in confusables_data.items():
         for other in others:
-            # In the list, right-to-left characters stand between marks of direction.
+            # In the list, right-to-left characters stand between direction marks.
             a, b = (top(text.replace("\u200e", "")) for text in (char, other["c"]))
             if a != b:
                 first, second = sorted((a, b), key=lambda text: (-len(text), text))
@@ -82,9 +82,9 @@ def _prototypes() -> dict[str, str]:
 
 
 def skeleton(text: str) -> str:
-    r"""Return what a text looks like: two texts with the same skeleton can be taken for one another.
+    r"""Return what a text looks like: two texts with the same skeleton can be mistaken for each other.
 
-    As in Unicode's UTS 39, but without spaces and marks on letters, which are easily overlooked.
+    Follows Unicode's UTS 39, but without spaces and marks on letters, which are easily overlooked.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def skeleton(text: str) -> str:
 
 
 def lookalike(text: str, earlier: Iterable[str]) -> str:
-    """Return the first of some earlier texts that looks like a text, if it is another; empty for none.
+    """Return the first of some earlier texts that looks like a text but differs from it; empty if none does.
 
     Capitals and small letters count as alike.
     """

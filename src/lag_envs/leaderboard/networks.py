@@ -41,7 +41,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 
 
 def bin_centres(bins: int) -> Array:
-    """Return the middles of equal parts of [-1, 1], the actions of Gymnasium's ``DiscretizeAction``."""
+    """Return the centres of equal parts of [-1, 1], the actions of Gymnasium's ``DiscretizeAction``."""
     return (2.0 * np.arange(bins) + 1.0) / bins - 1.0
 
 
@@ -53,7 +53,7 @@ class Normalise(Strict):
 
 
 class NetworkTable(PolicyTable):
-    """What the tables of all networks have."""
+    """The fields that all networks' tables share."""
 
     hidden: Annotated[list[Annotated[int, between(1, protocol.WIDTH)]], many(0, protocol.LAYERS)]
     activation: Literal["tanh", "relu", "elu", "leaky_relu", "silu", "sigmoid"] = "tanh"
@@ -93,14 +93,14 @@ class GRUTable(NetworkTable):
 
 
 class Network(Architecture):
-    """Base of the networks: fully connected layers, whose last outputs become actions."""
+    """Base of the networks: fully connected layers, the last of which decides the action."""
 
     counts_as = "learned"
 
     def _layers(self, task: Task, table: NetworkTable, wide: int, features: int) -> None:
-        """Note what the table says, and what arrays layers need that so many features enter.
+        """Read the table and set the arrays of layers that take so many `features`.
 
-        Of so many numbers as are `wide` each can be normalised.
+        Observations to normalise have length `wide`.
         """
         self.head, self.controls = Head(task), task.formulas.actions
         self.activation, self.bins, self.squash = table.activation, table.bins, table.squash
@@ -135,16 +135,16 @@ class Network(Architecture):
 class MLP(Network):
     """A network of fully connected layers, evaluated in float64.
 
-    In the table: `hidden`, the layers' widths, none for a linear map; `activation`; `squash` is "clip" or
-    "tanh"; `mean_limit`, to which the last layer's output is clipped before squashing (the mean under SAC's
-    gSDE), optional; `bins`, with which the network has so many outputs, the largest of which chooses the
-    middle of one of so many equal parts of [-1, 1], instead of squashing; and the table ``normalise`` with
-    `epsilon` and `clip`, with which the network sees (o - obs_mean)/√(obs_var + epsilon), clipped. Where
-    actions are listed, it has an output for each value of each list, the largest of which chooses, and there
-    are neither `squash`, `mean_limit` nor `bins`.
+    In the table: `hidden`, the layers' widths, none for a linear map; `activation`; `squash`, "clip" or
+    "tanh"; `mean_limit`, optional, to which the last layer's output is clipped before squashing (the mean
+    under SAC's gSDE); `bins`, instead of squashing: [-1, 1] is cut into so many equal parts, the network has
+    an output for each, and the largest output chooses the centre of its part; and the table ``normalise``
+    with `epsilon` and `clip`: then the network sees (o - obs_mean)/√(obs_var + epsilon), clipped. If actions
+    are listed, the network has an output for each value of each list, the largest of which chooses, and there
+    is no `squash`, `mean_limit` or `bins`.
 
-    With `frames`, optional, it sees so many observations, the oldest first, the last one last; before the
-    first there are zeros, or with `padding` "first" the first one over and over.
+    With `frames`, optional, it sees that many observations, the oldest first. Those before the first are
+    zeros, or copies of the first with `padding` "first".
 
     Arrays: ``weight_0`` (out, in), ``bias_0`` (out,) and so on; with ``normalise`` also ``obs_mean`` and
     ``obs_var``.
@@ -169,9 +169,9 @@ class MLP(Network):
 class GRU(Network):
     """A gated recurrent unit, followed by fully connected layers, evaluated in float64.
 
-    In the table: `memory`, the size m of the unit, and what ``mlp`` has but for `frames`; `hidden` is that of
-    the layers after the unit, none if left out. The unit is PyTorch's: with the logistic function σ and the
-    observation o, normalised if the table says so, the memory h, zero at first, becomes
+    In the table: `memory`, the size m of the unit, and everything that ``mlp`` has except `frames`; `hidden`
+    lists the layers after the unit, none if left out. The unit is PyTorch's: with the logistic function σ and
+    the observation o, normalised if the table says so, the memory h, zero at first, becomes
 
         r, z = σ(W_r o + b_r + V_r h + c_r), σ(W_z o + b_z + V_z h + c_z)
         h = (1 - z) tanh(W_n o + b_n + r (V_n h + c_n)) + z h
@@ -210,13 +210,13 @@ class _Layers:
             self.deviation = np.sqrt(arrays["obs_var"] + made.normalise.epsilon)
 
     def normalised(self, observations: Array) -> Array:
-        """Return the observations as the network sees them."""
+        """Return the observations as the network's input."""
         if not self.made.normalise:
             return observations
         return np.clip((observations - self.mean) / self.deviation, -self.clip, self.clip)
 
     def outputs(self, features: Array) -> Array:
-        """Return what the last layer puts out."""
+        """Return the last layer's output."""
         from lag_envs.leaderboard.kernels import affine
 
         x = features
@@ -246,7 +246,7 @@ class _Plain(Agent):
         self.layers, self.centres = layers, layers.centres
 
     def outputs(self, observations: Array) -> Array:
-        """Return what the last layer puts out, shape (n, outputs)."""
+        """Return the last layer's output, shape (n, outputs)."""
         return self.layers.outputs(self.layers.normalised(observations))
 
     def act(self, observations: Array) -> Array:
@@ -254,7 +254,7 @@ class _Plain(Agent):
 
 
 class _Stacked(Remembering):
-    """Remembers the last observations, shape (n, frames, n_observation)."""
+    """Its memory is the last observations, shape (n, frames, n_observation)."""
 
     def __init__(self, layers: _Layers, frames: int, padding: str) -> None:
         super().__init__(layers.head)
@@ -270,7 +270,7 @@ class _Stacked(Remembering):
 
 
 class _Recurrent(Remembering):
-    """Remembers the unit's numbers, shape (n, memory)."""
+    """Its memory is the unit's hidden state, shape (n, memory)."""
 
     def __init__(self, layers: _Layers, arrays: Mapping[str, Array]) -> None:
         super().__init__(layers.head)
@@ -297,9 +297,9 @@ class _Recurrent(Remembering):
 class Linear(Architecture):
     """Action = gain · observation + offset, clipped to [-1, 1].
 
-    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), each with an axis for the numbers of an action
-    where these are several. Where actions are listed, there is a number for each value of each list, the
-    largest of which chooses. `lag-envs info ID` lists the observation.
+    Arrays: ``gain`` (n_observation,) and ``offset`` (1,), each with one more axis if an action has several
+    numbers. If actions are listed, there is a number for each value of each list, the largest of which
+    chooses. `lag-envs info ID` lists the observation.
     """
 
     def __init__(self, env_id: str, table: PolicyTable) -> None:

@@ -18,38 +18,38 @@ Work = Callable[[Path], Any]
 def map_submissions(
     function: Work, folders: Sequence[Path], jobs: int = 1, ray: str | None = None
 ) -> Iterator[tuple[Path, Any]]:
-    """Call a function on every folder and yield (folder, what it returned or raised), as they are finished.
+    """Call a function on every folder; yield (folder, what it returned or raised) as each one finishes.
 
     Parameters
     ----------
     function : callable
-        Takes the folder of a submission. With several jobs or Ray it must be picklable, as a function at the
-        top of a module is, and so must be what it returns.
+        Takes the folder of a submission. With several jobs or Ray, it and its results must be picklable, so
+        it must be at the top of a module.
     folders : sequence of Path
         The submissions.
     jobs : int
-        Processes side by side; 1 for none besides this one.
+        Parallel processes; 1 for none besides this one.
     ray : str, optional
-        Address of a Ray cluster, "auto" for a running one, "local" for one on this machine. Its machines get
-        this package and the submissions' files from here, and need its dependencies.
+        Address of a Ray cluster, "auto" for a running one, "local" for one on this machine. This package and
+        the submissions' files are sent to its machines, which need the package's dependencies.
 
     Yields
     ------
     (Path, object)
-        A folder, and what came of it. An exception is yielded, not raised, so that one submission does not
-        cost the others theirs.
+        A folder and its outcome. An exception is yielded, not raised, so that one bad submission does not
+        stop the others.
 
     Raises
     ------
     SpreadError
-        Of `lag_envs.workers`, where Ray is missing, or its cluster.
+        From `lag_envs.workers`, if Ray or its cluster is missing.
     """
     if ray is not None:
         with cluster(ray) as submit:
             futures = {}
             for folder in folders:
                 files = packed(folder)
-                if files is None:  # it will be refused, for which nobody else is needed
+                if files is None:  # it will be refused, which needs no other machine
                     yield folder, _caught(function, folder)
                 else:
                     futures[submit(_unpacked, function, folder.name, files)] = folder
@@ -70,7 +70,7 @@ def _caught(function: Work, folder: Path) -> Any:
 
 
 def packed(folder: Path) -> dict[str, bytes] | None:
-    """Return a folder's files by name; None where it is none of plain files within the limit of size."""
+    """Return a folder's files by name; None unless they are plain files within the size limit."""
     files: dict[str, bytes] = {}
     try:
         with os.scandir(folder) as found:
@@ -86,7 +86,7 @@ def packed(folder: Path) -> dict[str, bytes] | None:
 
 
 def _unpacked(function: Work, name: str, files: dict[str, bytes]) -> Any:
-    """Call a function on a folder on a machine that does not see it."""
+    """Call a function on a folder, on a machine that does not have it."""
     with tempfile.TemporaryDirectory() as above:
         folder = Path(above) / name
         folder.mkdir()

@@ -1,4 +1,4 @@
-"""What is done to pending submissions: verified, recorded, and compared with those that are there."""
+"""Process pending submissions: verify, record, and compare with those already there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Check:
-    """What is done to a pending submission, here or on another machine.
+    """Process a pending submission, here or on another machine.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class Check:
     entries: Mapping[str, tuple[str, str]]
 
     def __call__(self, folder: Path, progress: Callable[[int, int], Any] | None = None) -> dict[str, Any]:
-        """Return the result, with some recorded episodes; raise `Refused` for what is not acceptable."""
+        """Return the result, with some recorded episodes; raise `Refused` if it is not acceptable."""
         from lag_envs.leaderboard.alike import check_twins
         from lag_envs.leaderboard.submission import Refused, load
         from lag_envs.leaderboard.verify import verify
@@ -42,12 +42,12 @@ class Check:
             raise Refused("its files are not those that were added")
         check_twins(submission, nonce)
         result = verify(submission, nonce, protocol.EPISODES, progress)
-        # What the board cannot keep fails here, and costs nobody else.
+        # A result that the board cannot keep fails here, without harm to the others.
         return check(result | {"claimed": claimed(submission), "replays": replays(submission, result)})
 
 
 def claimed(submission: About) -> dict[str, Any]:
-    """Return what a submission says of itself, which nobody verified."""
+    """Return a submission's statements about itself, which nobody verified."""
     training = submission.training
     return {
         "code": submission.code or None,
@@ -64,7 +64,7 @@ def claimed(submission: About) -> dict[str, Any]:
 
 
 def replays(submission: Submission, result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the median, the best and the worst episode of the policy in the middle, recorded."""
+    """Return recordings of the median policy's median, best and worst episode."""
     from lag_envs.leaderboard.verify import replay
 
     policy, chosen = shown_episodes(result)
@@ -73,7 +73,7 @@ def replays(submission: Submission, result: dict[str, Any]) -> list[dict[str, An
 
 
 def shown_episodes(result: Mapping[str, Any]) -> tuple[int, dict[str, int]]:
-    """Return the number of the policy in the middle, and those of its median, best and worst episode."""
+    """Return the number of the median policy, and those of its median, best and worst episode."""
     import numpy as np
 
     returns = np.array([policy["returns"] for policy in result["policies"]])
@@ -89,23 +89,23 @@ def finish(
     parallel_map: Callable[..., Iterator[tuple[Path, Any]]] | None = None,
     tell: Callable[[Entry, str], Any] = lambda entry, what: None,
 ) -> int:
-    """Verify what is pending and has a nonce.
+    """Verify all pending submissions that have a nonce.
 
     Parameters
     ----------
     board : Board
         The board.
     only : sequence of str, optional
-        The ids that may be verified; by default all.
+        Ids that may be verified; all by default.
     parallel_map : callable, optional
-        Like `map_submissions`, with all but its first two arguments given; by default one after the other.
+        Like `map_submissions` with all but its first two arguments given; one after the other by default.
     tell : callable
-        Told each entry and what became of it.
+        Called with each entry and its outcome.
 
     Returns
     -------
     int
-        How many could not be verified for a reason that is not their own; they stay pending.
+        How many could not be verified through no fault of their own; they stay pending.
     """
     from lag_envs.leaderboard.parallel import map_submissions
     from lag_envs.leaderboard.submission import Refused
@@ -122,7 +122,7 @@ def finish(
             if reason := closed(entry.env, entry.protocol, state.number):
                 board.rejected(entry.id, f"its board closed before it was verified: {reason}")
             elif not claims.enter_context(board.claimed(entry.id)):
-                tell(entry, "another process is at it")
+                tell(entry, "another process is verifying it")
                 continue
             else:
                 state = board.read()  # another process may just have finished it
@@ -166,7 +166,7 @@ class Neighbours:
         self._likeness: dict[tuple[str, str], Any] = {}
 
     def alike(self, entry: Entry, result: Mapping[str, Any], other: Entry) -> Alike | None:
-        """Return how near another submission is to one that was just verified; None where they are apart."""
+        """Return how near another submission is to one that was just verified; None if they are not alike."""
         from lag_envs.leaderboard.alike import Likeness
         from lag_envs.leaderboard.ranking import policy_error
 

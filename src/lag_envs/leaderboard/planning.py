@@ -1,4 +1,4 @@
-"""Planning ahead on the exact model, as numbers."""
+"""Model-predictive control: planning ahead on the exact model, with numbers from the table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Weight = Annotated[float, between(0.0, 1e6)]
 
 
 class MPCTable(PolicyTable):
-    """The table of one that plans ahead."""
+    """The table ``[policy]`` of a planner."""
 
     horizon: Annotated[int, between(2, protocol.HORIZON)]
     every: Annotated[int, between(1, protocol.HORIZON)] = 1
@@ -36,13 +36,13 @@ class MPCTable(PolicyTable):
 
 
 class PlanAhead(Architecture):
-    """Model-predictive control: `lag_envs.controllers.mpc.MPC` with these numbers.
+    """Model-predictive control: `lag_envs.controllers.mpc.MPC` with the table's numbers.
 
-    In the table: `horizon` (steps), `every` (steps after which a plan is renewed), `iterations` (of iLQR for
-    that), `guesses` and `budget` (plans that a search improves, and the steps of the model that it may take),
-    `pause` (steps from one search to the next) and `good` (cost of the end above which there is another
-    search; without it there is one), `seed` (of the guesses); and the tables `weights` and `rest`, by entry
-    of the state: what the square of the distance from the rest costs at the end. There are no arrays.
+    In the table: `horizon` (steps); `every` (steps between new plans); `iterations` (of iLQR for each);
+    `guesses` and `budget` (plans that a search improves, and its limit of model steps); `pause` (steps
+    between searches); `good` (a final cost above which another search follows; without it there is only one);
+    `seed` (of the guesses); and the tables `weights` and `rest`, by entry of the state: the final cost of the
+    squared distance from rest. There are no arrays.
     """
 
     table = MPCTable
@@ -64,7 +64,7 @@ class PlanAhead(Architecture):
         steps = table.horizon * (1 + len(SHARES) * table.iterations) / min(table.every, table.horizon)
         if steps > protocol.MODEL_STEPS:
             raise Refused(
-                f"{POLICY}: renewing plans takes {steps:.0f} steps of the model for one of the environment, "
+                f"{POLICY}: renewing plans takes {steps:.0f} steps of the model per step of the environment, "
                 f"at most {protocol.MODEL_STEPS} are allowed; plan less far, or less often"
             )
         self.numbers = table.model_dump(exclude={"architecture", "weights", "rest"}, exclude_none=True)
@@ -72,5 +72,5 @@ class PlanAhead(Architecture):
         self.arrays = {}
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
-        """Return what plans, with nothing planned yet."""
+        """Return a planner without a plan yet."""
         return MPC(self.task, self.tail, **self.numbers)

@@ -1,4 +1,4 @@
-"""The closed list of architectures of a submission: data in, actions out, with Stable-Baselines3's `predict`.
+"""The closed list of a submission's architectures: data in, actions out, with Stable-Baselines3's `predict`.
 
 =============  ===================================================================================
 architecture   what it is
@@ -6,13 +6,13 @@ architecture   what it is
 ``mlp``        a network of fully connected layers, which may see the last few observations
 ``gru``        a network with a memory: a gated recurrent unit
 ``linear``     action = gain · observation + offset, clipped
-``plan``       states, actions and a gain for each step, and what holds in the end
+``plan``       states, actions and a gain for each step, and feedback to hold the end
 ``table``      actions over a grid, or values over a grid that are looked up one step ahead
-``mpc``        plans ahead on the exact model: horizon, weights of the end, budget of model steps
+``mpc``        plans ahead on the exact model: horizon, terminal weights, budget of model steps
 ``controller`` one of `lag_envs.controllers`, with numbers
 =============  ===================================================================================
 
-An architecture is made from the table ``[policy]`` of ``submission.toml``. It tells which arrays it needs,
+An architecture is made from the table ``[policy]`` of ``submission.toml``. It states which arrays it needs
 and makes a policy from them.
 """
 
@@ -55,12 +55,12 @@ class Policy:
     arrays: Mapping[str, Array]
 
     def agent(self) -> Any:
-        """Return what acts, with the `predict` of Stable-Baselines3, and nothing yet to remember or draw.
+        """Return a fresh agent, with the `predict` of Stable-Baselines3.
 
         Raises
         ------
         Refused
-            Where the arrays' values do not fit.
+            If the arrays' values do not fit.
         """
         return self.architecture.agent(self.arrays)
 
@@ -75,7 +75,7 @@ def architecture(env_id: str, table: Mapping[str, Any]) -> Architecture:
     return kind(env_id, accepted(kind.table, dict(table), POLICY))
 
 
-#: Numbers of controllers that plan by which the planning gets longer.
+#: Numbers of controllers that make planning slower.
 PLANS = ("opening", "periods")
 
 
@@ -89,8 +89,8 @@ class ControllerTable(PolicyTable):
 class Controller(Architecture):
     """A controller of `lag_envs.controllers`, made for the undisturbed environment.
 
-    In the table: `name`, one of the controllers of the task, and the table ``numbers`` of its
-    keyword arguments that are numbers, optional. There are no arrays.
+    In the table: `name`, one of the task's controllers, and optionally the table ``numbers`` of its numeric
+    keyword arguments. There are no arrays.
     """
 
     table = ControllerTable
@@ -122,7 +122,7 @@ class Controller(Architecture):
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return self.build(**self.numbers)
-        except Exception as error:  # whatever nonsensical numbers cause
+        except Exception as error:  # nonsensical numbers may raise anything
             reason = shown(f"{type(error).__name__}: {error}")
             raise Refused(f"the controller cannot be made with these numbers: {reason}") from error
 

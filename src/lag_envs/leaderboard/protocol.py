@@ -1,7 +1,7 @@
-"""What a score on the leaderboard means: how many episodes, seeds, the reference, and limits of a submission.
+"""The meaning of a score on the leaderboard: episodes, seeds, the reference, and limits of a submission.
 
-A board freezes this, with the scale, when a protocol begins (`rules`); where something of it changes, the
-board has to begin the next one.
+A board freezes all this, with the scale, when a protocol begins (`rules`); if any of it changes, the board
+has to begin the next protocol.
 """
 
 from __future__ import annotations
@@ -12,24 +12,25 @@ from typing import Any, NamedTuple
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.measured import measured
 
-#: Newest version of ``submission.toml``. What an older one says, it says in every later one too.
+#: Newest version of ``submission.toml``. Each version keeps the meaning of the older ones.
 SCHEMA = 2
-#: Episodes of each policy, and those under each disturbance.
+#: Episodes of each policy, without and with each disturbance.
 EPISODES, DISTURBED_EPISODES = 1000, 100
-#: Policies that a learner submits at least, one per training seed; and that anyone submits at most.
+#: Policies that a learner must submit, one per training seed; and that anyone may submit.
 LEARNED_POLICIES, MOST_POLICIES = 5, 20
-#: How far returns may lie apart on two builds, relative to the way from random to best known. Libraries round
-#: the last digit of tanh differently, and that may grow in the course of an episode.
+#: How far returns may differ between two builds, relative to the distance from random to best known.
+#: Libraries round the last digit of tanh differently, and the difference may grow in the course of an
+#: episode.
 TOLERANCE = 1e-3
-#: The same for one who plans: where a rounding decides between two steps of its search, all that follows is
-#: another plan, nearly as good, and so each of its episodes may be another one.
+#: The same for a planner: if rounding decides between two steps of its search, it follows another plan from
+#: there, nearly as good, and so each of its episodes may differ.
 PLANNED = 1e-2
-#: Share of episodes that may lie further apart than that: where a rounding decides, all else may follow.
+#: Share of episodes that may differ by more than that: if rounding decides, all that follows may differ.
 APART = 0.01
 
 
 class Refused(Exception):
-    """A submission that is not accepted; the text says why, and is safe to print."""
+    """A submission was refused; the text says why, and is safe to print."""
 
 
 # --- limits of a submission ---------------------------------------------------------------------------------
@@ -38,16 +39,16 @@ class Refused(Exception):
 TOML_BYTES, POLICY_BYTES, FOLDER_BYTES, LINE = 65_536, 4_194_304, 16_777_216, 1_000
 #: Bytes of the header of a safetensors file.
 HEADER_BYTES = 16_384
-#: Hidden layers, their width, and numbers of a network.
+#: Hidden layers, their width, and parameters of a network.
 LAYERS, WIDTH, NUMBERS = 8, 1_024, 131_072
-#: Observations that a network sees at once, and numbers that a recurrent one remembers.
+#: Observations that a network sees at once, and the size of a recurrent one's memory.
 FRAMES, MEMORY = 64, 256
-#: Numbers of all networks of a submission, and CPU time of a verification [s].
+#: Parameters of all networks of a submission, and CPU time of a verification [s].
 ALL_NUMBERS, CPU_SECONDS = 1_048_576, 3_600.0
-#: Numbers nearer to 0 count as 0: arithmetic with subnormal ones takes fifty times as long.
+#: Numbers nearer to 0 count as 0: arithmetic with subnormal numbers is fifty times slower.
 TINY = 1e-150
-#: Steps that one who plans looks ahead, and steps of the model that it may take: for one of the environment,
-#: searches left out, and for a search.
+#: Steps that a planner looks ahead, and model steps that it may take: per step of the environment, without
+#: searches, and per search.
 HORIZON, MODEL_STEPS, SEARCH_STEPS = 250, 10_000, 1_000_000
 #: Points of a learning curve.
 CURVE = 200
@@ -57,10 +58,10 @@ CURVE = 200
 
 
 def first_seed(digest: str, nonce: str, policy: int) -> int:
-    """Return the reset seed of a policy's first episode; episode i has the i-th after it.
+    """Return the reset seed of a policy's first episode; the others count on from it.
 
-    Nobody can train on them: they follow from the submission's own bytes and from a nonce that is published
-    later.
+    Nobody can train on these seeds: they follow from the submission's own bytes and from a nonce that is
+    published later.
 
     Parameters
     ----------
@@ -80,16 +81,16 @@ def first_seed(digest: str, nonce: str, policy: int) -> int:
 
 
 class Reference(NamedTuple):
-    """A quick controller that plays the episodes of a verification too, see `ranking.corrected`.
+    """A quick controller that plays a verification's episodes too, see `ranking.corrected`.
 
     Parameters
     ----------
     controller : str
         Name of the task's controller.
     mean, error : float
-        Its mean return in other episodes, and the standard error of that.
+        Its mean return in other episodes, and that mean's standard error.
     episodes : int
-        How many these were.
+        The number of those episodes.
     """
 
     controller: str
@@ -99,7 +100,7 @@ class Reference(NamedTuple):
 
 
 def reference(env_id: str) -> Reference | None:
-    """Return an environment's reference; None where episodes differ little, or nobody measured it."""
+    """Return an environment's reference; None if its episodes differ little, or nobody measured it."""
     name, found = TASKS[env_id].reference, measured(env_id).get("reference")
     return Reference(name, **found) if name and found else None
 
@@ -113,7 +114,7 @@ def boards() -> list[str]:
 
 
 def rules() -> dict[str, Any]:
-    """Return what a verification is here and now, in JSON types."""
+    """Return the current rules of a verification, in JSON types."""
     return {
         "episodes": EPISODES,
         "disturbed_episodes": DISTURBED_EPISODES,

@@ -1,22 +1,22 @@
-"""Statistics of verified results: scores with intervals, ranks, and the other columns of a board.
+"""Statistics of verified results: scores with intervals, ranks, and a board's other columns.
 
-What is drawn anew
-------------------
-A row holds the scores of its policies in their episodes, shape (policies, episodes), without the luck of the
-episodes (`corrected`). A policy's result is its mean over the episodes, and the row's score is the
-interquartile mean (IQM) over the policies, as rliable has it for one task [1]_. Intervals are percentile
+What is resampled
+-----------------
+A row holds the scores of its policies in their episodes, shape (policies, episodes), corrected for the luck
+of the episodes (`corrected`). A policy's result is its mean over the episodes, and the row's score is the
+interquartile mean (IQM) over the policies, as in rliable for one task [1]_. Intervals are percentile
 bootstrap intervals of 95 %:
 
-- A row of several policies is a sample of training seeds: these are drawn anew, within the row (the stratum),
-  each with its mean as it is.
-- A row of one policy, such as a deterministic controller, has no spread of training: its episodes are drawn
-  anew. The interval tells how well the mean is known, and nothing about training.
-- What luck was measured with has a mean that is known only so well. Each sample therefore has another one,
-  drawn from a normal distribution: the same for all rows, since it moves all of them together, each as far as
-  it was corrected (`slope`). The reference itself is moved all the way: what is left of it is that mean, of
-  other episodes, with its standard error.
+- Several policies in a row are a sample of training seeds: they are resampled within the row (the
+  stratum), each with its mean fixed.
+- A row of one policy, such as a deterministic controller, has no spread of training: its episodes are
+  resampled. The interval tells how well the mean is known, and nothing about training.
+- The reference that measures luck has a mean that is itself uncertain. Each bootstrap sample therefore draws
+  another mean from a normal distribution. The same one is used for all rows, since an error moves them all
+  together, each as far as it was corrected (`slope`). The reference's own row is moved all the way: after
+  the correction, nothing is left of it but that mean, of other episodes, with its standard error.
 
-Each row draws from a generator seeded by its id, so a row's numbers do not depend on which others are there.
+Each row's generator is seeded by its id, so a row's numbers do not depend on the other rows.
 
 References
 ----------
@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 
 
 class Reference(Protocol):
-    """The mean return of the controller that plays everybody's episodes."""
+    """The mean return of the controller that plays everybody's episodes, and its standard error."""
 
     @property
     def mean(self) -> float:
@@ -65,7 +65,7 @@ class Reference(Protocol):
 
 
 class Chance(NamedTuple):
-    """Probability that a policy of one row does better than one of another, and its interval."""
+    """Probability that a policy of one row does better than one of another row, with its interval."""
 
     value: float
     low: float
@@ -85,9 +85,9 @@ class Place(NamedTuple):
     id : str
         The row.
     rank : int
-        From 1; rows between which nothing is decided share one, and the next rank counts them all.
+        From 1; rows that are not clearly different share one, and the next rank counts them all.
     above : Chance or None
-        Of the row above to do better than this one; None for the first.
+        Probability that the row above does better than this one; None for the first.
     """
 
     id: str
@@ -96,26 +96,26 @@ class Place(NamedTuple):
 
 
 def slope(policies: Sequence[Mapping[str, Any]]) -> float:
-    """Return by how much policies' returns go with the reference's in the same episodes; 0 without one."""
+    """Return the slope of policies' returns over the reference's in the same episodes; 0 without one."""
     if any(p.get("reference") is None for p in policies):
         return 0.0
     return luck_slope([p["returns"] for p in policies], [p["reference"] for p in policies])
 
 
 def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Array:
-    """Return the returns of verified policies without the luck of their episodes, shape (policies, episodes).
+    """Return verified policies' returns without the luck of their episodes, shape (policies, episodes).
 
-    Every submission has episodes of its own, and in some environments they differ more than agents do. So the
-    environment's reference, whose mean return is known, has played the same ones: what it got above that is
-    taken off, times the slope of the agent's returns over the reference's (a control variate; the mean stays
-    what it is in the long run, and an agent that has nothing in common with the reference keeps its returns).
+    Every submission has its own episodes, and in some environments episodes differ more than agents do. So
+    the environment's reference, whose mean return is known, has played the same ones. Its excess over that
+    mean, times the slope of the agent's returns over the reference's, is subtracted (a control variate: the
+    agent's expected return stays the same, and an agent uncorrelated with the reference keeps its returns).
 
     Parameters
     ----------
     reference : Reference or None
         The environment's reference; None for one that has none.
     policies : sequence of mapping
-        What was verified of each policy: ``returns`` and, where the environment has one, ``reference``.
+        The verified data of each policy: ``returns`` and, if the environment has one, ``reference``.
     """
     returns = np.array([p["returns"] for p in policies], np.float64)
     along = slope(policies) if reference is not None else 0.0
@@ -125,14 +125,14 @@ def corrected(reference: Reference | None, policies: Sequence[Mapping[str, Any]]
 
 
 class Scores(NamedTuple):
-    """What a row is ranked by.
+    """The scores that rank a row.
 
     Attributes
     ----------
     table : ndarray, shape (policies, episodes)
-        Scores without luck.
+        Scores corrected for luck.
     error : float
-        Standard error of the reference's mean, as far as it moves this row, as a score.
+        Standard error of the reference's mean, scaled to its effect on this row's score.
     """
 
     table: Array
@@ -140,12 +140,12 @@ class Scores(NamedTuple):
 
     @property
     def own(self) -> bool:
-        """Whether the row is the reference itself, or acts as it does: nothing of its episodes is left."""
+        """Whether the row is the reference itself, or acts like it: its own episodes cancel out."""
         return self.error > 0.0 and float(self.table.std()) < 1e-9
 
 
 def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> Scores:
-    """Return the scores of verified policies, from what was verified of each, see `corrected`."""
+    """Return the scores of verified policies, see `corrected`."""
     table = normalised(scale, corrected(reference, policies))
     if reference is None:
         return Scores(table)
@@ -153,7 +153,7 @@ def scored(scale: Scale, reference: Reference | None, policies: Sequence[Mapping
 
 
 def policy_error(reference: Reference | None, policies: Sequence[Mapping[str, Any]]) -> float:
-    """Return the standard error of a policy's mean return without luck, on the mean over the policies."""
+    """Return the standard error of a policy's corrected mean return, averaged over the policies."""
     table = corrected(reference, policies)
     error = 0.0 if reference is None else slope(policies) * reference.error
     return float(np.hypot(table.std(axis=1).mean() / np.sqrt(table.shape[1]), error))
@@ -174,37 +174,37 @@ def redrawn(id: str, scores: Scores) -> Array:
     sample = table.mean(axis=1) if len(table) > 1 else table[0]
     drawn = redraw(rng, sample)
     drawn = drawn if len(table) > 1 else drawn.mean(axis=1, keepdims=True)
-    # In every row's k-th sample the reference's mean is off by the same.
+    # All rows share the k-th sample's error of the reference's mean.
     return drawn + scores.error * np.random.default_rng(0).normal(size=(RESAMPLES, 1))
 
 
 def compare(x: Scores, y: Scores, x_drawn: Array, y_drawn: Array) -> Chance:
-    """Return the probability that a policy of one row does better than one of another.
+    """Return the probability that a policy of one row does better than one of another row.
 
     Parameters
     ----------
     x, y : Scores
         Scores of the two rows.
     x_drawn, y_drawn : ndarray, shapes (RESAMPLES, policies)
-        What `redrawn` made of them.
+        Their samples from `redrawn`.
     """
     value = improvement(x.table.mean(axis=1), y.table.mean(axis=1))
     return Chance(float(value), *ends(improvement(x_drawn, y_drawn)))
 
 
 def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Place]:
-    """Return the rows in the order of their scores, with their ranks.
+    """Return the rows sorted by score, with their ranks.
 
-    A row shares the rank of the row above where the interval of the probability that the one above does
-    better contains one half. Sharing goes on from row to row: the first and the last of those who share a
-    rank may well be apart.
+    A row shares the rank of the row above if one half lies in the interval of the probability that the row
+    above does better. Ties are passed on from row to row, so the first and the last row of one rank may well
+    be clearly different.
 
     Parameters
     ----------
     scores : mapping of str to Scores
         Scores of each row, by its id.
     drawn : mapping of str to ndarray, shape (RESAMPLES, policies)
-        What `redrawn` made of them.
+        Their samples from `redrawn`.
     """
     order = sorted(scores, key=lambda id: (-float(iqm(scores[id].table.mean(axis=1))), id))
     places: list[Place] = []
@@ -220,20 +220,20 @@ def ranked(scores: Mapping[str, Scores], drawn: Mapping[str, Array]) -> list[Pla
 
 
 def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scores: Scores) -> dict[str, Any]:
-    """Return the numbers of a row that need no other row, but for the interval of its score.
+    """Return a row's columns that need no other row, except the interval of its score.
 
     Parameters
     ----------
     env_id : str
         The environment.
     result : mapping
-        What was verified.
+        The verified result.
     few : int
-        In how many episodes, the first ones, conditions were changed.
+        Number of episodes under changed conditions: the first ones.
     scale : Scale
         The environment's.
     scores : Scores
-        What `scored` made of it.
+        The result's scores, from `scored`.
 
     Returns
     -------
@@ -241,7 +241,7 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
         ``score``, mean ``return``, optimality ``gap``, ``success`` with Wilson's interval over all episodes
         of all policies, ``settle``: the median time [s], ``effort``: the mean, ``robustness``: the score
         under each changed condition, ``often``: the score when acting ten times as often, ``profile``: pairs
-        of a score and the share of episodes above it, luck and all. None for what was not measured.
+        of a score and the share of episodes above it, not corrected for luck. None for anything not measured.
     """
     policies = result["policies"]
     bare = np.array([p["returns"] for p in policies], np.float64)
@@ -252,10 +252,10 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
     if success:
         low, high = wilson(sum(success), len(success))
         counted = {"rate": sum(success) / len(success), "low": low, "high": high}
-    # Disturbed are the first episodes only: what sets these apart from all is not the disturbance's doing.
+    # Only the first episodes are disturbed: subtract how these differ from all anyway.
     moved = means - normalised(scale, bare[:, :few].mean(axis=1))
     robustness = {name: _score(scale, each, moved) for name, each in (result.get("robustness") or {}).items()}
-    # Where there are kicks, they are others when acting often.
+    # With random kicks, acting more often draws different ones.
     often = 0.0 * moved if env_id in TASKS and TASKS[env_id]().draws else moved
     return {
         "score": float(iqm(means)),
@@ -271,12 +271,12 @@ def columns(env_id: str, result: Mapping[str, Any], few: int, scale: Scale, scor
 
 
 def pooled(policies: Sequence[Mapping[str, Any]], name: str) -> list[Any]:
-    """Return what was noted of every episode of every policy; nothing where it is not defined."""
+    """Return a quantity over all episodes of all policies; empty if it is not defined."""
     return [value for p in policies for value in (p.get(name) or [])]
 
 
 def _score(scale: Scale, returns: Sequence[float | None] | None, moved: Array) -> float | None:
-    """Return the score of policies' mean returns, moved; None where one could not take part."""
+    """Return the score of policies' mean returns, shifted; None if one of them could not take part."""
     if not returns or None in returns:
         return None
     return float(iqm(normalised(scale, np.array(returns, np.float64)) + moved))

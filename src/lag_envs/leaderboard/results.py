@@ -1,4 +1,4 @@
-"""What a verification found, as it is kept: its schema, and how two of them compare."""
+"""A verification's result as it is stored: its schema, and how two of them compare."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lag_envs.leaderboard import protocol
 from lag_envs.leaderboard.fields import Strict, checked, plain
 from lag_envs.leaderboard.log import EnvId, Hash, Number, Text, load_json
 
-#: Bytes of a result, packed and unpacked.
+#: Largest result [bytes], packed and unpacked.
 PACKED, UNPACKED = 2**25, 2**28
 Count = Annotated[int, Field(ge=0, le=2**63)]
 
@@ -63,7 +63,7 @@ class Curve(Strict):
 
 
 class Claimed(Strict):
-    """What a submission says of itself, which nobody verified."""
+    """A submission's statements about itself, which nobody verified."""
 
     code: Text | None
     license: Text
@@ -77,7 +77,7 @@ class Claimed(Strict):
 class Result(Strict):
     """What `verify` returns; on a board with `claimed` and `replays`."""
 
-    protocol: Count | None = None  # of old results; the log has it
+    protocol: Count | None = None  # only in old results; otherwise the log has it
     env: EnvId
     digest: Hash
     nonce: str
@@ -108,19 +108,19 @@ _RESULT: TypeAdapter[Result] = TypeAdapter(Result)
 
 
 def check(result: Any) -> dict[str, Any]:
-    """Return a result that is as it should be; raise a ValueError otherwise."""
+    """Return a valid result; raise a ValueError otherwise."""
     checked(_RESULT, result)
     return result
 
 
 def unpacked(content: bytes) -> dict[str, Any]:
-    """Return the result that a file holds; raise a ValueError for what is none."""
+    """Return the result in a file; raise a ValueError if it is not one."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(content)) as file:
             text = file.read(UNPACKED + 1)
     except (OSError, EOFError, ValueError) as error:
         raise ValueError(f"it cannot be unpacked: {error}") from None
-    except Exception as error:  # zlib's own
+    except Exception as error:  # zlib's own errors
         raise ValueError(f"it cannot be unpacked: {type(error).__name__}: {error}") from None
     if len(text) > UNPACKED:
         raise ValueError(f"it unpacks to more than {UNPACKED:,} bytes")
@@ -154,7 +154,7 @@ _VALUE: TypeAdapter[Value] = TypeAdapter(Value)
 
 
 def checked_value(content: bytes) -> dict[str, Any]:
-    """Return the value function that a file holds; raise a ValueError for what is none."""
+    """Return the value function in a file; raise a ValueError if it is not one."""
     value = load_json(content)
     checked(_VALUE, value)
     return value
@@ -162,7 +162,7 @@ def checked_value(content: bytes) -> dict[str, Any]:
 
 @cache
 def build() -> str:
-    """Return the SHA-256 of this package's code: of another build, bits may differ."""
+    """Return the SHA-256 of this package's code: another build may give other bits."""
     root, total = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py"), key=lambda path: path.relative_to(root).as_posix()):
         content = path.read_bytes().replace(b"\r\n", b"\n")
@@ -174,18 +174,18 @@ def build() -> str:
 
 
 class Comparison(NamedTuple):
-    """How two verifications of the same submission compare.
+    """How two verifications of the same submission differ.
 
     Parameters
     ----------
     same : bool
         Whether every action, reward and end was the same, to the bit, and all means under disturbances.
     build : bool
-        Whether they are of the same build on the same kind of processor, so that they have to be.
+        Whether both are of the same build on the same kind of processor, so that the bits must agree.
     difference : float
-        The largest difference of a policy's mean return, relative to the way from random to best known.
+        The largest difference of a policy's mean return, relative to the distance from random to best known.
     far : list of str
-        What is further apart than it may be, in words; empty where they agree.
+        Differences beyond the tolerance, in words; empty if there are none.
     """
 
     same: bool
@@ -202,16 +202,16 @@ def compare(
     Parameters
     ----------
     result, other : mapping
-        What `verify` returned.
+        Results of `verify`.
     way : float
-        From the mean return of random actions to that of the best policy known.
+        Best known mean return minus that of random actions.
     plans : bool
-        Whether it searches for a plan in each episode, see `protocol.PLANNED`.
+        Whether the policy searches for a plan in each episode, see `protocol.PLANNED`.
 
     Raises
     ------
     ValueError
-        Where they are not of the same submission, nonce and episodes.
+        If they differ in submission, nonce or episodes.
     """
     for name in ("env", "digest", "nonce", "episodes"):
         if result[name] != other[name]:
@@ -227,7 +227,7 @@ def compare(
         for name, share in apart(a, b, way, plans).items():
             if share > protocol.APART:
                 far.append(f"the {name} of {share:.1%} of the episodes of seed {a['seed']}")
-    # One episode of a hundred may be another one altogether.
+    # One episode in a hundred may differ altogether.
     tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
     few = tolerance * max(1.0, result["episodes"] / protocol.DISTURBED_EPISODES)
     conditions = {**result["robustness"], "acting often": result["often"]}
@@ -254,8 +254,8 @@ def apart(
 ) -> dict[str, float]:
     """Return the share of episodes that differ in their returns, success, times and efforts.
 
-    Another plan that is as good takes another time and effort: of one who plans the means are compared, and
-    the share is 0 or 1.
+    A planner may find another plan, equally good, with another time and effort. So only its means are
+    compared, and the share is 0 or 1.
     """
     tolerance = protocol.PLANNED if plans else protocol.TOLERANCE
 
@@ -270,7 +270,7 @@ def apart(
         if not plans or a is None or b is None or len(a) != len(b):
             return share(name, most)
         differences = [x - y for x, y in zip(a, b, strict=True) if x is not None and y is not None]
-        # Of few episodes one may be another one altogether.
+        # Of few episodes, one may differ altogether.
         most *= max(1.0, protocol.DISTURBED_EPISODES / max(1, len(differences)))
         return float(bool(differences) and abs(np.mean(differences)) > most)
 

@@ -1,8 +1,8 @@
-"""The policies that come with the package: for each environment the best on the board, as data.
+"""The policies that come with the package: the board's best for each environment, as data.
 
 ``python -m lag_envs.leaderboard.shipped`` chooses them from a clone's board and writes them beside this file.
-Together they have at most `MOST` bytes; where the best of all would be larger, those give way by which least
-is lost. Controllers are in the package anyway.
+Together they have at most `MOST` bytes; if the best ones are larger, some are replaced by smaller ones, so
+that the least score per byte is lost. Controllers are in the package anyway.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Shipped(NamedTuple):
     name : str
         Its name on the board.
     score : float
-        What it was verified to score there.
+        Its verified score on the board.
     submission : str
         The submission's id.
     seed : int
-        Which of its policies.
+        The policy's training seed.
     policy : mapping
         The table ``[policy]`` of its ``submission.toml``.
     """
@@ -48,7 +48,7 @@ class Shipped(NamedTuple):
 
 
 def shipped(folder: Path = FOLDER) -> dict[str, Shipped]:
-    """Return what comes with the package, by environment."""
+    """Return the shipped policies, by environment."""
     found = json.loads((folder / INDEX).read_text(encoding="utf-8"))
     return {env_id: Shipped(**entry) for env_id, entry in found.items()}
 
@@ -100,7 +100,7 @@ def candidates(board: Any) -> list[Candidate]:
 
 
 def chosen(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
-    """Return the best for each environment, or what loses least where these are too large together.
+    """Return the best for each environment; if they are too large together, replace those that lose least.
 
     Examples
     --------
@@ -125,7 +125,7 @@ def chosen(of: Iterable[Candidate], most: int = MOST) -> dict[str, Candidate]:
 
 
 def ship(board: Any, folder: Path = FOLDER) -> dict[str, Shipped]:
-    """Write the policies of a board that are to come with the package, and return what they are."""
+    """Write a board's policies to ship with the package; return them."""
     import tomllib
 
     from lag_envs.tasks import TASKS

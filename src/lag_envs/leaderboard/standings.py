@@ -1,4 +1,4 @@
-"""What page and tables show of a board: its rows with scores and ranks, and what is known beside them."""
+"""The data of page and tables: a board's rows with scores and ranks, and facts about the environment."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def page_data(board: Board) -> dict[str, Any]:
-    """Return what `board_data` does, with what only the page needs: agents that run there, drives by hand."""
+    """Return `board_data` and what only the page needs: agents that run there, drives by hand."""
     from lag_envs.leaderboard.drives import best_drives
     from lag_envs.leaderboard.site.driving import agent
     from lag_envs.leaderboard.submission import load
@@ -38,25 +38,25 @@ def page_data(board: Board) -> dict[str, Any]:
 
 
 def board_data(board: Board, made: str | None = None) -> dict[str, Any]:
-    """Return all that page and tables show.
+    """Return all data that page and tables show.
 
     Parameters
     ----------
     board : Board
         The board.
     made : str, optional
-        The date to note; by default today's.
+        The date to state; by default today's.
 
     Returns
     -------
     dict
-        JSON types. ``environments`` has every environment, with its ``rows`` in order, and after them the
-        frozen boards; ``combined`` has what `combined.combined` makes of the open ones.
+        JSON types. ``environments`` has every environment, with its ``rows`` in order, followed by the frozen
+        boards; ``combined`` has the result of `combined.combined` for the open ones.
 
     Raises
     ------
     BoardError
-        Where something on the board is not as it was noted, see `audit.sound`.
+        If something on the board is not as it was logged, see `audit.sound`.
     """
     from lag_envs.evaluation.statistics import rounded
     from lag_envs.leaderboard.audit import sound
@@ -86,7 +86,7 @@ def _environment(
     number: int,
     reached: dict[Agent, Result],
 ) -> dict[str, Any]:
-    """Return a board, and note what the ranked agents reached on it."""
+    """Return a board, and note the results of its ranked agents."""
     from lag_envs.evaluation.statistics import ends, iqm, rounded
     from lag_envs.leaderboard import ranking
     from lag_envs.leaderboard.combined import Agent, Result
@@ -102,7 +102,7 @@ def _environment(
         scores = {id: ranking.scored(scale, reference, r["policies"]) for id, r in found.items()}
         drawn = {id: ranking.redrawn(id, each) for id, each in scores.items()}
         first = {id: state.first(entries[id]) for id in found}
-        # Who acts like an earlier one is shown, but neither ranked nor anybody's neighbour.
+        # Rows that act like an earlier one are shown, but not ranked, and nobody is compared with them.
         places = ranking.ranked({id: each for id, each in scores.items() if first[id] is None}, drawn)
         ranks = {place.id: place for place in places}
         for id in sorted(scores, key=lambda id: -float(iqm(scores[id].table.mean(axis=1)))):
@@ -140,7 +140,7 @@ def _environment(
             row["replays"] = [
                 replay | {"t0": 0.0, "score": float(normalised(scale, replay["return"]))}
                 for replay in result["replays"]
-                # Under protocol 1 those of random actions were other ones.
+                # Under protocol 1, the episodes of random actions were different ones.
                 if abs(replay["return"] - verified[replay["label"]]) <= 1e-3 * (scale.best - scale.random)
             ]
             rows.append(rounded(row))
@@ -161,7 +161,7 @@ def _environment(
 
 
 def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
-    """Return what is known of an environment's returns: frozen with the protocol, where there is one."""
+    """Return the known returns of an environment: those frozen with the protocol, if there is one."""
     found = known_returns(env_id)
     known = found and found._asdict()
     if scale is None:
@@ -170,7 +170,7 @@ def _known(env_id: str, scale: Any) -> dict[str, Any] | None:
 
 
 def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
-    """Return the earlier author or name, of others, that an entry's can be taken for; empty for none."""
+    """Return another's earlier author or name that looks like this entry's; empty if there is none."""
     from lag_envs.leaderboard.names import lookalike
 
     earlier = [e for e in entries if e.line < entry.line and set(e.authors).isdisjoint(entry.authors)]
@@ -182,7 +182,7 @@ def _looks_like(entry: Entry, entries: Iterable[Entry]) -> str:
 
 
 def _value(path: Path) -> dict[str, Any] | None:
-    """Return a value function for the page; None where there is none."""
+    """Return a value function for the page; None if there is none."""
     try:
         return checked_value(read_plain(path, PACKED))
     except FileNotFoundError:

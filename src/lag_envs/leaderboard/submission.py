@@ -1,7 +1,7 @@
 """Read and write a submission: a folder with ``submission.toml`` and arrays. Nothing in it is ever run.
 
-Reading goes from the outside inward: which files there are and how large, then the text, then the header of
-each file of arrays, and only then the arrays. What is refused is refused before more is read.
+Reading goes from the outside in: first the names and sizes of the files, then the text, then the header of
+each file of arrays, and only then the arrays. Bad input is refused before more is read.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from lag_envs.leaderboard.protocol import Refused
 __all__ = ["About", "Refused", "Submission", "about", "digest_of", "load", "read_files", "write"]
 
 TOML = "submission.toml"
-#: Training seeds lie below this.
+#: Upper limit of training seeds.
 MOST_SEED = 10**9
 POLICY = re.compile(r"policy_(0|[1-9][0-9]{0,8})\.safetensors")
 
 
 @dataclass(frozen=True, kw_only=True)
 class About:
-    """What ``submission.toml`` says, checked.
+    """The contents of ``submission.toml``, checked.
 
     Parameters
     ----------
     env, name, license : str
-        As it says.
+        As in the file.
     kind : str
-        "learned", "controller" or "optimal", as follows from the architecture.
+        "learned", "controller" or "optimal"; follows from the architecture.
     authors : tuple of str
         Who made it.
     digest : str
-        SHA-256 of names and contents of the folder's files.
+        SHA-256 of the names and contents of the folder's files.
     seeds : tuple of int
-        Training seeds of the policies, growing; (0,) for a built-in controller.
+        Training seeds of the policies, increasing; (0,) for a built-in controller.
     architecture : Architecture
-        What the arrays fill.
+        The architecture, which takes the arrays.
     code, description : str
-        Empty where not given.
+        Empty if not given.
     training : mapping
         ``{"env_steps", "seconds", "hardware", "curves": [{"seed", "steps": [...], "returns": [...]}]}``;
-        empty where not given. All of it is claimed, not verified.
+        empty if not given. All of it is claimed, not verified.
     """
 
     env: str
@@ -85,7 +85,7 @@ class Submission(About):
     Parameters
     ----------
     policies : tuple of (int, Policy)
-        Training seed and policy, by growing seed.
+        Training seed and policy, by increasing seed.
     folder : Path
         Where it was read.
     """
@@ -94,7 +94,7 @@ class Submission(About):
     folder: Path
 
 
-# --- what submission.toml must be ---------------------------------------------------------------------------
+# --- schema of submission.toml ------------------------------------------------------------------------------
 
 
 Seed = Annotated[int, between(0, MOST_SEED - 1)]
@@ -139,10 +139,10 @@ class Training(Strict):
 
 
 class Toml(Strict):
-    """All of the file."""
+    """The whole file."""
 
     version: Annotated[int, between(1, protocol.SCHEMA)] = Field(alias="schema")
-    #: The board's affair: what earlier exports say of it counts for nothing, and neither do they have to.
+    #: Decided by the board: earlier exports may state it, and it is ignored.
     stated: Annotated[int, between(1, 10**6)] = Field(default=1, alias="protocol")
     env: Annotated[str, AfterValidator(_on_a_board)]
     name: Annotated[str, line(60), Field(pattern="[A-Za-z0-9]")]
@@ -150,7 +150,7 @@ class Toml(Strict):
     license: Annotated[str, line(60), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9.+() -]*$")]
     code: Annotated[str, line(200), Field(pattern=r"^(https://[A-Za-z0-9._~:/?#@!$&*+,;=%-]+)?$")] = ""
     description: Annotated[str, line(500)] = ""
-    #: Follows from the architecture; may be stated.
+    #: Follows from the architecture; may be stated too.
     kind: Any = None
     policy: dict[str, Any]
     training: Training | None = None
@@ -170,7 +170,7 @@ def load(folder: Path | str) -> Submission:
     Raises
     ------
     Refused
-        For anything that is not as it should be; the text says what.
+        For anything wrong with it; the text says what.
     """
     folder = Path(folder)
     files = read_files(folder)
@@ -197,17 +197,17 @@ def load(folder: Path | str) -> Submission:
 
 
 def about(files: Mapping[str, bytes]) -> About:
-    """Return what a submission's files say of it; the arrays are not looked at.
+    """Return the statements of a submission's files; the arrays are not looked at.
 
     Parameters
     ----------
     files : mapping of str to bytes
-        What `read_files` returns.
+        The result of `read_files`.
 
     Raises
     ------
     Refused
-        For anything in ``submission.toml`` that is not as it should be.
+        For anything wrong in ``submission.toml``.
     """
     told = accepted(Toml, _parse(files[TOML]), TOML)
     made = architecture(told.env, told.policy)
@@ -229,12 +229,12 @@ def about(files: Mapping[str, bytes]) -> About:
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
-    """Return the files' contents by name; nothing but plain files with the right names is opened.
+    """Return the files' contents by name; only plain files with the right names are opened.
 
     Raises
     ------
     Refused
-        For other files, links, folders, and what is too large.
+        For other files, links, folders, and files that are too large.
     """
     try:
         if not stat.S_ISDIR(os.lstat(folder).st_mode):
@@ -272,7 +272,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 
 def _read(file: Path, size: int) -> bytes:
-    """Return a file's content; refuse one that has been exchanged since it was looked at."""
+    """Return a file's content; refuse a file that was replaced since it was looked at."""
     try:
         content = read_plain(file, size)
     except OSError as error:
@@ -283,14 +283,14 @@ def _read(file: Path, size: int) -> bytes:
 
 
 def _parse(content: bytes) -> dict[str, Any]:
-    """Return what a TOML file holds."""
+    """Return the contents of a TOML file."""
     import tomllib
 
     try:
         text = content.decode()
     except UnicodeDecodeError as error:
         raise Refused(f"{TOML} is not UTF-8 text (byte {error.start})") from error
-    # Reading keys of many parts takes time in proportion to the square of their number.
+    # Parsing keys of many parts takes quadratic time.
     if any(len(line) > protocol.LINE for line in text.split("\n")):
         raise Refused(f"{TOML} has a line of more than {protocol.LINE} characters; break it")
     try:
@@ -302,7 +302,7 @@ def _parse(content: bytes) -> dict[str, Any]:
 
 
 def _training(told: Training, found: list[int]) -> dict[str, Any]:
-    """Return the table ``[training]``; `found` are the seeds of which there are policies."""
+    """Return the table ``[training]``; `found` are the seeds of the policies."""
     if sorted(told.seeds) != found:
         raise Refused(
             f"{TOML}: training.seeds must be those of the policy files, {found}; got {sorted(told.seeds)}"
@@ -316,7 +316,7 @@ def _training(told: Training, found: list[int]) -> dict[str, Any]:
 
 
 def _kind(made: Architecture, trained: bool, stated: Any) -> str:
-    """Return the kind, which follows from the architecture; refuse another that is stated."""
+    """Return the kind, which follows from the architecture; refuse a different one that is stated."""
     kind = made.counts_as or ("learned" if trained else "controller")
     if stated not in (None, kind):
         raise Refused(
@@ -329,7 +329,7 @@ def _kind(made: Architecture, trained: bool, stated: Any) -> str:
 
 
 def _check_different(policies: Sequence[tuple[int, Policy]]) -> None:
-    """Refuse one learned policy under two seeds."""
+    """Refuse the same learned policy under two seeds."""
     first: dict[bytes, int] = {}
     for seed, policy in policies:
         content = b"".join(policy.arrays[name].tobytes() for name in sorted(policy.arrays))
@@ -351,7 +351,7 @@ def digest_of(files: Mapping[str, bytes]) -> str:
 
 
 def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a file, which must be the ones that the architecture asks for."""
+    """Return the arrays of a file, which must be those of the architecture."""
     from safetensors import SafetensorError
     from safetensors.numpy import load as read
 
@@ -374,7 +374,7 @@ def _arrays(name: str, content: bytes, made: Architecture) -> dict[str, NDArray[
 
 
 def _check_header(content: bytes) -> None:
-    """Refuse in a header what the library takes: a long one, a key twice, other types, anything besides."""
+    """Refuse a header that the library would accept: too long, repeated keys, other types or extra fields."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len(dict(pairs)) < len(pairs):
@@ -396,7 +396,7 @@ def _check_header(content: bytes) -> None:
 
 
 def _check_shapes(name: str, shapes: Mapping[str, tuple[int, ...]], made: Architecture) -> None:
-    """Refuse arrays that are not the architecture's."""
+    """Refuse arrays that do not fit the architecture."""
     if set(shapes) != set(made.arrays):
         odd = sorted(set(shapes) ^ set(made.arrays))[0]
         what = "is missing" if odd in made.arrays else "is not known"
@@ -439,7 +439,7 @@ def write(
     code: str = "",
     description: str = "",
 ) -> Submission:
-    """Write a submission into a new folder, whole or not at all, and return it as `load` reads it.
+    """Write a submission into a new folder, all or nothing, and return it as `load` reads it.
 
     Parameters
     ----------
@@ -450,18 +450,18 @@ def write(
     policy : mapping
         The table ``[policy]``.
     kind : str, optional
-        The kind, to be refused where another follows from the policy.
+        The kind; refused unless it follows from the policy.
     arrays : mapping of int to mapping of str to ndarray
-        For each training seed the arrays, of float32 or float64; none for a built-in controller.
+        For each training seed, the arrays, of float32 or float64; none for a built-in controller.
     training : mapping, optional
         The table ``[training]``, without ``seeds``.
 
     Raises
     ------
     Refused
-        For what `load` would refuse.
+        For anything that `load` would refuse.
     FileExistsError
-        For a folder that is there.
+        If the folder exists.
     """
     import tomli_w
     from safetensors.numpy import save
@@ -469,7 +469,7 @@ def write(
     folder, arrays = Path(folder), arrays or {}
     if os.path.lexists(folder):
         raise FileExistsError(f"{folder} already exists")
-    # The oldest that knows such policies, so that what is written stays what it is.
+    # The oldest version that has such policies, so that a policy's files never change.
     schema = architecture(env, policy).schema if env in protocol.boards() else 1
     told: dict[str, Any] = {
         "schema": schema, "env": env, "name": name, "authors": list(authors), "license": license,

@@ -1,4 +1,4 @@
-"""A plan that is followed by time-varying feedback, as numbers."""
+"""A plan followed by time-varying feedback, as numbers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lag_envs.tasks import TASKS
 class Plan(Architecture):
     """Action = planned action - gain · (state - planned state), with a gain for each step.
 
-    After the plan, action = -hold · (state - rest). States are read from the observation; an angle that is
-    observed by its cosine and sine differs from the planned one by the shorter way around. For one who acts
-    more often, planned states are interpolated.
+    After the plan, action = -hold · (state - rest). States are read from the observation; differences of an
+    angle that is observed by its cosine and sine are taken the shorter way around. When acting more often,
+    planned states are interpolated.
 
     Arrays: ``states`` (T + 1, n_state), ``actions`` (T,), ``gains`` (T, n_state), ``rest`` (n_state,),
-    ``hold`` (n_state,), states in SI units. Where an action has m numbers, ``actions`` is (T, m), ``gains``
-    (T, m, n_state), and ``hold`` (m, n_state).
+    ``hold`` (n_state,), states in SI units. If an action has m numbers, ``actions`` is (T, m), ``gains`` (T,
+    m, n_state), and ``hold`` (m, n_state).
     """
 
     schema = 2
@@ -32,5 +32,5 @@ class Plan(Architecture):
         self.arrays = Tracking.shapes(task)
 
     def agent(self, arrays: Mapping[str, Array]) -> Any:
-        """Return what follows the plan."""
+        """Return the agent that follows the plan."""
         return Tracking(self.task, **arrays)

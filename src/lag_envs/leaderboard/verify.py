@@ -1,4 +1,4 @@
-"""Recompute the scores of a submission: 1,000 episodes of each policy, and how it bears disturbances."""
+"""Recompute the scores of a submission: 1,000 episodes of each policy, and fewer under disturbances."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lag_envs.leaderboard.submission import Refused, Submission, load
 from lag_envs.tasks import TASKS
 
 Array = NDArray[np.float64]
-#: Libraries on which the bits of a trajectory depend.
+#: Libraries that decide the bits of a trajectory.
 PACKAGES = ("gymnasium", "numpy", "numba", "llvmlite", "scipy", "safetensors")
 
 
@@ -40,41 +40,40 @@ def verify(
     episodes: int = protocol.EPISODES,
     progress: Callable[[int, int], Any] | None = None,
 ) -> dict[str, Any]:
-    """Return what a submission's policies get, all of it recomputed.
+    """Return the results of a submission's policies, all of it recomputed.
 
     Parameters
     ----------
     submission : Submission
         The submission.
     nonce : str
-        Decides the episodes together with the submission's digest, see `protocol.first_seed`.
+        Decides the episodes, together with the submission's digest, see `protocol.first_seed`.
     episodes : int
-        Episodes of each policy; under disturbances, and acting often where there are no kicks, at most
-        `protocol.DISTURBED_EPISODES`.
+        Episodes of each policy. There are at most `protocol.DISTURBED_EPISODES` under disturbances, and when
+        acting often without kicks.
     progress : callable, optional
-        Called now and then with the steps taken, and the steps that there are at most.
+        Called now and then with the steps taken so far, and the largest number of steps to take.
 
     Returns
     -------
     dict
-        Of JSON types, as `results.Result` has it: env, digest, nonce, episodes, policies, robustness, often,
+        Of JSON types, as in `results.Result`: env, digest, nonce, episodes, policies, robustness, often,
         seconds, machine, versions, build. ``policies`` has for each one its seed, the episodes' returns,
-        successes, times [s] (None where the goal was not reached) and efforts (mean of (u/U)²), a hash of all
-        actions, rewards and ends, and what the environment's ``reference`` got in the same episodes, if it
-        has one. ``robustness`` maps
-        disturbances to the policies' mean returns; ``often`` has those for acting ten times as often, None
-        for an agent that counts steps and cannot.
+        successes, times [s] (None if the goal was not reached) and efforts (mean of (u/U)²), a hash of all
+        actions, rewards and ends, and the returns of the environment's ``reference`` in the same episodes, if
+        it has one. ``robustness`` maps disturbances to the policies' mean returns; ``often`` has those for
+        acting ten times as often, None for an agent that counts steps and cannot.
 
     Raises
     ------
     Refused
-        Where a policy fails, or returns what is no action.
+        If a policy fails, or returns something that is no action.
     """
     if not 1 <= episodes <= 100_000:
         raise ValueError(f"episodes must lie between 1 and 100000, got {episodes}")
     started, busy = time.perf_counter(), time.process_time()
     env, few = submission.env, min(episodes, protocol.DISTURBED_EPISODES)
-    # Kicks are others when acting often, and it takes as many episodes again until they make no difference.
+    # Acting often draws other kicks, and averaging them out takes as many episodes again.
     runs = [(condition, few) for condition in on_board(env)]
     runs.append((often(env), episodes if TASKS[env]().draws else few))
     nominal, *sizes = (condition.steps(env) * count for condition, count in [(Condition(), episodes), *runs])
@@ -128,13 +127,13 @@ def _machine() -> dict[str, Any]:
 
     from lag_envs.host import machine
 
-    # What code is compiled for; the name of a processor does not always tell.
+    # The features that code is compiled for; a processor's name does not always tell them.
     features = hashlib.sha256(get_host_cpu_features().flatten().encode()).hexdigest()[:16]
     return machine() | {"target": f"{get_host_cpu_name()} {features}"}
 
 
 def _reference(env_id: str, seeds: Sequence[int]) -> dict[str, list[float]]:
-    """Return the returns of the environment's reference in the same episodes; nothing where there is none."""
+    """Return the reference's returns in the same episodes; empty if the environment has none."""
     reference = protocol.reference(env_id)
     if reference is None:
         return {}
@@ -149,8 +148,8 @@ def replay(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Play some of the episodes of a verification again, and record them.
 
-    Networks and linear feedback go through the same numbers as in the verification, bit for bit; other agents
-    may differ in the last digit, as the libraries under them round differently for another number of rows.
+    Networks and linear feedback repeat the verification's numbers, bit for bit. Other agents may differ in
+    the last digit, since their libraries round differently for another number of rows.
 
     Parameters
     ----------
@@ -158,7 +157,7 @@ def replay(
         The submission.
     result : dict
         What `verify` returned, or its digest, nonce and number of episodes.
-    policy : int
+    The result of `verify`, or its digest, nonce and number of episodes.
         Number of the policy, from 0.
     chosen : sequence of int
         Numbers of the episodes, from 0.
@@ -166,7 +165,7 @@ def replay(
     Returns
     -------
     found : dict
-        What `verify` says of the policy, of these episodes alone.
+        The same data as `verify` has of the policy, for these episodes alone.
     episodes : list of dict
         For each of them ``seed`` (of the training), ``reset_seed``, ``return``, ``dt`` [s], ``states`` (steps
         + 1 of them, in SI units), ``actions`` and ``rewards`` (steps), ``target`` (or None); rounded to 6
@@ -176,7 +175,7 @@ def replay(
     training_seed, data = submission.policies[policy]
     first = protocol.first_seed(result["digest"], result["nonce"], policy)
     agent = data.agent()
-    # What draws actions draws them for all episodes together, so all have to be played.
+    # Random actions are drawn for all episodes together, so all have to be played.
     rows = list(chosen) if hasattr(agent, "rng") else list(range(len(chosen)))
     seeds = range(first, first + result["episodes"]) if hasattr(agent, "rng") else [first + i for i in chosen]
     rollout = Rollout(env, agent, seeds)
@@ -202,7 +201,7 @@ def replay(
 
 
 def _plain(values: Array) -> list[Any]:
-    """Return rows as JSON has them: of a single number as that number."""
+    """Return rows in JSON types; a row of one number as that number."""
     return rounded((values[:, 0] if values.shape[1:] == (1,) else values).tolist())
 
 
@@ -228,21 +227,21 @@ def declare_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--nonce", default="", help="decides the episodes (default: none)")
     parser.add_argument(
         "--episodes", metavar="N", type=int, default=protocol.EPISODES,
-        help="episodes of each policy (default: %(default)s, what the board asks for)",
+        help="episodes of each policy (default: %(default)s, as on the board)",
     )  # fmt: skip
     parser.add_argument(
-        "--jobs", metavar="N", type=int, default=1, help="submissions side by side (default: 1)"
+        "--jobs", metavar="N", type=int, default=1, help="submissions to verify in parallel (default: 1)"
     )
     parser.add_argument("--ray", metavar="ADDRESS", help='spread them over a Ray cluster; "local" starts one')
     parser.add_argument("--json", metavar="FILE", help="write all results to this file")
     parser.add_argument(
         "--against", metavar="FILE",
-        help="compare with results that --json wrote, here or elsewhere, of the same nonce and episodes",
+        help="compare with results that --json wrote, here or elsewhere, for the same nonce and episodes",
     )  # fmt: skip
 
 
 def run_verify(args: argparse.Namespace) -> int:
-    """Verify submissions and print what they get; return 1 where one was refused."""
+    """Verify submissions and print their results; return 1 if one was refused."""
     if not 1 <= args.episodes <= 100_000:
         raise UserError(f"--episodes must lie between 1 and 100000, got {args.episodes}")
     if args.jobs < 1:
@@ -266,7 +265,7 @@ def run_verify(args: argparse.Namespace) -> int:
 
 
 def _read(file: Path) -> dict[str, dict[str, Any]]:
-    """Return results that were written before, by digest."""
+    """Return earlier results, by digest."""
     try:
         found = load_json(read_plain(file, UNPACKED))
         if not isinstance(found, list) or not all(isinstance(r, dict) for r in found):
@@ -278,7 +277,7 @@ def _read(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, plans: bool) -> bool:
-    """Tell how a result compares with an earlier one; return whether it is too far from it."""
+    """Print how a result compares with an earlier one; return whether it is too far from it."""
     from lag_envs.scores import known_returns
 
     if other is None:
@@ -300,7 +299,7 @@ def _report(result: dict[str, Any], other: dict[str, Any] | None, file: str, pla
 
 
 def _results(folders: list[Path], args: argparse.Namespace) -> Iterator[tuple[Path, Any]]:
-    """Verify here, with a progress bar, or where it was asked for."""
+    """Verify here, with a progress bar, or on a Ray cluster."""
     from lag_envs.leaderboard.parallel import map_submissions
     from lag_envs.workers import SpreadError
 

@@ -1,7 +1,7 @@
-"""The bound that is known before a step, against what the step really leaves out.
+"""The bound on a step's truncation error that is known beforehand, against the actual truncation error.
 
-Truncation is compared with truncation: a step leaves out what the coefficients of the exact motion, by the
-oracle, sum up to beyond the series' order. Rounding plays no part.
+Truncation is compared with truncation: the actual error is the sum of the exact motion's coefficients beyond
+the series' order, from the oracle. Rounding plays no part.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 SECTION = "bound"
 ORDERS = (8, 12, 14, 16, 20)
 DIGITS = 100
-MORE = 80  # coefficients beyond the order, whose sum is what is left out
-MOST_SUBSTEPS = 100  # of the steps whose cost is looked at, which run as plain Python
+MORE = 80  # coefficients beyond the order that are summed as the truncation error
+MOST_SUBSTEPS = 100  # of the steps whose cost is measured, which run as plain Python
 TOLERANCE = pendulum.TOLERANCE
 
 
@@ -63,7 +63,7 @@ class Driven(Scene):
     delta: float = parameter(0.0, "rad/s²")
 
     coordinates: ClassVar = {"theta": "rad"}
-    prescribed: ClassVar = {"turn": "rad"}  # its rate is the drive's part that grows
+    prescribed: ClassVar = {"turn": "rad"}  # its rate is the growing part of the drive
     controls: ClassVar = {"turn_ddot": "rad/s²"}
 
     def kinetic(self, q: Any, v: Any, xp: Any) -> Any:
@@ -92,9 +92,9 @@ def driven(drive: Coefficients) -> tuple[Scene, list[float]]:
 def truncation(
     theta: float, omega: float, drive: Coefficients, h: float, order: int, digits: int = DIGITS
 ) -> tuple[float, float]:
-    """Return what one step of the series leaves out of θ [rad] and of θ' [rad/s]; infinite if it diverges.
+    """Return the truncation errors of a step of the series in θ [rad], θ' [rad/s]; infinite if it diverges.
 
-    It is the sum of the oracle's coefficients beyond the order, of which `MORE` are taken.
+    They are the sums of the oracle's next `MORE` coefficients beyond the order.
     """
     scene, control = driven(drive)
     state = [0.0, 0.0, theta, omega]
@@ -118,7 +118,7 @@ def random_problem(rng: np.random.Generator) -> tuple[float, float, Coefficients
 
 
 def step_at(omega: float, drive: Coefficients, x: float) -> float:
-    """Return the longest step [s] that the bound certifies with this x."""
+    """Return the longest step [s] that is certified with this x."""
     low, high = -40.0, 5.0
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -128,13 +128,13 @@ def step_at(omega: float, drive: Coefficients, x: float) -> float:
 
 
 def majorant(x: float, h: float, order: int) -> tuple[float, float]:
-    """Return the bounds on what one step leaves out of θ and θ'."""
+    """Return the bounds on one step's truncation errors in θ and θ'."""
     tail = x * (x / 2.0) ** (order + 1) / (1.0 - x / 2.0)
     return tail / (order + 2), tail / h
 
 
 def points(n: int, seed: int) -> Iterator[Row]:
-    """Yield bound and truncation of one step of every order for n random drives."""
+    """Yield bound and truncation error of one step, at every order, for n random drives."""
     for i in range(n):
         rng = np.random.default_rng([seed, i])
         theta, omega, drive = random_problem(rng)
@@ -148,7 +148,7 @@ def points(n: int, seed: int) -> Iterator[Row]:
 
 
 def cost(n: int, seed: int) -> Iterator[Row]:
-    """Yield, for steps of any length, the substeps that the bound asks for and the fewest that are enough."""
+    """Yield, for steps of any length, the substeps that the bound requires and the fewest that suffice."""
     for i in range(n):
         rng = np.random.default_rng([9, seed, i])
         theta, omega, drive = random_problem(rng)
@@ -181,7 +181,7 @@ def _enough(
     exact: Sequence[mpf],
     limits: Sequence[float],
 ) -> bool:
-    """Tell whether n substeps, in float64, are as accurate as asked for."""
+    """Tell whether n substeps, in float64, reach the required accuracy."""
     h = dt / n
     y: Any = theta, omega, math.cos(theta), math.sin(theta)
     for i in range(n):
@@ -191,7 +191,7 @@ def _enough(
 
 
 def environment(id: str, n: int) -> Iterator[Row]:
-    """Yield what the bound certifies of an environment, and n of its steps at random within that."""
+    """Yield the certified range of an environment, and n random steps within it."""
     from lag_envs.report.stepped import Stepped
     from lag_envs.tasks import TASKS
 
@@ -244,7 +244,7 @@ def _state(task: Any, theta: float, speed: float) -> list[float]:
 
 
 def _largest(good: Callable[[float], bool], steps: int = 40) -> float:
-    """Return the largest speed up to 1e4 rad/s that is good, by bisection."""
+    """Return the largest speed up to 1e4 rad/s that passes, by bisection."""
     low, high = 0.0, 1e4
     for _ in range(steps):
         middle = math.sqrt(max(low, 1e-2) * high)
@@ -259,7 +259,7 @@ QUANTITIES = (("theta", "θ", "rad"), ("theta_dot", "θ'", "rad/s"))
 
 
 def content(rows: list[Row], problems: list[Result]) -> Content:
-    """Return what the section shows."""
+    """Return the section's content."""
     kinds = {
         kind: [r for r in rows if r["kind"] == kind] for kind in ("point", "environment", "cost", "reach")
     }
@@ -268,9 +268,9 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
     closest = min((m for r in measured for m in _margins([r])), default=None)
     tight = _table(
         "bound-tightness",
-        "Bound over truncation of one step, both in exact arithmetic, for random drives. Never below 1 means "
-        "never broken. 50 % is the median. Per power: the (order + 1)th root of the median for θ', by how "
-        "much the bound sees the step as longer than it is.",
+        "Bound over truncation error of one step, both in exact arithmetic, for random drives. It is never "
+        "below 1 if the bound is never broken. 50 % is the median. Per power: the (order + 1)th root of the "
+        "median for θ', the factor by which the bound overestimates the step's length.",
         kinds["point"],
         lambda r: f"order {r['order']}",
     )
@@ -284,7 +284,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
             + (f"; the closest is a factor of {closest:.3g}" if closest else ""),
         ),
         Claim(
-            "The substeps that the bound asks for are enough for 1e-12.",
+            "The substeps that the bound requires are enough for 1e-12.",
             len(counted) == len(kinds["cost"]) if kinds["cost"] else None,
             f"{len(counted)} of {len(kinds['cost'])} random steps",
         ),
@@ -294,9 +294,9 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         pictures.append(
             Picture(
                 "bound-scatter",
-                "Proved bound against what a step really leaves out, for random drives and steps such that "
-                "x, the size that the bound follows from, lies between 0.02 and 0.5. Every point must lie "
-                f"left of the line. What is left out is summed with {DIGITS} digits.",
+                "Proved bound against actual truncation error, for random drives and steps such that x, "
+                "the size that the bound follows from, lies between 0.02 and 0.5. Every point must lie "
+                f"left of the line. The truncation error is summed with {DIGITS} digits.",
                 lambda: _draw_scatter(kinds["point"]),
             )
         )
@@ -304,7 +304,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         pictures.append(
             Picture(
                 "bound-cost",
-                "What the bound costs: substeps that it asks for against the fewest that reach 1e-12, order "
+                "What the bound costs: the substeps that it requires against the fewest that reach 1e-12, "
+                "order "
                 "16, random drives and steps. Circles grow with the number of cases. On the line nothing is "
                 "wasted.",
                 lambda: _draw_cost(counted),
@@ -318,8 +319,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
             f"coefficients beyond the order, which the oracle computes with {DIGITS} digits. Rounding "
             "plays no part.",
             "The bound holds for every field, drag and drive of a given size, whatever the angle, so it "
-            "is far above the truncation error of most steps. That costs little: a series of order N "
-            "compensates for such a factor by a step that is shorter by the factor's (N + 1)th root.",
+            "is far above the truncation error of most steps. That costs little: a series of order N makes "
+            "up for such a factor by a step that is shorter by the factor's (N + 1)th root.",
             _cost_text(kinds["cost"]),
         ],
         tables=[table for table in (tight, scenes, _problem_table(problems)) if table],
@@ -331,7 +332,7 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
 
 
 def _margins(rows: Sequence[Row]) -> list[float]:
-    """Return bound over truncation of both quantities, where something is left out at all."""
+    """Return bound over truncation error of both quantities, where that error is not zero."""
     return [r[f"{name}_bound"] / r[name] for r in rows for name, _, _ in QUANTITIES if r[name]]
 
 
@@ -368,13 +369,14 @@ def _reach_table(steps: Sequence[Row], reaches: Sequence[Row]) -> Table | None:
         least, _, median, _ = _quantiles(found, "theta_dot")
         worst = max((r["theta_dot"] for r in found), default=None)
         certified = known[id]["certified"] if id in known else found[0]["reach"]
-        certified = math.floor(10.0 * certified) / 10.0  # as README and the pages have it
+        certified = math.floor(10.0 * certified) / 10.0  # as in README and the pages
         actual = known[id]["actual"] if id in known else None
         lines.append([id, dt, order, certified, actual, worst, least, median])
     return Table(
         "bound-environments",
-        "Each environment with a pendulum: the speed up to which one series per step is certified to leave "
-        "out at most 1e-12 rad/s under its largest controls, and the speed up to which it really does at "
+        "Each environment with a pendulum: the speed up to which one series per step is certified to have "
+        "a truncation error of at most 1e-12 rad/s under its largest controls, and the speed up to which "
+        "it really has, at "
         "all angles tried; the largest truncation met within the certified speeds, and the bound over the "
         "truncation (least, median).",
         [
@@ -398,7 +400,7 @@ def _cost_text(rows: Sequence[Row]) -> str:
     ratios = [r["chosen"] / r["needed"] for r in counted]
     text = (
         f"Over {len(counted)} random steps of 1 to {max(r['chosen'] for r in counted)} substeps the bound "
-        f"asks for {float(np.median(ratios)):.2g} times the fewest that reach 1e-12 (median; at most "
+        f"requires {float(np.median(ratios)):.2g} times the fewest that reach 1e-12 (median; at most "
         f"{max(ratios):.2g} times)."
     )
     missed = len(rows) - len(counted)
@@ -407,9 +409,7 @@ def _cost_text(rows: Sequence[Row]) -> str:
 
 def _problem_table(problems: Sequence[Result]) -> Table | None:
     lines = [[p.name, p.problem] for p in problems]
-    return (
-        Table("bound-problems", "What could not be measured.", ["job", "problem"], lines) if lines else None
-    )
+    return Table("bound-problems", "Problems: not measured.", ["job", "problem"], lines) if lines else None
 
 
 def _details(rows: Sequence[Row]) -> Table:
@@ -452,6 +452,6 @@ def _draw_cost(rows: Sequence[Row]) -> Figure:
     axes.plot([0.8, end], [0.8, end], color="black", linewidth=1.5)
     axes.scatter(places[:, 0], places[:, 1], s=25.0 * np.sqrt(counts), color=COLOURS[16], alpha=0.7)
     axes.set(xscale="log", yscale="log", xlim=(0.8, end), ylim=(0.8, end))
-    axes.set(xlabel="fewest substeps that reach 1e-12", ylabel="substeps that the bound asks for")
+    axes.set(xlabel="fewest substeps that reach 1e-12", ylabel="substeps that the bound requires")
     axes.grid(alpha=0.3)
     return figure

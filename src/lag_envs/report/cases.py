@@ -20,7 +20,7 @@ class Variant(NamedTuple):
     kind: type[Scene]
     parameters: dict[str, Any]
     dt: float  #: control step [s]
-    state_range: Sequence[float]  #: states lie within, in the scene's units
+    state_range: Sequence[float]  #: bounds of the states, in the scene's units
     controls: tuple[float, float]
 
     def scene(self, **changes: Any) -> Scene:
@@ -28,7 +28,7 @@ class Variant(NamedTuple):
         return self.kind(**(self.parameters | changes))
 
 
-#: Damped as the tasks are, and wider ranges of states than tasks reach on the way.
+#: With the tasks' damping, and wider ranges of states than tasks start from.
 VARIANTS = {
     variant.name: variant
     for variant in (
@@ -53,7 +53,7 @@ VARIANTS = {
 
 
 class Case(NamedTuple):
-    """A start on a scene, and a control that is held."""
+    """A start on a scene, and a constant control."""
 
     scene: Scene
     state: tuple[float, ...]
@@ -68,7 +68,7 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
     name : str
         Name of the variant.
     n, seed : int
-        How many, and of which sequence; a longer ensemble begins with the shorter one.
+        How many, and the seed of their sequence; a longer ensemble begins with the shorter one.
     vary : bool, default True
         Multiply every parameter that is not zero by a factor between 1/2 and 2, log-uniform.
 
@@ -98,9 +98,9 @@ def ensemble(name: str, n: int, seed: int = 0, *, vary: bool = True) -> list[Cas
 
 
 def scales(case: Case, dt: float) -> list[float]:
-    """Return the size that the error of each state entry is relative to, as the README defines accuracy.
+    """Return the size by which each state entry's error is divided, as README defines accuracy.
 
-    Angles and lengths max(1, |q|, |q'| dt), their rates max(1, |q'|, what the field adds).
+    For angles and lengths max(1, |q|, |q'| dt), for their rates max(1, |q'|, the field's contribution).
     """
     from lag_envs.report.stepped import Stepped
     from lag_envs.stepping import pendulum

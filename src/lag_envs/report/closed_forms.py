@@ -1,7 +1,7 @@
-"""Closed forms of motions: the undamped pendulum's elliptic functions, and what is linear.
+"""Closed forms of motions: elliptic functions for the undamped pendulum, and linear motion.
 
-They check the oracle, and take its place where a pendulum turns so far that a step for every radian would
-take minutes.
+They check the oracle, and replace it where a pendulum turns so far that the oracle, with a step per radian,
+would take minutes.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def pendulum(oracle: Oracle, controls: Sequence[Any]) -> tuple[sympy.Rational, s
 def flow(
     oracle: Oracle, coefficients: Sequence[Any], state: Sequence, controls: Sequence, dt: Any, digits: int
 ) -> list[mpf]:
-    """Return the state after a time dt where `pendulum` has found these coefficients."""
+    """Return the state after a time dt, for coefficients that `pendulum` has found."""
     with mp.workdps(digits + 40):
         t = mpf(dt)
         q, v = oracle.start([mpf(x) for x in state], [mpf(u) for u in controls], mpf)

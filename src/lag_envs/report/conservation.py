@@ -1,4 +1,4 @@
-"""What ought to stay: energy, the balance of power, cos² + sin²; and how errors grow in time."""
+"""Conserved quantities: energy, the power balance, cos² + sin²; and how errors grow in time."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Free(NamedTuple):
 
     scene: Scene
     state: tuple[float, ...]
-    #: Control step [s] with 28 bits behind the point, so that 1e7 of them are an exact number too.
+    #: Control step [s], a multiple of 2^-28, so that 1e7 steps are an exact number too.
     dt: float = round(0.02 * 2**28) / 2**28
 
 
@@ -82,7 +82,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def marks(steps: int) -> NDArray[np.int64]:
-    """Return the numbers of steps at which a run is looked at: eight per decade.
+    """Return the numbers of steps after which a run is recorded: eight per decade.
 
     Examples
     --------
@@ -97,7 +97,7 @@ def march(scene: Stepped) -> Callable:
     """Compile ``march(out, marks, dt, x, constants...)`` for a scene without control.
 
     Row j of `out` is the lifted state after ``marks[j]`` steps, row -1 the start; it returns the number of
-    rows that were filled.
+    filled rows.
     """
     code = scene.stepper()
     width = len(code.start)
@@ -119,7 +119,7 @@ def march(scene: Stepped) -> Callable:
 
 
 def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the lifted states after these numbers of steps; fewer rows where a step was refused."""
+    """Return the lifted states after these numbers of steps; fewer rows if a step was refused."""
     stepped = Stepped(problem.scene, dt=problem.dt)
     largest = stepped.largest_majorant(problem.dt)
     if method != OURS:
@@ -131,7 +131,7 @@ def run(problem: Free, method: str, at: NDArray[np.int64]) -> NDArray[np.float64
 
 
 def free(name: str, method: str, steps: int) -> Iterator[Row]:
-    """Yield drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
+    """Yield the drifts of a run without drag and drive, and for ours its error and the amplified rounding."""
     problem = FREE[name]
     scene, angle = problem.scene, Stepped(problem.scene).angle
     at = marks(steps)
@@ -143,7 +143,7 @@ def free(name: str, method: str, steps: int) -> Iterator[Row]:
     if angle is not None:
         c, s = states[:, -2], states[:, -1]
         row["length"] = finite(c * c + s * s - 1.0)
-        # The angle itself is rounded the more, the larger it is; cosine and sine are what is stepped.
+        # A large angle itself has large roundings; the cosine and sine are stepped.
         where[:, angle] = np.arctan2(s, c)
         turns = states[:, angle] - where[:, angle]
         row["pair"] = finite(turns - 2.0 * math.pi * np.round(turns / (2.0 * math.pi)))
@@ -156,12 +156,12 @@ def free(name: str, method: str, steps: int) -> Iterator[Row]:
 
 
 def finite(values: NDArray[np.float64]) -> list[float | None]:
-    """Return numbers that JSON can hold."""
+    """Return numbers that JSON can represent."""
     return [float(v) if math.isfinite(v) else None for v in values]
 
 
 def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
-    """Return the error of the first coordinate, and what the scene makes of one rounding of the start."""
+    """Return the error of the first coordinate, and how far the scene amplifies one rounding of the start."""
     from mpmath import mp, mpf
 
     scene, start, dt = FREE[name]
@@ -183,7 +183,7 @@ def growth(name: str, at: Sequence[int], states: NDArray[np.float64]) -> Row:
 
 
 def balance(variant: str, steps: int) -> Iterator[Row]:
-    """Yield how far energy, work and loss are from adding up, over a run with random controls."""
+    """Yield the imbalance of energy, work and loss over a run with random controls."""
     about = VARIANTS[variant]
     scene = about.scene()
     rng = np.random.default_rng(1)
@@ -224,7 +224,7 @@ def exponent(steps: Sequence[float], values: Sequence[float | None]) -> float | 
 
 
 def worst(values: Sequence[float | None]) -> float | None:
-    """Return the largest size, or None where one is not finite."""
+    """Return the largest size, or None if one is not finite."""
     return None if None in values or not values else max(abs(v) for v in values if v is not None)
 
 
@@ -249,20 +249,20 @@ TEXT = (
 DRIFT = (
     "Largest relative drift of energy, of c² + s² from 1, and of θ from the angle of (c, s) [rad]. Growth:"
     " the exponent of the largest energy drift so far over the last two decades; 0.5 is a random walk, 1 is"
-    " steady. An empty cell: not finite, refused, or not there."
+    " steady. Empty cell: not finite, refused, or not applicable."
 )
 GROWTH = (
-    "Error of θ or x at the end of a run, what the scene amplifies one rounding to, the largest ratio of the"
+    "Error of θ or x at the end of a run, one rounding as amplified by the scene, the largest ratio of the"
     " error to √n amplified roundings, and the exponents of growth."
 )
 BALANCE = (
-    "Change of energy less work plus loss [J]: largest of a step, and summed over the run; beside it the"
-    " largest energy and all work and loss that went through."
+    "Change of energy minus work plus loss [J]: the largest of a step, and the sum over the run; beside them"
+    " the largest energy and the total of work and loss."
 )
 
 
 def content(rows: list[Row], problems: list[Result]) -> Content:
-    """Return what the section shows."""
+    """Return the section's content."""
     drifts, grown, balances = (
         [row for row in rows if row["kind"] == kind] for kind in ("drift", "growth", "balance")
     )
@@ -362,12 +362,12 @@ def _claims(ours: list[Row], grown: list[Row], balances: list[Row], steps: int) 
             1e-15,
         ),
         claim(
-            "On bar and shell the error stays below 100 √n times what the scene makes of one rounding.",
+            "On bar and shell the error stays below 100 √n times one rounding as the scene amplifies it.",
             [(max(_ratios(row)), row["name"]) for row in grown if row["name"] != "incline"],
             100.0,
         ),
         claim(
-            "With drag and drive, energy, work and loss add up in every step to 1e-13 of what is there.",
+            "With drag and drive, energy, work and loss balance in every step to 1e-13 of their size.",
             [
                 (row["largest"] / max(row["energy"], row["turnover"] / row["steps"]), row["name"])
                 for row in balances
@@ -408,8 +408,8 @@ def _pictures(drifts: list[Row], grown: list[Row]) -> Iterator[Picture]:
     if grown:
         yield Picture(
             "conservation-growth",
-            "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: what that"
-            " closed form makes of one rounding of the start.",
+            "Error of θ (incline: x) of our runs against the closed form in 30 digits. Dotted: one "
+            "rounding of the start, propagated by that closed form.",
             lambda: _growths(grown),
         )
 

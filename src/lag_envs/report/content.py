@@ -1,4 +1,4 @@
-"""What a section of the report shows, apart from how it is set: text, tables, pictures, claims."""
+"""The content of a section of the report, independent of its layout: text, tables, pictures, claims."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Table:
-    """A table; numbers stay numbers, so that CSV has them in full."""
+    """A table; numbers stay numbers, so that the CSV file has all their digits."""
 
     name: str  #: of the CSV file, and the anchor
     caption: str
@@ -25,14 +25,14 @@ class Picture:
     """A figure, drawn when it is written."""
 
     name: str  #: of the file
-    caption: str  #: says what is shown, of which cases, and the reference
+    caption: str  #: the content, the cases, and the reference
     draw: Callable[[], Figure]
     raster: bool = False  #: many cells or points: PNG instead of SVG
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement that was measured; `holds` is None where there was nothing to measure it by."""
+    """A measured statement; `holds` is None if there was nothing to measure it by."""
 
     text: str
     holds: bool | None

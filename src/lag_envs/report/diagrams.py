@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Colours after Okabe and Ito; what our machinery compiles is drawn in full, libraries dashed.
+#: Colours after Okabe and Ito; methods compiled by our machinery have solid lines, libraries dashed ones.
 STYLES = {
     "explicit Euler": ("#999999", "o", "-"),
     "semi-implicit Euler": ("#999999", "s", "-"),
@@ -92,7 +92,7 @@ def panel(ax: Axes, points: Sequence[Point], floor: float | None) -> None:
 
 
 def curves(points: Sequence[Point]) -> dict[str, list[Point]]:
-    """Return a curve for each rival: of all forms of a method, those that no other form of it beats."""
+    """Return a curve for each rival: of all forms of a method, the points that no other form beats."""
     found: dict[str, list[Point]] = {}
     for p in points:
         if not p.ours:

@@ -1,9 +1,9 @@
-"""The report as this project commits it: ``python -m lag_envs.report.docs REPORT PROJECT``.
+"""The report in the form that this project commits: ``python -m lag_envs.report.docs REPORT PROJECT``.
 
-From a report's folder it writes, into a checkout, ``docs/accuracy.json`` (tables, claims, machine, versions),
-the figures, and what follows from that file alone: ``docs/accuracy.md``, a page to read, and
+From a report's folder it writes into a checkout: ``docs/accuracy.json`` (tables, claims, machine, versions),
+the figures, and the pages that depend on that file alone: ``docs/accuracy.md``, a page to read, and
 ``docs/accuracy-details.md`` with all texts, tables and figures. Without a report's folder it writes the pages
-and the first figure anew from ``docs/accuracy.json``. A test makes the texts again and compares.
+and the first figure again from ``docs/accuracy.json``. A test makes the texts again and compares.
 """
 
 from __future__ import annotations
@@ -30,37 +30,37 @@ DETAILS = "accuracy-details.md"
 OVERVIEW = Picture(
     "overview",
     "Error against run time. The shortest time of one control step in which each method reaches an error, "
-    "with the state alone, not in a batch. Rivals get their fastest form.",
+    "with only the state, not in a batch. Rivals get their fastest form.",
     lambda: overview.draw({}),
     raster=True,
 )
 
 
 class Part(NamedTuple):
-    """A part of the page to read: a section of the report, with words that hold whatever was measured."""
+    """A part of the page to read: a section of the report, with words that hold for any measurement."""
 
     section: str
     title: str
     text: str
-    pictures: tuple[str, ...]  #: beginnings of their files' names
+    pictures: tuple[str, ...]  #: beginnings of their file names
 
 
 PARTS = (
     Part(
         "work_precision",
         "One step of the package's scenes",
-        "Bar, incline and shell have steps of their own. Ours is as shipped, at rounding error; a rival "
-        "is given the scene's own equation and its fastest form, with the setting that just reaches an "
-        "error. Only ours knows a bound on its error before the step. The table names the fastest rival "
+        "Bar, incline and shell have dedicated steps. Ours is as shipped, at rounding error; a rival is "
+        "given the scene's own equation and its fastest form, with the setting that just reaches an "
+        "error. Only ours has a bound on its error before the step. The table names the fastest rival "
         "for each error, with its time as a multiple of ours: below 1 the rival is faster.",
         (),
     ),
     Part(
         "general",
-        "One step of scenes that are only energies",
-        "Here equations are derived from the energies and stepped by the general Taylor series, which "
-        "certifies each step. The others give no bound: which of their settings reaches an error is known "
-        "here from exact solutions.",
+        "One step of scenes defined by energies alone",
+        "Here the equations are derived from the energies and stepped by the general Taylor series, which "
+        "certifies each step. The other methods give no bound: which of their settings reaches an error is "
+        "known here only from exact solutions.",
         ("general-double",),
     ),
     Part(
@@ -68,37 +68,37 @@ PARTS = (
         "Whole episodes",
         "Episodes of random actions, compared with the exact motion under the same controls. Gymnasium's "
         "environments are measured against their own equations. No method that starts from float64 "
-        "numbers can do better than about one rounding of the start, which the system itself amplifies; "
+        "numbers can do better than about one rounding of the start, amplified by the system itself; "
         "the last column has the error as a multiple of that.",
         ("environment-errors.png",),
     ),
     Part(
         "stability",
         "Stiffness and extremes",
-        "Each cell of a map is one control step, with more and more damping, and shorter or longer. Heavy "
-        "damping breaks explicit methods and wears out implicit ones. Beside the maps there are named "
+        "Each cell of a map is one control step, for increasing damping and step length. Heavy damping "
+        "breaks explicit methods and degrades implicit ones. Beside the maps there are named "
         "cases, from a bar of 1e-8 m to drives of 1e6: each is either accurate or refused with an error.",
         ("stability-damping-pivotedbar.png", "extreme-cases-map"),
     ),
     Part(
         "conservation",
         "Conservation",
-        "Without drag and drive energy must not change. The table has its largest drift over a very long "
+        "Without drag and drive, energy must not change. The table has its largest drift over a very long "
         "run.",
         ("conservation-energy",),
     ),
     Part(
         "bound",
         "The bound",
-        "The bound on what a step leaves out is proved ([numerics](numerics.md), [engine](engine.md)). "
-        "Here it is compared with what steps really leave out: every point must lie left of the line.",
+        "The bound on a step's truncation error is proved ([numerics](numerics.md), [engine](engine.md)). "
+        "Here it is compared with the actual truncation errors: every point must lie left of the line.",
         ("bound-scatter",),
     ),
     Part(
         "leave_out",
         "What is left out",
-        "A constant that is zero leaves no operation behind, and the state holds only what an environment "
-        "needs. The table shows what a step of each environment consists of, the figure what leaving "
+        "A constant that is zero costs no operation, and the state holds only what an environment "
+        "needs. The table shows the parts of each environment's step, the figure what leaving "
         "something out saves.",
         ("leave-out",),
     ),
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Write a report's compact form into a checkout."""
     parser = argparse.ArgumentParser(description="Write a report's compact form into a checkout.")
     parser.add_argument(
-        "report", type=Path, nargs="?", help="the report's folder; without one the pages are written anew"
+        "report", type=Path, nargs="?", help="the report's folder; without one the pages are written again"
     )
     parser.add_argument("project", type=Path, nargs="?", default=Path(), help="the checkout (default: here)")
     args = parser.parse_args(arguments)
@@ -122,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     found = json.loads((args.report / FILE).read_text(encoding="utf-8"))
     if not found["complete"]:
-        print(f"{args.report} is not complete; `lag-envs report {args.report}` goes on", file=sys.stderr)
+        print(f"{args.report} is not complete; `lag-envs report {args.report}` resumes it", file=sys.stderr)
         return 2
     docs = args.project / "docs"
     figures = docs / FIGURES
@@ -137,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def update(project: Path) -> None:
-    """Write what follows from ``docs/accuracy.json`` and ``docs/speed.json``: pages and the first figure."""
+    """Write the files that depend on ``docs/accuracy.json`` and ``docs/speed.json``: pages, first figure."""
     for path, text in generated(project).items():
         write(path, text)
     accuracy = json.loads((project / "docs" / "accuracy.json").read_text(encoding="utf-8"))
@@ -145,7 +145,7 @@ def update(project: Path) -> None:
 
 
 def generated(project: Path) -> dict[Path, str]:
-    """Return the generated files, as they ought to be."""
+    """Return the generated files as they should be."""
     accuracy, speed = (
         json.loads((project / "docs" / name).read_text(encoding="utf-8"))
         for name in ("accuracy.json", "speed.json")
@@ -155,7 +155,7 @@ def generated(project: Path) -> dict[Path, str]:
 
 
 def drawn(picture: Picture, folder: Path) -> Path:
-    """Draw a figure; one that is large as SVG becomes PNG."""
+    """Draw a figure; one that is too large as SVG becomes PNG."""
     path = page.draw(picture, folder)
     if picture.raster or path.stat().st_size <= LARGEST_SVG:
         return path
@@ -164,7 +164,7 @@ def drawn(picture: Picture, folder: Path) -> Path:
 
 
 def compact(found: dict[str, Any], files: dict[str, str]) -> dict[str, Any]:
-    """Return what the texts need of a report."""
+    """Return the parts of a report that the texts need."""
     sections = []
     for name, content in content_of(found).items():
         sections.append(
@@ -204,7 +204,7 @@ def markdown(accuracy: dict[str, Any]) -> str:
         "",
         *_picture({"file": f"{OVERVIEW.name}.png", "caption": OVERVIEW.caption}),
         "",
-        "What matters in it:",
+        "The main results:",
         "",
         *(f"- {text}" for text in (*FIRST, *overview.findings(accuracy))),
         "",
@@ -244,23 +244,24 @@ def markdown(accuracy: dict[str, Any]) -> str:
 
 INTRODUCTION = """\
 One control step, with its control held, is accurate to 1e-12: |error of θ| ≤ 1e-12 max(1, |θ|, |θ̇| dt) and
-|error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. For lengths it is alike
+|error of θ̇| ≤ 1e-12 max(1, |θ̇|, (α² + β²)^¼), where θ̈ = -α sinθ - β cosθ - γθ̇ + …. Lengths are treated
+alike
 ([numerics](numerics.md)). This holds for all environments with an exact flow, over the ordinary ranges of
-their parameters, with damping γ dt up to 1e6. At extremes the system itself amplifies a rounding of its
+their parameters, with damping γ dt up to 1e6. At extremes, the system itself amplifies a rounding of its
 state or parameters; there the error stays within ten times that amplification. A step that would need more
 than a million substeps, or has no finite result, raises `StepRefused` and leaves the state as it was.
 
-Over many steps errors grow as the system makes them grow. The default bar, upright and without control,
+Over many steps, errors grow as the system amplifies them. The default bar, upright and without control,
 doubles an error every 0.14 s, whatever the method.
 
-`lag-envs report` measures all that follows (extras `report`, `peers`, `pinocchio`; `--quick` for a first
+`lag-envs report` measures all results below (extras `report`, `peers`, `pinocchio`; `--quick` for a first
 look).
 It also writes a page with all rows as CSV and JSON."""
 
 FIRST = (
-    "Only ours has a bound on its error that is known before or with the step. What the others reach was "
+    "Only ours has a bound on its error that is known before or with the step. The errors of the others were "
     "found afterwards, from exact solutions.",
-    "On the left ours is at rounding error. A coarser setting would not be faster, so there is one point.",
+    "On the left, ours is at rounding error. A coarser setting would not be faster, so there is one point.",
 )
 
 

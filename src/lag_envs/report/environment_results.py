@@ -1,4 +1,4 @@
-"""What the errors of whole episodes come to: tables, pictures, claims."""
+"""Results on the errors of whole episodes: tables, pictures, claims."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from lag_envs.tasks import TASKS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Limits on the error of an exact flow's step and of its episode, and on that of any episode: so many times
-#: one rounding of its start, as the system amplifies it, or what the series' steps may leave out together.
+#: Limits on the error of an exact flow's step and of its episode, and on that of any episode: a multiple of
+#: one rounding of its start, as amplified by the system, or the sum of the series' truncation errors.
 LARGEST_STEP, LARGEST_ERROR, ROUNDINGS = 1e-15, 1e-13, 100.0
-#: What any scene promises of a step. The certificate asks for less, but measures a velocity by energy: that
-#: of a light body may be small beside what it is measured by.
+#: The accuracy that any scene promises of a step. The certificate requires less truncation error, but
+#: measures a velocity by energy, and a light body's velocity may be small compared to that measure.
 PROMISED = 1e-12
-APART = 1e9  #: by this factor at least, Gymnasium's errors are to be larger than ours
-#: The undriven pendulum is let go at rest, this far from hanging [rad]; it is compared over the first, its
-#: energy over the second time [s].
+APART = 1e9  #: Gymnasium's errors should be larger than ours by at least this factor
+#: The undriven pendulum is released at rest, this far from hanging [rad]; it is compared over the first time,
+#: its energy over the second [s].
 RELEASED, COMPARED, LONG = 2.5, 10.0, 100.0
 MARKS = ("one step", *(f"{t:g} s" for t in TIMES), "the end")
 BLUE, GREY = "#0072b2", "#666666"
@@ -33,7 +33,7 @@ COLOURS = {"Pendulum-v1": "#d55e00", "CartPole-v1": "#cc79a7", "Acrobot-v1": "#0
 
 
 def content(rows: list[Row], problems: list[Result]) -> Content:
-    """Return what the section shows."""
+    """Return the section's content."""
     cases = {case: [r for r in rows if r["case"] == case] for case in dict.fromkeys(r["case"] for r in rows)}
     episodes = {case: group for case, group in cases.items() if group[0]["seed"] is not None}
     free = {case: group for case, group in cases.items() if group[0]["seed"] is None}
@@ -46,8 +46,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
                 "Error of whole episodes (the first 1,000 steps of longer ones), relative to the size of the "
                 "state, as the largest up to a time. "
                 "One line per episode, and for CartPole-v1 another for its update carried on past its end. "
-                "The exact states are computed to more than 30 digits. Dotted, in the same colours: what "
-                "one rounding of the start grows to, in exact arithmetic.",
+                "The exact states are computed to more than 30 digits. Dotted, in the same colours: one "
+                "rounding of the start, propagated in exact arithmetic.",
                 lambda: _draw_all(episodes),
             ),
             Picture(
@@ -73,26 +73,27 @@ def _text() -> list[str]:
         "Episodes are recorded from gym.make under random actions: float64 states, and the controls that "
         "were applied. The exact motion has the same start and the same controls, without rounding in "
         f"between. The oracle computes it with {DIGITS} digits, and for the first seed of ours again with "
-        f"{DIGITS + 12}. Where a task kicks, the kicks are computed by its own formula from the "
+        f"{DIGITS + 12}. Where a task has random kicks, they are computed by its own formula from the "
         "environment's own random numbers, without rounding.",
         "Gymnasium's equations are those of scenes with the parameters of each instance. Its environments "
         "clip velocities: such episodes are left out, and the next seed is taken. Angles that Acrobot-v1 "
-        "wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, as its "
-        "actions are; that counts as its error. CartPole-v1 falls within a second under random actions, so "
+        "wraps are compared up to whole turns. Pendulum-v1 rounds the torque's part to float32, since its "
+        "actions are float32; that counts as its error. CartPole-v1 falls within a second under random "
+        "actions, so "
         "its update is also continued past that end, to 10 s.",
         "An error is the largest over the entries of the state and over the time until then, each entry "
-        "relative to the largest that it gets in the episode, at least 1 in SI units. No method that starts "
+        "relative to its largest size in the episode, at least 1 in SI units. No method that starts "
         "from float64 numbers can do better than about one rounding of the start, amplified by the system. "
         "So this rounding floor is shown too: every entry of the start is moved by 2^-53 of its size, and "
         "propagated exactly. Where the system damps or does not amplify, roundings of later steps add to it.",
-        "The exact flows of pendulum and linear motion leave out less than a rounding. A step of the general "
-        "series is divided until each part, as its certificate says, leaves out less than "
-        f"{TOLERANCE:g} of a velocity's size, and no further. Where steps are long, or friction changes "
-        "within a narrow range of speeds, it leaves out nearly that much, which is many roundings.",
+        "The exact flows of pendulum and linear motion have a truncation error below rounding. A step of the "
+        "general series is divided until the truncation error of each part, as its certificate says, is less "
+        f"than {TOLERANCE:g} of a velocity's size, and no further. Where steps are long, or friction changes "
+        "within a narrow range of speeds, it comes close to that limit, which is many roundings.",
         "The error of one step is the largest of any step of the episode. Each step is repeated in exact "
         "arithmetic from the state recorded before it, and compared with the state recorded after it. "
         "Ours carry cosine and sine beside the angle. If an angle has grown to many turns, its rounding "
-        "and theirs differ, and that counts as error too.",
+        "and theirs differ, and this counts as error too.",
     ]
 
 
@@ -115,7 +116,7 @@ def _is_general(row: Row) -> bool:
 
 
 def _share(row: Row) -> float:
-    """Return an episode's error as a share of its limit with the general series."""
+    """Return an episode's error relative to its limit with the general series."""
     limit = max(ROUNDINGS * row["amplified"]["the end"], TOLERANCE * row["steps"])
     return row["error"]["the end"] / limit
 
@@ -154,8 +155,8 @@ def _cases_table(episodes: dict[str, list[Row]], failed: dict[str, str]) -> Tabl
     lines += [[name, *empty, problem] for name, problem in failed.items()]
     return Table(
         "environment-errors",
-        "Errors relative to the size of the state. Largest over the episodes where not said otherwise; "
-        "empty where an episode was over before.",
+        "Errors relative to the size of the state. Largest over the episodes unless stated otherwise; "
+        "empty if an episode had ended before.",
         columns,
         lines,
     )
@@ -171,7 +172,7 @@ def _entries_table(cases: dict[str, list[Row]]) -> Table:
     return Table(
         "environment-entries",
         "Errors of each entry of the state in its unit, the largest over the episodes. Size: the largest "
-        "that the entry gets, at least 1.",
+        "that the entry reaches, at least 1.",
         ["environment", "entry", "unit", "size", *map(_column, MARKS)],
         lines,
     )
@@ -185,11 +186,11 @@ def _free_table(free: dict[str, list[Row]]) -> Table:
         lines.append([*steps, row["amplified"]["10 s"], _ratio(row), 100.0 * row["gain"]])
     return Table(
         "environment-undriven",
-        f"A pendulum without control, let go at rest {RELEASED} rad from hanging: error of its angle, and by "
-        f"how much its energy above rest grows in {LONG:g} s, where it should stay. Ours has the equation of "
-        "motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its series is laid out for, so "
-        "the error is truncation within the 1e-12 rad/s that a step may leave out; with 0.02 s only rounding "
-        "is left. CartPole-v1 is given no force.",
+        f"A pendulum without control, released at rest {RELEASED} rad from hanging: the error of its angle, "
+        f"and how much its energy above rest, which should be constant, grows in {LONG:g} s. Ours has the "
+        "equation of motion of Pendulum-v1. A step of 0.05 s is 2.5 times the one that its series is "
+        "designed for, so the error is truncation within the 1e-12 rad/s allowed per step; with 0.02 s "
+        "only rounding is left. CartPole-v1 is given no force.",
         [
             *("case", "integrator", "dt [s]", "angle, one step [rad]", "up to 1 s [rad]"),
             *("up to 10 s [rad]", "amplified rounding", "error over amplified rounding"),
@@ -228,8 +229,8 @@ def _summary(episodes: dict[str, list[Row]]) -> Table | None:
     return Table(
         "environments",
         "Error against the exact motion under the same controls, relative to the size of the state; the "
-        "largest over random episodes. One step: the largest over all of their steps. Last column: over what "
-        "one rounding of the start grows to by itself.",
+        "largest over random episodes. One step: the largest over all of their steps. Last column: the "
+        "error over one rounding of the start as amplified by the system.",
         ["environment", "integrator", "one step", "whole episode", "length [s]", "error / rounding floor"],
         lines,
     )
@@ -250,8 +251,8 @@ def _claims(rows: list[Row]) -> list[Claim]:
     worst = max(series, key=_share, default=None)
     claims = [
         Claim(
-            f"With exact flows every error stays below {ROUNDINGS:g} times one rounding of the start, as the "
-            "system itself amplifies it.",
+            f"With exact flows every error stays below {ROUNDINGS:g} times one rounding of the start, as "
+            "amplified by the system itself.",
             _ratio(above) <= ROUNDINGS if above else None,
             f"{_ratio(above):.2g} times in {above['case']}, of {len(flows)} episodes" if above else "",
         ),
@@ -272,8 +273,8 @@ def _claims(rows: list[Row]) -> list[Claim]:
             f"{furthest['error']['the end']:.2g} in {furthest['case']}" if furthest else "",
         ),
         Claim(
-            f"Every episode of Gymnasium's is off by more than {APART:g} times the largest error of ours "
-            "that have the same equations.",
+            f"Every episode of Gymnasium's environments is off by more than {APART:g} times the largest "
+            "error of ours that have the same equations.",
             least["error"]["the end"] > APART * twin["error"]["the end"] if twin and least else None,
             f"{least['case']}: at least {least['error']['the end']:.2g}, "
             f"{least['error']['the end'] / twin['error']['the end']:.1g} times that of {twin['case']}"
@@ -316,7 +317,7 @@ def _colour(row: Row) -> str:
 
 
 def _curve(row: Row) -> tuple[list[float], list[float], list[float]]:
-    """Return times, errors and amplified roundings; what is exactly 0 is drawn at the picture's lower end."""
+    """Return times, errors and amplified roundings; exact zeros are drawn at the picture's lower end."""
     times, errors, amplified = zip(*row["curve"], strict=True)
     return list(times), [max(e, 1e-19) for e in errors], list(amplified)
 

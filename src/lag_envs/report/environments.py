@@ -1,8 +1,8 @@
-"""The error of whole episodes: every environment of ours, and Gymnasium's of the same kind.
+"""The error of whole episodes: every environment of ours, and those of the same kind in Gymnasium.
 
 An episode is recorded as it comes out of ``gym.make``: its float64 states, and the controls that were
 applied. `episodes` compares it with the exact one, `gymnasium_peers` has Gymnasium's equations, and
-`environment_results` tells what the errors come to.
+`environment_results` presents the errors.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lag_envs.tasks.pivoted_bar import SwingUpFree
 __all__ = ["content", "jobs", "ours", "theirs", "undriven"]
 
 SECTION = "environments"
-#: Control steps of an episode at most: each is followed several times to more than 30 digits.
+#: Longest episode in control steps: each is followed several times to more than 30 digits.
 MOST_STEPS = 1_000
 
 
@@ -51,7 +51,7 @@ def jobs(quick: bool) -> list[Job]:
             {"id": id, "seed": seed, "duration": 1.0 if quick else longest(kind())}, timeout=600.0,
         )
         for id, kind in TASKS.items()
-        if not kind.imperfections  # their motion is that of another
+        if not kind.imperfections  # the motion is the same as that of another id
         for seed in seeds
     ]  # fmt: skip
     made += [
@@ -72,7 +72,7 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def longest(task: Task) -> float | None:
-    """Return for how long an episode is followed, or None for the whole of it."""
+    """Return how long an episode is followed [s], or None for the whole of it."""
     return MOST_STEPS * task.dt if task.limit > MOST_STEPS else None
 
 
@@ -90,7 +90,7 @@ def ours(id: str, seed: int, duration: float | None = None) -> Iterator[Row]:
 
 
 def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) -> Row:
-    """Return the row of an episode of ours; if asked, computed twice, with how far the two lie apart."""
+    """Return the row of an episode of ours; if asked, computed twice, with the difference of the two."""
 
     def exact(start: Sequence[Any], digits: int = DIGITS) -> list[list[mpf]]:
         return replay(task, seed, start, episode.controls, digits)
@@ -118,7 +118,8 @@ def against_exact(task: Task, episode: Episode, seed: int, vouch: bool = False) 
 def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
     """Yield rows of one of Gymnasium's environments under random actions.
 
-    CartPole-v1 falls within half a second; a second row goes on to 10 s, by its own update, as if it had not.
+    CartPole-v1 falls within half a second; a second row goes on to 10 s, by its own update, as if it had not
+    ended.
     """
     seconds = seconds or {"Acrobot-v1": 100.0}.get(id, 10.0)
     steps = round(seconds / PEERS[id].step(gym.make(id, disable_env_checker=True).unwrapped))
@@ -132,7 +133,7 @@ def theirs(id: str, seed: int, seconds: float | None = None) -> Iterator[Row]:
 
 # --- the undriven pendulum ---
 
-#: Peers, what gives them no force, and the action for it.
+#: Peers, a change that removes their force, and the action for it.
 UNDRIVEN: dict[str, tuple[dict[str, float], Any]] = {
     "Pendulum-v1": ({}, np.zeros(1, np.float32)),
     "CartPole-v1": ({"force_mag": 0.0}, 0),
@@ -148,11 +149,11 @@ TWIN: dict[str, Any] = {
 
 
 def undriven(id: str = "", dt: float = 0.05) -> Iterator[Row]:
-    """Yield a row of a pendulum without control, let go at rest: a peer's, or ours with the same equation.
+    """Yield a row of a pendulum without control, released at rest: a peer's, or ours with the same equation.
 
-    ``dt`` is the control step of ours [s], by default that of Pendulum-v1.
+    ``dt`` is our control step [s], by default that of Pendulum-v1.
 
-    ``gain`` is the share by which energy above rest grows in 100 s.
+    ``gain`` is the relative growth of energy above rest in 100 s.
     """
     if not id:
         env: Any = gym.make(SwingUpFree.id, disable_env_checker=True, **TWIN, dt=dt)

@@ -1,8 +1,8 @@
 """Recorded episodes, and their errors against exact ones.
 
 From the same start, under the same controls, the exact states are computed to more than 30 digits by chaining
-control steps whose states are not rounded in between. For the error of one step, every step of the episode is
-taken again by itself, from the state that was recorded.
+control steps without rounding the states in between. For the error of one step, every step of the episode is
+repeated by itself, from the recorded state.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 
 EPS = 2.0**-53
 DIGITS = 34
-#: Errors are told up to these times [s], and up to the end.
+#: Errors are given up to these times [s], and up to the end.
 TIMES = (1.0, 5.0, 10.0)
 POINTS = 120  #: of a curve in the picture
 
 
 class Episode(NamedTuple):
-    """What was recorded: ``controls[i]`` was held from ``states[i]`` to ``states[i + 1]``."""
+    """A recorded episode: ``controls[i]`` was held from ``states[i]`` to ``states[i + 1]``."""
 
     states: Array
     controls: list[float]
@@ -41,7 +41,7 @@ class Episode(NamedTuple):
 
 
 def play(env: gym.Env, actions: Iterator[Any]) -> Episode:
-    """Record an episode of one of our environments, which has been reset."""
+    """Record an episode of one of our environments, which has just been reset."""
     inner: Any = env.unwrapped
     states, controls, terminated, truncated = [inner.state], [], False, False
     while not (terminated or truncated):
@@ -59,9 +59,9 @@ def random_actions(env: gym.Env, seed: int) -> Iterator[Any]:
 
 
 def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int, float], list[mpf]]:
-    """Return what takes one exact step of our environment: from a state, with a number from 1 and a control.
+    """Return a function for exact steps of our environment, from a state, with a number from 1 and a control.
 
-    Kicks are those of the first episode after a reset with that seed, made by the task's own formula from the
+    Kicks are those of the first episode after a reset with that seed, from the task's own formula and the
     environment's own random numbers, which are a function of seed, episode and step. They are multiples of
     2**-52, so they are exact.
     """
@@ -71,7 +71,7 @@ def stepping(task: Task, seed: int, digits: int) -> Callable[[Sequence[Any], int
     key = np.uint64(episode_key(np.uint64(seed), np.uint64(1)))  # a plain integer would be taken as signed
 
     def step(state: Sequence[Any], number: int, control: float) -> list[mpf]:
-        # One computation; whole episodes are vouched for by a second one with more digits.
+        # One computation; whole episodes are checked by a second one with more digits.
         state = oracle.once(state, control, task.dt, digits)
         with mp.workdps(digits + 30):
             draws = [float(uniform(key, np.uint64(number), np.uint64(i))) for i in range(task.draws)]
@@ -95,7 +95,7 @@ def replay(
 
 
 def sizes(states: Array) -> Array:
-    """Return the size of each state entry: the largest it gets in the episode, at least 1."""
+    """Return the size of each state entry: its largest in the episode, at least 1."""
     return np.maximum(1.0, np.abs(states).max(axis=0))
 
 
@@ -113,22 +113,22 @@ def compare(
     dt: float,
     wraps: Sequence[int] = (),
 ) -> Row:
-    """Return errors and amplified rounding, each as the largest up to a time, relative to the states' sizes.
+    """Return errors and amplified rounding, each the largest up to a time, relative to the states' sizes.
 
-    "one step" is the largest error that any step of the episode makes by itself.
+    "one step" is the largest error of any single step of the episode.
 
     Parameters
     ----------
     episode : Episode
-        What was recorded.
+        The recorded episode.
     path, shifted : list of list of mpf
-        The exact states from the same start, and from the start that was moved by a rounding.
+        The exact states from the same start, and from the start moved by a rounding.
     alone : list of list of mpf
-        For each step the exact state at its end, from the recorded state at its start.
+        For each step, the exact state at its end, from the recorded state at its start.
     dt : float
         Control step [s].
     wraps : sequence of int
-        Entries that the environment brings back into [-π, π].
+        Entries that the environment wraps into [-π, π].
     """
     states, scale = episode.states, sizes(episode.states)
 

@@ -1,8 +1,8 @@
-"""Problems as every rival is given them: y' = rate(t, y, p) on generic numbers; arrays of starts.
+"""Problems in the form that every rival takes: y' = rate(t, y, p) on generic numbers; arrays of starts.
 
 `Problems` makes them of a scene's cases by the scene's own flow and coefficients, so that all solve the same
-equation. Any other equation will do as well: what a rival needs is an `Equation`, the arrays, and a way
-back from its unknowns to states.
+equation. Any other equation will do as well: a rival needs an `Equation`, the arrays, and a way back from its
+unknowns to states.
 
 Examples
 --------
@@ -36,12 +36,12 @@ class Equation(ABC):
     """A system of first order; equal ones share compiled code, so they are hashable."""
 
     size: int  #: number of unknowns
-    lifted: int  #: the same with cosines and sines as unknowns of their own
-    parameters: int  #: numbers that a problem has of its own, held over the time
+    lifted: int  #: the same, with cosines and sines as additional unknowns
+    parameters: int  #: numbers that each problem has of its own, constant in time
 
     @abstractmethod
     def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
-        """Return y'; where `y` is lifted, no function of `xp` is called."""
+        """Return y'; if `y` is lifted, no function of `xp` is called."""
 
     def stepper(self, method: str, carried: bool) -> Callable:
         """Return ``step(y, p, t, h, xp)`` of one of `METHODS`.
@@ -51,7 +51,7 @@ class Equation(ABC):
         Raises
         ------
         ValueError
-            For a method that needs to know more than the rate.
+            For a method that needs more than the rate.
         """
         tableau = METHODS[method].tableau
         if tableau is None:
@@ -67,14 +67,14 @@ class Equation(ABC):
 
 @dataclass(frozen=True)
 class NormalForm(Equation):
-    """The equation of motion of one of the three flows, with only the terms that are there.
+    """The equation of motion of one of the three flows, with only its nonzero terms.
 
     Parameters
     ----------
     kind : type
-        The flow's coefficients. Behind them, `p` has the turning plane's angle at the start.
+        The flow's coefficients. After them, `p` has the turning plane's angle at the start.
     present : tuple of bool
-        Which of the coefficients are not zero.
+        Tells which coefficients are not zero.
     """
 
     kind: type
@@ -89,16 +89,16 @@ class NormalForm(Equation):
 
     @property
     def parameters(self) -> int:  # type: ignore[override]
-        """Number of coefficients that are there, and the angle."""
+        """Number of nonzero coefficients, plus the angle."""
         return sum(self.present) + (self.kind is slope.TurningSlope)
 
     def coefficients(self, p: Sequence) -> Any:
-        """Return the flow's coefficients; those that are not there are a literal 0.0."""
+        """Return the flow's coefficients; the missing ones are a literal 0.0."""
         given = iter(p)
         return self.kind(*(next(given) if there else 0.0 for there in self.present))
 
     def rate(self, t: Any, y: Sequence, p: Sequence, xp: Any) -> tuple:
-        """Return (q', v'), and where cosine and sine are among the unknowns, their rates too."""
+        """Return (q', v'), and the rates of cosine and sine if these are among the unknowns."""
         return rate(self.coefficients(p), t, y, xp, p[-1])
 
     def stepper(self, method: str, carried: bool) -> Callable:
@@ -123,7 +123,7 @@ class Problems:
     Parameters
     ----------
     cases : sequence of Case
-        The problems; each control is held.
+        The problems; each control is constant.
     """
 
     def __init__(self, cases: Sequence[Case]) -> None:
@@ -139,7 +139,7 @@ class Problems:
             np.broadcast_to(x, self._u.shape) for x in scene.drive(self._lifted, self._u, self._k, np)
         ])  # fmt: skip
         present = tuple(bool(row.any()) for row in coefficients)
-        #: What is solved.
+        #: The equation to solve.
         self.equation: Equation = NormalForm(flow.coefficients, present)
         rows = [row for row, there in zip(coefficients, present, strict=True) if there]
         if flow.coefficients is slope.TurningSlope:
@@ -155,7 +155,7 @@ class Problems:
         return len(self.cases)
 
     def states(self, y: Array, span: float) -> Array:
-        """Return the scene's states, one per line, of unknowns after the control was held for some time."""
+        """Return the scene's states, one per line, from unknowns after the control was held for some time."""
         moved = [*y[:2], *self._variables[2:]]
         ends = self._stepped.pack(moved, self._lifted, self._u, span, self._k)
         return np.stack(ends[: len(self._stepped.form.state_names)], axis=1)

@@ -1,4 +1,4 @@
-"""The named stiff and extreme cases, what is expected of each, and how one of them is measured."""
+"""The named stiff and extreme cases, the expected outcome of each, and how one of them is measured."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
 EPS = 2.0**-53
-#: What README calls exact, as a share of the scales; and how many roundings of the state are allowed beside.
+#: README's accuracy, relative to the scales; and how many roundings of the state are allowed in addition.
 EXACT, ROUNDINGS = 1e-12, 10.0
 
 FULL, AMPLIFIED, REFUSED = "full accuracy", "amplified rounding", "refused with an error"
 
 
 class Extreme(NamedTuple):
-    """A step that asks much; the scene is made when it is measured, since that may be what is refused."""
+    """A demanding step; the scene is made when it is measured, since making it may already be refused."""
 
     scene: str
     parameters: dict[str, Any]
@@ -116,7 +116,7 @@ EXTREMES = {
     "step of 0 s": _bar((1.0, 0.0), 0.0, 0.0, REFUSED),
 }
 
-#: What `lag-envs report --quick` and the tests take.
+#: The cases of `lag-envs report --quick` and the tests.
 QUICK = (
     "damping, gamma dt = 1e4",
     "damping, gamma dt = 1e6",
@@ -135,17 +135,17 @@ QUICK = (
 
 
 def amplification(case: Case, dt: float) -> list[float]:
-    """Return how much larger one rounding of the start is at the step's end, whatever the method.
+    """Return by how much one rounding of the start is amplified at the step's end, whatever the method.
 
     Every entry of the state is moved up and down by 2**-53 times its size; for angles the size is at least
     1 rad, since cosine and sine are stored to absolute precision, for a pendulum's rate at least
-    (α² + β²)^¼. The moves are of finite size: next to the unstable equilibrium they count what a rounding
-    really does, where a derivative would say too much or too little.
+    (α² + β²)^¼. The moves are of finite size: next to the unstable equilibrium they show what a rounding
+    really does, where a derivative would give too much or too little.
 
     Returns
     -------
     list of float
-        For each entry at the end the sum over the moved entries of its change, divided by 2**-53.
+        For each entry at the end, the sum over the moved entries of its change, divided by 2**-53.
     """
     scene, state, control = case
     base = reference.remembered(scene, state, control, dt)
@@ -178,7 +178,7 @@ def _floor(case: Case, entry: int) -> float:
 
 
 def substeps(case: Case, dt: float) -> int:
-    """Return how many substeps the step takes; negative where it is refused."""
+    """Return how many substeps the step takes; negative if it is refused."""
     scene, state, control = case
     stepped = Stepped(scene, dt=dt)
     y = map(float, stepped.lift(np.asarray(state, dtype=np.float64)))
@@ -188,17 +188,17 @@ def substeps(case: Case, dt: float) -> int:
 
 
 def build(extreme: Extreme) -> Case:
-    """Return the case; raises what the scene raises."""
+    """Return the case; raises the scene's own errors."""
     scene: Scene = getattr(scenes, extreme.scene)(**extreme.parameters)
     return Case(scene, tuple(map(float, extreme.state)), extreme.control)
 
 
 def measure(name: str) -> Row:
-    """Take a case's step and return a row of what came of it.
+    """Take a case's step and return a row with its outcome.
 
     ``error`` is the largest error of an entry relative to its scale, ``amplification`` the largest effect of
-    a rounding relative to the same, ``roundings`` the largest error of an entry over what one rounding of the
-    start, or of the end itself, makes there. All are None where the step was refused.
+    a rounding relative to the same, ``roundings`` the largest error of an entry over the effect of one
+    rounding of the start, or of the end itself. All are None if the step was refused.
     """
     extreme = EXTREMES[name]
     row: Row = {"name": name, "scene": extreme.scene, "expected": extreme.expected, "dt": extreme.dt}

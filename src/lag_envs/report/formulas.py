@@ -1,4 +1,4 @@
-"""SymPy's expressions as lists of operations: on numbers of any kind, and as Taylor series of balls."""
+"""SymPy's expressions as lists of operations, for numbers of any kind and for Taylor series of balls."""
 
 from __future__ import annotations
 
@@ -15,22 +15,23 @@ class Formulas:
     Parameters
     ----------
     expressions : sequence of sympy.Expr
-        What is computed.
+        The expressions to compute.
     inputs, held : sequence of sympy.Symbol
-        What they depend on; `held` does not change in time. All other symbols are constants, which are bound
-        once for each scene.
+        Their variables; `held` does not change in time. All other symbols are constants, which are bound once
+        per scene.
     """
 
     def __init__(self, expressions: Sequence[Any], inputs: Sequence[Any], held: Sequence[Any]) -> None:
         self.constants: list[Any] = []
-        #: Operations with the places of what they take; each adds one value, or two, to those of the inputs.
+        #: Operations with the indices of their arguments; each appends one value, or two, to those of the
+        #: inputs.
         self.program: list[tuple[str, tuple[int, ...]]] = []
         self._place: dict[Any, int] = {x: i for i, x in enumerate((*inputs, *held))}
         self._inputs, self.size = set(self._place), len(self._place)
-        #: Places of what does not change in time.
+        #: Indices of values that do not change in time.
         self.held = set(range(len(inputs), self.size))
         shared, rest = sympy.cse([min(e, reduced(e), key=sympy.count_ops) for e in expressions])
-        constant: dict[Any, Any] = {}  # what is shared but constant goes back to where it came from
+        constant: dict[Any, Any] = {}  # a shared constant is put back into place
         for symbol, expression in shared:
             if (expression := expression.xreplace(constant)).free_symbols & self._inputs:
                 self._place[symbol] = self._of(expression)
@@ -40,7 +41,7 @@ class Formulas:
         self.found = [self._of(e.xreplace(constant)) for e in rest]
 
     def _of(self, e: Any) -> int:
-        """Return the place of an expression's value, after operations that compute it."""
+        """Return the index of an expression's value, after adding the operations that compute it."""
         if e not in self._place:
             place = self._made(e)
             self._place.setdefault(e, place)
@@ -67,7 +68,7 @@ class Formulas:
             return self._add("sum", *parts, *([self._of(fixed)] if fixed else []))
         if e.is_Mul:
             fixed, moving = e.as_independent(*self._inputs, as_Add=False)
-            # What is held comes first, so that its products are numbers.
+            # Held factors come first, so that their product is a number.
             places = sorted(
                 (self._of(part) for part in sympy.Mul.make_args(moving)), key=lambda p: p not in self.held
             )
@@ -139,9 +140,9 @@ class Series:
     Parameters
     ----------
     formulas : Formulas
-        What is computed.
+        The expressions to compute.
     given : sequence of list of flint.arb
-        Coefficients of the inputs, which their owner makes longer; those that are held, at the end, have one.
+        Coefficients of the inputs, which the caller extends; the held ones, at the end, have one.
     constants : sequence of flint.arb
         The formulas' constants.
     """
@@ -155,7 +156,7 @@ class Series:
         self.found = [self._y[i] for i in formulas.found]
 
     def extend(self) -> None:
-        """Find one more coefficient of all, when the inputs have one more."""
+        """Compute one more coefficient of all series, when the inputs have one more."""
         y, c, held = self._y, self._constants, self._formulas.held
         out, k = self._first, len(y[0]) - 1
         for operation, at in self._formulas.program:

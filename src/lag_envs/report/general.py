@@ -1,8 +1,8 @@
-"""Scenes that are nothing but energies: error against time beside other engines, certificates, energy.
+"""Scenes defined by energies alone: error against time beside other engines, certificates, energy.
 
-Each system is stepped for one control step from the same harsh states, every joint turning fast at once. All
-rivals run in compiled loops, many states in one call, and the errors are those of the calls that are timed.
-What other engines are given is proved to be the same model first.
+Each system takes one control step from the same harsh states, with every joint turning fast at once. All
+rivals run in compiled loops, many states in one call, and the errors are those of the timed calls. Other
+engines' models are first checked to be the same.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from lag_envs.stepping.general import code_of
 __all__ = ["certified", "content", "errors", "jobs", "measured", "shares"]
 
 SECTION = "general"
-#: Copies of the states in a timed call, tolerances and orders of ours.
+#: Copies of the states in a timed call; our tolerances and orders.
 COPIES = 8
 TOLERANCES: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12, 1e-14)
 ORDERS: Sequence[int] = tuple(range(4, 25, 2))
-#: Settings of the others.
+#: Settings of the other methods.
 HEYOKA: Sequence[float] = (1e-2, 1e-3, 1e-4, 1e-6, 1e-7, 1e-9, 1e-10, 1e-12, 1e-13, 1e-15)
 SUBSTEPS = {
     "RK4": (1, 2, 4, 8, 16, 32, 64, 128, 256, 512),
     "DOP853": (1, 2, 3, 4, 6, 8, 12, 16, 32),
     CompiledRadau.METHOD: (1, 2, 4, 8, 16, 32, 64),
 }
-#: Lengths of a step that the certificate is asked for [s].
+#: Step lengths at which the certificate is tried [s].
 LENGTHS = (0.005, 0.01, 0.02, 0.05, 0.1)
 FAMILIES = ("compiled", "heyoka", *ENGINES)
-#: The order of the clock, with which every job's samples are taken in turn.
+#: Tolerance and order of the clock, which is timed in turn with every job's samples.
 CLOCK = (1e-12, 16)
-#: Seconds over which energy is watched.
+#: Seconds over which energy is recorded.
 LONG = 1000.0
-#: Prints the seconds until a scene has made its first step.
+#: Prints the seconds that a scene takes to its first step.
 FIRST = """
 from math import inf
 from time import process_time
@@ -68,7 +68,7 @@ print(process_time() - begin)
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Return the jobs: exact ends, equality of models, then all that is timed."""
+    """Return the jobs: exact end states, equality of models, then everything that is timed."""
     names = ["cart-pole"] if quick else list(SYSTEMS)
     families = [f for f in FAMILIES if not (quick and f == "pinocchio")]
     count = 8 if quick else MEMBERS
@@ -104,14 +104,14 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def exact(name: str, count: int) -> Iterator[Row]:
-    """Compute the exact ends, which are kept for the other jobs."""
+    """Compute the exact end states, which are kept for the other jobs."""
     system = SYSTEMS[name]
     high, _ = ends(system.scene, *system.draw(count), DT)
     yield {"kind": "exact", "system": name, "states": len(high)}
 
 
 def models(name: str, engine: str) -> Iterator[Row]:
-    """Yield how far an engine's model is from the scene's equations by SymPy."""
+    """Yield the difference of an engine's model from the scene's equations by SymPy."""
     about = {"kind": "model", "system": name, "engine": engine}
     try:
         mass, acceleration = differences(SYSTEMS[name], engine)
@@ -125,7 +125,7 @@ def models(name: str, engine: str) -> Iterator[Row]:
 
 
 def rivals(family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours are with those that our machinery compiles."""
+    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
     some: slice = slice(-1, None, -5) if quick else slice(None)
     if family == "heyoka":
         methods = ("Taylor",) if quick else ("Taylor", Heyoka.NARROW)
@@ -172,7 +172,7 @@ def measured(
     about: Mapping[str, Any],
     dt: float = DT,
 ) -> Iterator[Row]:
-    """Yield errors and times of rivals, those of a call from all states, taken in turn with a clock's."""
+    """Yield errors and times of rivals, for calls with all states, timed in turn with a clock."""
     together = mode == "batch"
     found: list[Row] = []
     samples: list[Sample] = []
@@ -200,7 +200,7 @@ def measured(
 
 
 def errors(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, float | None]:
-    """Return worst and median over states of the largest entry's error, relative to max(1, |entry|)."""
+    """Return the worst and median error over states, of the largest entry relative to max(1, |entry|)."""
     high, low = truth
     some = found[: len(high)]
     if not np.isfinite(some).all():
@@ -210,7 +210,7 @@ def errors(found: Array, truth: tuple[Array, Array]) -> tuple[float | None, floa
 
 
 def again(sample: Sample, least: int = 10_000) -> Sample:
-    """Return the sample so often repeated from its start that it has so many steps, if they are quick."""
+    """Return a quick sample, repeated from its start until it has at least so many steps."""
     sample.end()
     begin = process_time()
     sample.end()
@@ -238,7 +238,7 @@ def certificate(name: str, count: int) -> Iterator[Row]:
 
 
 def certified(scene: Any, states: Array, controls: Array, dt: float, order: int) -> tuple[list[int], Array]:
-    """Return the attempts of each step, not positive where it was refused, and its largest bound."""
+    """Return each step's attempts, not positive if it was refused, and the largest bound of any step."""
     code, numbers = code_of(scene)
     attempts, bounds = [], []
     for state, held in zip(states.tolist(), controls.tolist(), strict=True):
@@ -249,7 +249,7 @@ def certified(scene: Any, states: Array, controls: Array, dt: float, order: int)
 
 
 def shares(attempts: Sequence[int]) -> Row:
-    """Return the share of steps certified in one attempt, the mean of attempts, and how many were refused."""
+    """Return the share of steps certified in one attempt, the mean of attempts, and the number refused."""
     taken = [a for a in attempts if a > 0]
     return {
         "share": sum(a == 1 for a in attempts) / len(attempts),
@@ -259,7 +259,7 @@ def shares(attempts: Sequence[int]) -> Row:
 
 
 def first(name: str, rounds: int) -> Iterator[Row]:
-    """Yield the seconds until the first step: ours with an empty and a filled cache, heyoka's compiling."""
+    """Yield the seconds until the first step: ours with an empty and a filled cache, heyoka's compilation."""
     system = SYSTEMS[name]
     state, control = (x[0].tolist() for x in system.draw(1))
     script = FIRST.format(scene=system.scene, state=state, control=control, dt=DT)
@@ -290,7 +290,7 @@ def _heyoka(system: System, mode: str) -> float:
     problems = SceneProblems(system.scene, *system.draw(1), system)
     width = 1 if mode == "single" else 2 * heyoka.recommended_simd_size()
     state: Any = heyoka.llvm_state
-    # What it has compiled before, on this day or another, does not count; version 7 keeps it on disk too.
+    # Earlier compilations, today's or older, must not count; version 7 keeps them on disk too.
     state.clear_memcache()
     switch = getattr(state, "set_diskcache_enabled", lambda on: None)
     switch(False)
@@ -303,9 +303,9 @@ def _heyoka(system: System, mode: str) -> float:
 
 
 def energy(quick: bool) -> Iterator[Row]:
-    """Yield how far the energy of undamped double pendulums is from where it was, relative to its range.
+    """Yield how far the energy of undamped double pendulums drifts, relative to its range.
 
-    Ours over the whole path, the others at its end.
+    Ours over the whole path, the others at the end.
     """
     scene = SYSTEMS["double pendulum, driven"].scene
     count, steps = (1, 500) if quick else (4, round(LONG / DT))

@@ -1,4 +1,4 @@
-"""What errors and times of scenes of energies come to: tables, claims, pictures."""
+"""Results on scenes defined by energies: errors and times as tables, claims, pictures."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from lag_envs.stepping.series import TOLERANCE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Length of the control step [s], and states that it is taken from.
+#: Length of the control step [s], and the number of start states.
 DT, MEMBERS = 0.02, 200
-#: Orders that the certificate is asked for.
+#: Orders at which the certificate is tried.
 CERTIFIED_ORDERS = (12, 14, 16, 18, 20, 22)
 #: Errors at which times are compared.
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
 MODES = {"single": "alone", "batch": "in a batch"}
 LABELS = {"heyoka": "heyoka", "mujoco": "MuJoCo", "pinocchio": "Pinocchio", "compiled": "compiled"}
-#: Models count as equal to this, relative; so much may be lost of energy.
+#: Largest difference of equal models, and largest loss of energy, relative.
 EQUAL, DRIFT = 1e-12, 1e-9
 
 
 class Best(NamedTuple):
-    """The quickest setting of a method that reaches an error."""
+    """A method's quickest setting that reaches an error."""
 
     ns: float
     label: str
@@ -47,7 +47,7 @@ def label(row: Row) -> str:
 
 
 def column(row: Row) -> str:
-    """Return whose column a point belongs to: compiled methods have one each."""
+    """Return a point's column: compiled methods have one each."""
     if row["family"] == "ours":
         return "lag_envs"
     if row["family"] == "compiled":
@@ -55,11 +55,11 @@ def column(row: Row) -> str:
     return LABELS[row["family"]]
 
 
-#: Those that are compared with, and in which columns they are.
+#: The rivals to compare with, and their columns.
 OTHERS = (
     ("other libraries", ("heyoka", "MuJoCo", "Pinocchio")),
     (
-        "steps of one length without a bound, compiled as ours is",
+        "fixed-step methods without a bound, compiled like ours",
         ("RK4, compiled", "DOP853, compiled", "Radau IIA, compiled"),
     ),
 )
@@ -69,7 +69,8 @@ COLUMNS = (*OTHERS[0][1], *OTHERS[1][1])
 def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
     """Return, by system, mode and error, the quickest setting of each column.
 
-    Times are in ours of one job, by the clock that every job has taken; what has no batch is in it as alone.
+    Times are in units of ours in one job, by the clock of every job. A method without a batch counts there as
+    it does alone.
     """
     points = [r for r in rows if r["kind"] == "point" and "ns" in r and r["error"] is not None]
     clocks: dict[tuple[str, str], float] = {}
@@ -90,7 +91,7 @@ def best(rows: Sequence[Row]) -> dict[tuple[str, str, float], dict[str, Best]]:
 
 
 def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
-    """Return what is shown: times at equal errors, equality of models, certificates, first steps, energy."""
+    """Return the content: times at equal errors, equality of models, certificates, first steps, energy."""
     found = best(rows)
     missing = sorted({r["problem"] for r in rows if "not installed" in r.get("problem", "")})
     fastest = [_fastest(found, mode, *others) for others in OTHERS for mode in MODES]
@@ -113,19 +114,20 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
         [
             "Scenes that state nothing but their energies are stepped by the general series, which "
             f"certifies each step. Here they take one control step of {DT:g} s from {MEMBERS} harsh "
-            "states, in which each joint turns at up to 6 to 12 rad/s. An error is that of the worst "
+            "states, in which each joint turns at up to 6 to 12 rad/s. The error is that of the worst "
             "entry of the worst state, relative to max(1, |entry|), against Taylor series of Lagrange's "
             "equations by SymPy in python-flint's ball arithmetic.",
             "All run in compiled loops, many states in one call, on one core. The overhead of a call counts, "
             "compilation does not. Samples are taken in turn, and times are medians of processor time. The "
-            "errors are those of the calls that are timed, at the fastest setting that reaches the given "
+            "errors are those of the timed calls, at the fastest setting that reaches the given "
             "error.",
-            "Ours certifies each step, at a tolerance and an order. The others give no bound: which setting "
-            "reaches an error is known here from the exact ends. heyoka runs with fast_math, without compact "
+            "Ours certifies each step, at a tolerance and an order. The others give no bound: which "
+            "setting reaches an error is known here only from the exact ends. heyoka runs with fast_math, "
+            "without compact "
             "mode, its compiled step in a compiled loop, in a batch in blocks of two widths. MuJoCo runs its "
             "own model in compiled rollouts, by Euler, implicitfast and RK4; Pinocchio its articulated-body "
             "algorithm in RK4 steps in a C++ loop. For both, a driven support is a field in its frame. RK4, "
-            "DOP853 and Radau IIA take steps of one length and are compiled as ours is.",
+            "DOP853 and Radau IIA take fixed steps and are compiled like ours.",
             *([f"Not compared: {', '.join(missing)}."] if missing else []),
             *(verdict(found, mode) for mode in MODES if found),
         ],
@@ -143,7 +145,7 @@ def slug(name: str) -> str:
 
 
 def verdict(found: Mapping[tuple, Mapping[str, Best]], mode: str) -> str:
-    """Say of each column how it compares at equal error."""
+    """Summarise for each column how it compares at equal error."""
     parts = []
     for name in COLUMNS:
         ratios = [
@@ -213,9 +215,9 @@ def _summary(found: Mapping[tuple, Mapping[str, Best]]) -> Table | None:
         return None
     return Table(
         "general-summary",
-        f"Scenes that are only energies: CPU time of a control step of {DT:g} s [ns], each at its quickest "
-        f"setting whose worst error from {MEMBERS} harsh states is below the one given; ours is certified, "
-        "the others give no bound (`lag-envs report`)",
+        f"Scenes defined by energies alone: CPU time of a control step of {DT:g} s [ns], each at its "
+        f"quickest setting whose worst error from {MEMBERS} harsh states is below the one given; ours is "
+        "certified, the others give no bound (`lag-envs report`)",
         ("system", "error", "lag_envs", "in a batch", *COLUMNS[:5], "heyoka in a batch"),
         rows,
     )
@@ -236,7 +238,7 @@ def _accurate(rows: Sequence[Row]) -> Claim:
     found = [r for r in rows if r["kind"] == "point" and (r["setting"], r["method"]) == shipped]
     worst = max((math.inf if r["error"] is None else r["error"] for r in found), default=0.0)
     return Claim(
-        "At the tolerance and the order that are shipped, a step from a harsh state errs by less than 1e-12.",
+        "At the shipped tolerance and order, a step from a harsh state errs by less than 1e-12.",
         worst < 1e-12 if found else None,
         f"{worst:.1e} at most" if found else "",
     )
@@ -290,8 +292,8 @@ def _shares(rows: Sequence[Row]) -> Table:
             found.setdefault((r["system"], r["dt"]), {})[r["order"]] = r
     return Table(
         "general-certificate",
-        "Share of harsh states from which a step of a length is certified as a whole at the tolerance that "
-        f"is shipped, by order, and attempts a step at order {CERTIFIED_ORDERS[-1]}",
+        "Share of harsh states from which a step of a length is certified as a whole at the shipped "
+        f"tolerance, by order, and attempts per step at order {CERTIFIED_ORDERS[-1]}",
         ("system", "step [s]", *(f"order {n}" for n in CERTIFIED_ORDERS), "attempts", "refused"),
         [
             (system, dt, *(f"{100.0 * here[n]['share']:.1f} %" for n in CERTIFIED_ORDERS),
@@ -310,8 +312,8 @@ def _first(rows: Sequence[Row]) -> Table:
     kinds = ("cold", "cached", "heyoka, single", "heyoka, batch")
     return Table(
         "general-first",
-        "CPU seconds until the first step, imports apart: ours from energies to a step, with an empty and "
-        "a filled cache of compiled code; heyoka's compiling at tolerance 1e-15",
+        "CPU seconds until the first step, without imports: ours from energies to a step, with an empty and "
+        "with a filled cache of compiled code; heyoka's compilation at tolerance 1e-15",
         ("system", "lag_envs, cold", "lag_envs, cached", "heyoka", "heyoka, batch"),
         [(name, *(median(of[k]) if k in of else None for k in kinds)) for name, of in found.items()],
     )
@@ -320,8 +322,8 @@ def _first(rows: Sequence[Row]) -> Table:
 def _energy(rows: Sequence[Row]) -> Table:
     return Table(
         "general-energy",
-        "Energy of undamped double pendulums: how far from where it was at most, relative to its height "
-        "above the lowest; ours over the whole time, the others at its end",
+        "Energy of undamped double pendulums: largest drift, relative to its height above the lowest "
+        "energy; ours over the whole time, the others at the end",
         ("method", "seconds", "drift"),
         [
             (r["method"], r["seconds"], "lost" if r["drift"] is None else r["drift"])

@@ -1,6 +1,6 @@
 """Gymnasium's environments of the same kind as ours: scenes with their equations, and their episodes.
 
-That the scenes have the equations of Gymnasium's source is tested on its own steps.
+A test checks on Gymnasium's own steps that the scenes have the equations of its source.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from lag_envs.scenes.base import Scene
 
 
 class Peer(NamedTuple):
-    """One of Gymnasium's environments: its equations, and what its actions mean."""
+    """One of Gymnasium's environments: its equations, and the meaning of its actions."""
 
-    scene: Callable[[Any], Scene]  #: of an instance
-    order: Sequence[int]  #: of the scene's state entries among its own
+    scene: Callable[[Any], Scene]  #: from an instance
+    order: Sequence[int]  #: places of the scene's state entries in its own state
     integrator: str
-    step: Callable[[Any], float]  #: the control step [s] of an instance
-    control: Callable[[Any, Any], float]  #: from an instance and an action, as the environment's own code
+    step: Callable[[Any], float]  #: the control step [s] from an instance
+    control: Callable[[Any, Any], float]  #: from an instance and an action, like the environment's own code
     wraps: Sequence[int] = ()
-    limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: speeds are cut here, the last entries
+    limits: Callable[[Any], Sequence[float]] = lambda env: ()  #: at these speeds it clips the last entries
 
     def described(self, env: Any) -> tuple[list[str], list[str]]:
         """Return names and units of its state."""
@@ -72,7 +72,7 @@ PEERS = {
 
 
 def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: bool) -> Episode:
-    """Record up to so many steps of a peer that has been reset; to its termination, or past it."""
+    """Record at most so many steps of a peer that has been reset; until its termination, or past it."""
     states, controls, terminated = [np.array(env.state, np.float64)], [], False
     for action in itertools.islice(actions, steps):
         controls.append(peer.control(env, action))
@@ -85,7 +85,7 @@ def watch(env: Any, peer: Peer, actions: Iterator[Any], steps: int, to_the_end: 
 
 
 def random_episode(id: str, seed: int, steps: int, to_the_end: bool) -> tuple[Any, Episode, int]:
-    """Return a peer, an episode of it, and its seed: a later one if with that asked for a speed is cut."""
+    """Return a peer, an episode of it, and its seed: a later one if a speed was clipped with that seed."""
     peer = PEERS[id]
     env: Any = gym.make(id, disable_env_checker=True).unwrapped
     while True:

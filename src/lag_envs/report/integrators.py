@@ -1,12 +1,13 @@
-"""The integrators that people would otherwise use, as flows: any scene can be stepped by them.
+"""The integrators that people would otherwise use, as flows that can step any scene.
 
-Each is written once, on generic numbers, for q'' = a(q, v, t), and compiled by the machinery that compiles
-ours, so that times compare methods and not compilers. A comparison integrator takes one step per control
-step; `n` substeps are `n` control steps of a length n times smaller.
+Each is written once, on generic numbers, for q'' = a(q, v, t), and compiled by the same machinery as ours, so
+that times compare methods and not compilers. A comparison integrator takes one step per control step; `n`
+substeps are `n` control steps that are n times shorter.
 
-Cosine and sine are computed at every stage, or *carried*: an explicit Runge-Kutta method has them as two more
-unknowns, c' = -s q' and s' = c q', and calls no function at all; the others turn the pair that the step began
-with by two short polynomials. Carried is faster and errs a little differently, so the report has both.
+Cosine and sine are either computed at every stage or *carried*: an explicit Runge-Kutta method has them as
+two more unknowns, c' = -s q' and s' = c q', and calls no function at all; other methods rotate the step's
+initial pair by two short polynomials. Carrying is faster and its errors differ slightly, so the report has
+both.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lag_envs.stepping.compiling import compile_function, compile_traced
 from lag_envs.stepping.flows import Flow, pendulum_flow
 from lag_envs.stepping.tracing import polynomial, sum_of_products
 
-#: π/2 in three parts, of which the first two have zeros to spare (Cody and Waite).
+#: π/2 in three parts, the first two with trailing zero bits (Cody and Waite).
 _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _SIN = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(9)]
 _COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(10)]
@@ -30,8 +31,8 @@ _COS = [(-1.0) ** k / math.factorial(2 * k) for k in range(10)]
 def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
     """Return cosine and sine to rounding, for angles up to some 1e5 rad.
 
-    Arithmetic only, so that a compiled loop over a batch becomes vector instructions as ours does; with calls
-    of the C library the comparison integrators would be ten times slower.
+    Only arithmetic, so that a compiled loop over a batch is vectorised like ours; with calls of the C library
+    the comparison integrators would be ten times slower.
     """
     quarter = xp.floor(angle * (2.0 / math.pi) + 0.5)
     r = angle - quarter * _HALF_PI[0] - quarter * _HALF_PI[1] - quarter * _HALF_PI[2]
@@ -44,7 +45,7 @@ def cosine_sine(angle: Any, xp: Any) -> tuple[Any, Any]:
 
 
 class Arithmetic:
-    """A namespace whose cosine and sine are those of `cosine_sine`; the rest is another's."""
+    """A namespace with the functions of another, but with `cosine_sine` for cosine and sine."""
 
     def __init__(self, xp: Any) -> None:
         self._xp = xp
@@ -62,7 +63,7 @@ class Arithmetic:
 
 
 def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> tuple:
-    """Return (q', v') of a flow's equation, and (c', s') where cosine and sine are among the unknowns.
+    """Return (q', v') of a flow's equation, and (c', s') if cosine and sine are among the unknowns.
 
     Parameters
     ----------
@@ -71,11 +72,11 @@ def rate(coefficients: Any, t: Any, y: Sequence, xp: Any, angle: Any = 0.0) -> t
     t : number
         The time [s].
     y : sequence
-        q, v, and where they are unknowns the flow's cosine and sine.
+        q, v, and the flow's cosine and sine if they are unknowns.
     xp : namespace
-        Where cosine and sine are taken from if they are no unknowns.
+        Namespace for cosine and sine if they are not unknowns.
     angle : number
-        The turning plane's angle at t = 0, if its cosine and sine are no unknowns [rad].
+        The turning plane's angle at t = 0, if its cosine and sine are not unknowns [rad].
     """
     q, v, *pair = y
     if isinstance(coefficients, slope.FixedSlope):
@@ -96,7 +97,7 @@ class Problem(NamedTuple):
     force: Callable[[Any, Any], Any]
     gradient: Callable[[Any, Any], Any]  # of the force by q
     damping_rate: Any
-    linear: bool  # whether the gradient is the same everywhere, so that Newton's method needs one iteration
+    linear: bool  # whether the gradient is constant, so that Newton's method needs one iteration
 
     def acceleration(self, q: Any, v: Any, t: Any) -> Any:
         """Return q''."""
@@ -106,7 +107,7 @@ class Problem(NamedTuple):
 def problem(coefficients: Any, variables: Sequence, xp: Any, carried: bool = False) -> Problem:
     """Return the equation of motion of a flow with these coefficients, from its variables at the start.
 
-    If carried, cosines and sines are turned from those at the start: exact to rounding up to 0.6 rad.
+    If carried, cosines and sines are rotated from those at the start: exact to rounding up to 0.6 rad.
     """
     if isinstance(coefficients, pendulum.Coefficients):
         push = coefficients._replace(gamma=0.0)
@@ -248,7 +249,7 @@ def radau(p: Problem, q: Any, v: Any, h: Any, xp: Any) -> tuple[Any, Any]:
 
 
 def _solve(rows: list[list[Any]]) -> list[Any]:
-    """Solve a small linear system, right-hand side last in each row, whose matrix is close to one."""
+    """Solve a small linear system with a matrix close to the identity; right-hand side last in each row."""
     n = len(rows)
     for k in range(n):
         inverse = 1.0 / rows[k][k]
@@ -268,7 +269,7 @@ class Tableau(NamedTuple):
 
 
 def explicit(tableau: Tableau, rate: Callable, y: Sequence, h: Any) -> list:
-    """Return the unknowns after one step; ``rate(t, y)`` with t from the step's start."""
+    """Return the unknowns after one step of ``rate(t, y)``, with t measured from the step's start."""
     found: list[Sequence] = []
     for weights, at in zip(tableau.a, tableau.c, strict=True):
         found.append(rate(at * h, _moved(y, weights, found, h)))
@@ -308,7 +309,7 @@ def dop853() -> Tableau:
 class Method(NamedTuple):
     """A comparison integrator, and its order of convergence."""
 
-    step: Callable | None  #: of a `Problem`, or None where the tableau is all there is to know
+    step: Callable | None  #: of a `Problem`; None if the tableau is all there is
     order: int
     tableau: Callable[[], Tableau] | None = None
 
@@ -356,7 +357,7 @@ def comparison(name: str, flow: Flow, carried: bool = False) -> Flow:
 
 
 def _lifted(tableau: Tableau, variables: Sequence, coefficients: Any, dt: Any) -> tuple:
-    """Step a flow's variables, the pair of cosine and sine among them, and restore the pair's length."""
+    """Step a flow's variables, including the cosine-sine pair, and restore the pair's length."""
     q, v, c, s = explicit(tableau, lambda t, y: rate(coefficients, t, y, None), variables, dt)
     longer = 1.5 - 0.5 * (c * c + s * s)
     return q, v, c * longer, s * longer

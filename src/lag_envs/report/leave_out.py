@@ -1,4 +1,4 @@
-"""What each environment carries from step to step, what it leaves out, and what leaving that out saves."""
+"""The state and terms that each environment carries, the ones it leaves out, and the time this saves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BATCH = 1024
 
 
 class Pair(NamedTuple):
-    """A scene without something, and the same one with it; a control step of both, on the same state."""
+    """A scene without something, and the same one with it; a control step of both, from the same state."""
 
     left_out: str
     without: Scene | Stepped
@@ -74,7 +74,7 @@ QUICK_PAIRS = 2
 
 
 def jobs(quick: bool) -> list[Job]:
-    """Return the jobs: one that looks at the compiled code of every id, one that takes times."""
+    """Return the jobs: one that examines the compiled code of every id, one that measures times."""
     count = QUICK_PAIRS if quick else len(PAIRS)
     return [
         Job(SECTION, "terms", f"{SECTION}:terms"),
@@ -92,14 +92,14 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def terms() -> Iterator[Row]:
-    """Yield what the compiled step of every environment with a flow of its own carries."""
+    """Yield the contents of the compiled step of every environment with a dedicated flow."""
     for id, task in TASKS.items():
         if task().scene._form is not None:
             yield {"kind": "terms", "id": id} | carried(task())
 
 
 def carried(task: Task) -> Row:
-    """Return state, terms, stages and constants of a task's compiled step, and which of them nothing uses."""
+    """Return state, terms, stages and constants of a task's compiled step, and those that nothing uses."""
     scene = task.scene
     numbers = constants_of(task)
     absent = frozenset(name for name, value in numbers.items() if value == 0.0)
@@ -141,7 +141,7 @@ def made(line: str) -> list[str]:
 def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
     """Return the names on which the results depend, in straight-line code.
 
-    Within a recorded block every input is used by construction, so the calls are all there is to look at.
+    Within a recorded block every input is used by construction, so only the calls need checking.
 
     Examples
     --------
@@ -156,7 +156,7 @@ def live(lines: Sequence[str], results: Iterable[str]) -> set[str]:
 
 
 def savings(count: int, rounds: int) -> Iterator[Row]:
-    """Yield operations and times of a step without something and with it, in a batch, in turn."""
+    """Yield operations and times of a step without something and with it, in a batch, timed in turn."""
     samples = {}
     for pair in PAIRS[:count]:
         for name, stepped in zip(("without", "having"), pair.stepped(), strict=True):
@@ -176,19 +176,19 @@ def savings(count: int, rounds: int) -> Iterator[Row]:
 # --- what is shown ---
 
 TEXT = (
-    "A constant that is zero leaves no operation behind, and the state has no entries that an environment "
+    "A constant that is zero costs no operation, and the state has no entries that an environment "
     "does not need. Terms are those of θ'' = -α sinθ - β cosθ - γθ' + δ + ramp·t for bar and shell, of "
     "x'' = pull - drag·x' for a fixed slope, and of the linear equation of a turning slope.",
     "Unused are inputs of an id's compiled step on which no result depends: its lines are followed "
     "backwards from the next state, reward, ending and observation to constants, state, target and "
     "action. Idle are operations whose result is not used.",
-    "Savings: a control step of 1,024 states at once, dynamics only, compiled without something and with "
+    "Savings: a control step of 1,024 states at once, dynamics only, compiled without a feature and with "
     "it. Both are timed in turn; the numbers are medians.",
 )
 
 
 def content(rows: list[Row], problems: list[Result]) -> Content:
-    """Return what the section shows."""
+    """Return the section's content."""
     found = [row for row in rows if row["kind"] == "terms"]
     saved = [row for row in rows if row["kind"] == "savings"]
     return Content(
@@ -198,7 +198,8 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         pictures=[
             Picture(
                 "leave-out",
-                "Time of a control step without something, and what having it would add. Batches of 1,024.",
+                "Time of a control step without a feature, and the time that the feature would add. "
+                "Batches of 1,024.",
                 lambda: _bars(saved),
             )
         ]
@@ -229,7 +230,7 @@ def _terms(rows: list[Row]) -> Table:
     lists = ("state", "terms", "left_out"), ("constants", "zero"), ("unused", "idle")
     return Table(
         "leave-out-terms",
-        "What each id carries and leaves out; operations are those of one step of the dynamics.",
+        "The features that each id has and leaves out; operations are those of one step of the dynamics.",
         head,
         [
             (
@@ -249,7 +250,7 @@ def _savings(rows: list[Row]) -> Table:
     head = ("left out", "operations without", "with", "ns without", "ns with", "saved [ns]", "saved [%]")
     return Table(
         "leave-out-savings",
-        "What leaving something out saves.",
+        "The time that leaving a feature out saves.",
         head,
         [
             (
@@ -269,7 +270,7 @@ def _summary(rows: list[Row]) -> Table | None:
         return None
     return Table(
         "leave_out",
-        "What a step of each environment consists of:",
+        "The parts of each environment's step:",
         ("id", "state", "terms", "left out", "operations", "unused"),
         [
             (
@@ -297,7 +298,7 @@ def _claims(rows: list[Row], saved: list[Row]) -> list[Claim]:
             "; ".join(unused) or f"{len(rows)} environments",
         ),
         Claim(
-            "What is left out leaves no operation behind.",
+            "Features that are left out cost no operation.",
             not more if saved else None,
             "; ".join(more) or f"{len(saved)} pairs",
         ),

@@ -1,7 +1,7 @@
-"""The bodies of the general engine's scenes as other engines are given them: links, one hanging on the other.
+"""The general engine's scenes in the form that other engines take: links, one hanging on the other.
 
-`MuJoCo` and `Pinocchio` take the same table of links. A support that moves is a field in its own frame, and
-hinges count angles from link to link, so each system says how its coordinates become joints'.
+`MuJoCo` and `Pinocchio` take the same table of links. A moving support is a field in its own frame, and
+hinges measure angles from link to link, so each system defines how its coordinates map to joints.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from lag_envs.scenes import Acrobot, CartPole, Chain, RotaryPendulum
 from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
-#: What an inertia about a rod's own axis is given as, where there is none: MuJoCo asks for some [kg m²].
+#: Inertia about a rod's own axis where it has none: MuJoCo requires a positive one [kg m²].
 THIN = 1e-15
 
 
 class Link(NamedTuple):
-    """A body and the joint that it hangs by; z is up."""
+    """A body and the joint that it hangs from; z is up."""
 
     kind: str  #: "slide" or "hinge"
     axis: tuple[float, float, float]
-    place: tuple[float, float, float]  #: of the joint, from the one before [m]
+    place: tuple[float, float, float]  #: of the joint, from the previous one [m]
     mass: float
     centre: tuple[float, float, float]  #: of mass, from the joint [m]
     inertia: tuple[float, float, float]  #: about the centre, along the axes [kg m²]
@@ -45,7 +45,7 @@ class Link(NamedTuple):
 
 @dataclass(frozen=True)
 class System:
-    """A scene, the states and controls that its problems are drawn from, and its links."""
+    """A scene, the ranges from which its states and controls are drawn, and its links."""
 
     name: str
     scene: Scene
@@ -53,18 +53,18 @@ class System:
     speeds: Sequence[float]
     push: float
     links: Sequence[Link]
-    relative: bool = False  #: whether joints' angles are differences of the scene's
-    field: bool = False  #: whether the control moves the support, else it is the joint's force
-    joint: int = 0  #: which joint's
+    relative: bool = False  #: whether joints' angles are differences of the scene's angles
+    field: bool = False  #: whether the control moves the support; otherwise it is the joint's force
+    joint: int = 0  #: the joint that the control acts on
 
     def turned(self, values: Array) -> Array:
-        """Return joints' numbers of the coordinates', one row each."""
+        """Return joint values for coordinate values, one row each."""
         if not self.relative:
             return values
         return np.concatenate([values[:1], np.diff(values, axis=0)])
 
     def back(self, values: Array) -> Array:
-        """Return coordinates' numbers of the joints'."""
+        """Return coordinate values for joint values."""
         return np.cumsum(values, axis=0) if self.relative else values
 
     def forces(self, controls: Array) -> Array:
@@ -77,13 +77,13 @@ class System:
     def fields(self, controls: Array) -> Array:
         """Return the fields [m/s²], one row for each control."""
         gravity: float = self.scene.gravity  # type: ignore[attr-defined]
-        along = controls if self.field else 0.0 * controls  # the support moves against x
+        along = controls if self.field else 0.0 * controls  # a support's acceleration acts against x
         return np.stack([along, 0.0 * controls, np.full(len(controls), -gravity)], axis=1)
 
     def draw(self, count: int, seed: int = 0) -> tuple[Array, Array]:
         """Return harsh random states and controls, one row each; prescribed coordinates start at 0.
 
-        Every joint turns at up to its full speed, all at once.
+        Every joint turns at up to its full speed, all of them at once.
         """
         rng = np.random.default_rng(seed)
         states = np.zeros((count, len(self.scene.state_names)))
@@ -105,9 +105,9 @@ def _scene(kind: type[Scene], **parameters: Any) -> Any:
 def _bars(
     lengths: Sequence[float], masses: Sequence[float], centres: Sequence[float], own: Sequence[float]
 ) -> list:
-    """Return bars that hang one on the other and turn counter-clockwise in the plane.
+    """Return bars that hang one from the other and turn counter-clockwise in the plane.
 
-    x points to the left here, so that their axis is one of the coordinates', which Pinocchio is faster with.
+    x points to the left here, so that their axis is a coordinate axis, with which Pinocchio is faster.
     """
     places = [0.0, *lengths[:-1]]
     return [
@@ -164,7 +164,7 @@ SYSTEMS = {
 
 
 class Engine(Peer):
-    """A rival with a model of its own, made of a system's links."""
+    """A rival with its own model, made of a system's links."""
 
     @property
     def batched(self) -> bool:
@@ -217,7 +217,7 @@ class MuJoCoLinks(Engine):
     stepped = ("Euler", "implicitfast", "RK4")
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
-        """Make a model for each field; one is enough where the control is a force."""
+        """Make a model for each field; one is enough if the control is a force."""
         import mujoco
         from mujoco.rollout import rollout
 
@@ -249,7 +249,7 @@ class MuJoCoLinks(Engine):
 
 
 def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
-    """Return MuJoCo's mass matrix and accelerations at places and velocities of its joints."""
+    """Return MuJoCo's mass matrix and accelerations for given joint positions and velocities."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(xml(system, gravity=system.fields(np.array([control]))[0]))
@@ -268,7 +268,7 @@ def mujoco_motion(system: System, q: Array, v: Array, control: float) -> tuple[A
 class PinocchioLinks(Engine):
     """Pinocchio's articulated-body algorithm in a compiled loop of RK4 steps.
 
-    Its wheel brings its headers along: `pinocchio.cpp` is compiled where there is a compiler, once a report.
+    Its wheel includes its headers: `pinocchio.cpp` is compiled once per report, if there is a compiler.
     """
 
     family = "pinocchio"
@@ -307,7 +307,7 @@ def pinocchio() -> Any:
     Raises
     ------
     ModuleNotFoundError
-        Where Pinocchio is missing, or its headers, or a compiler.
+        If Pinocchio, its headers, or a compiler is missing.
     """
     include = _headers()
     compiler = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -334,7 +334,7 @@ def pinocchio() -> Any:
 
 
 def _headers() -> Path:
-    """Return the folder of Pinocchio's and Eigen's headers, as their wheels have them."""
+    """Return the folders of Pinocchio's and Eigen's headers in their wheels."""
     for package, header in (
         ("libpinocchio", "pinocchio/algorithm/aba.hpp"),
         ("cmeel-eigen", "eigen3/Eigen/Core"),
@@ -365,7 +365,7 @@ def pinocchio_model(system: System) -> Any:
 
 
 def pinocchio_motion(system: System, q: Array, v: Array, control: float) -> tuple[Array, Array]:
-    """Return Pinocchio's mass matrix and accelerations at places and velocities of its joints."""
+    """Return Pinocchio's mass matrix and accelerations for given joint positions and velocities."""
     n, controls = len(q), np.array([control])
     acceleration, mass = np.empty(n), np.empty((n, n))
     given = [np.ascontiguousarray(x) for x in (q, v, system.forces(controls)[0], system.fields(controls)[0])]
@@ -373,7 +373,7 @@ def pinocchio_motion(system: System, q: Array, v: Array, control: float) -> tupl
     return mass, acceleration
 
 
-#: Engines with models of their own: their dynamics at a point, by family.
+#: Engines with their own models: their dynamics at a point, by family.
 MOTIONS: dict[str, Callable[[System, Array, Array, float], tuple[Array, Array]]] = {
     "mujoco": mujoco_motion, "pinocchio": pinocchio_motion,
 }  # fmt: skip
@@ -381,9 +381,9 @@ ENGINES: dict[str, type[Engine]] = {engine.family: engine for engine in (MuJoCoL
 
 
 def differences(system: System, family: str, count: int = 50) -> tuple[float, float]:
-    """Return how far an engine's mass matrices and accelerations are from SymPy's at random states.
+    """Return the difference of an engine's mass matrices and accelerations from SymPy's at random states.
 
-    Both are relative to the largest there is.
+    Both are relative to the largest value.
     """
     from lag_envs.report.oracle import oracle_of
 

@@ -1,4 +1,4 @@
-"""Control steps of a scene of energies as problems that every rival can be given; ours is one of them."""
+"""Control steps of an energy-defined scene as problems for every rival; ours is one of them."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SceneEquation(Equation):
-    """The equation of motion of a scene with its numbers put in; what they make vanish is left out.
+    """The equation of motion of a scene with its numbers inserted; terms that vanish are left out.
 
-    Unknowns are the places of the free coordinates, then their velocities.
+    Unknowns are the free coordinates, then their velocities.
     """
 
     scene: Scene
@@ -40,7 +40,7 @@ class SceneEquation(Equation):
     @cached_property
     def _motion(self) -> tuple[list[Expr], list[Expr]]:
         given = {name: getattr(self.scene, name) for name in self.scene._numbers()}
-        # What may be infinite, such as a track, is in no formula.
+        # Parameters that may be infinite, such as a track, are in no formula.
         numbers = {parameter(name): Expr.of(x) for name, x in given.items() if math.isfinite(x)}
         found = self.scene.mechanics
         return [substitute(e, numbers) for e in found.entries()], [
@@ -59,7 +59,7 @@ class SceneEquation(Equation):
 
     @cached_property
     def needed(self) -> tuple[str, ...]:
-        """What the parameters are: controls, and where moving coordinates start, ``s`` and ``s_dot``."""
+        """The parameters: controls, and the starts of prescribed coordinates, ``s`` and ``s_dot``."""
         layout = self.scene._layout
         symbols = {symbol for part in self._motion for expr in part for symbol in expr.symbols()}
         found = [name for name in layout.controls if control(name) in symbols]
@@ -98,7 +98,7 @@ class SceneEquation(Equation):
 
 
 class SceneProblems(Problems):
-    """Control steps of one scene from some states under some controls.
+    """Control steps of one scene from several states under several controls.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class SceneProblems(Problems):
     controls : ndarray, shape (n, n_controls)
         Controls.
     system : System, optional
-        The scene's bodies as other engines are given them.
+        The scene's bodies in the form for other engines.
     """
 
     def __init__(self, scene: Scene, starts: Array, controls: Array, system: System | None = None) -> None:
@@ -132,7 +132,7 @@ class SceneProblems(Problems):
         return len(self.starts)
 
     def _shift(self, sign: float) -> None:
-        """Go from w to velocities, where a rate is held, or back."""
+        """Convert w to velocities, if a rate is held, or back."""
         scene = self.scene
         if scene._layout.at("rate"):
             shift = oracle_of(scene).shift(self._q, self._v, list(self.controls.T))
@@ -141,7 +141,7 @@ class SceneProblems(Problems):
             }
 
     def states(self, y: Array, span: float) -> Array:
-        """Return the scene's states, one per line, of unknowns after the controls were held for some time."""
+        """Return the scene's states, one per line, from unknowns after a time with the controls held."""
         layout = self.scene._layout
         n = len(layout.free)
         q, v = dict(self._q), dict(self._v)
@@ -162,9 +162,9 @@ class SceneProblems(Problems):
 
 
 class Certified(Rival):
-    """The general engine at a tolerance and an order, each step certified, in the loops that it ships.
+    """The general engine at a tolerance and an order, each step certified, in its shipped loops.
 
-    The setting is the tolerance; the method names the order. Alone it is the loop of `Scene.simulate`, in a
+    The setting is the tolerance; the method names the order. Alone it runs the loop of `Scene.simulate`, in a
     batch the block function of the vector environments, both over one control step from each state.
     """
 
@@ -172,7 +172,7 @@ class Certified(Rival):
 
     @staticmethod
     def method_of(order: int) -> str:
-        """Return the name of an order."""
+        """Return the name of the method with an order."""
         return f"lag_envs, order {order}"
 
     @property
@@ -248,7 +248,7 @@ def _batch(stepper: Any, code: Any, tolerance: float) -> Callable:
     """
     names = [*code.start, *code.controls]
     rows = {name: i for i, name in enumerate([*names, *code.rows])}
-    # An input of the series may have the name of a control or of a row of its own.
+    # An input of the series may have the name of a control or its own row.
     flow = {name: len(names) + i for i, name in enumerate(code.rows)}
 
     def at(row: int) -> str:

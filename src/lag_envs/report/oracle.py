@@ -1,17 +1,18 @@
-"""The oracle: the exact motion of any scene, from Lagrange's equations as SymPy derives them.
+"""The oracle: the exact motion of any scene, from Lagrange's equations derived by SymPy.
 
-Of the package only the scene's energies, its names and SymPy's view of them (`lag_envs.scenes.symbolic`) are
-used. Equations, series, arithmetic and step control share nothing with `mechanics` and `stepping`; numbers
-are python-flint's balls. There are two methods:
+It uses nothing of the package but the scene's energies, its names and their form in SymPy
+(`lag_envs.scenes.symbolic`). Equations, series, arithmetic and step control share nothing with `mechanics`
+and `stepping`; numbers are python-flint's balls. There are two methods:
 
-* Taylor series, each coefficient by one more iteration of Picard's on series of balls. The step is as long as
-  the last coefficients allow. Balls hold what rounding and cancellation do within a step.
-* Where damping is so heavy that such steps would be far shorter than what is left, and once its boundary
-  layer has died out: collocation at Chebyshev nodes that include the end of the step, which is stable for
-  any damping, by Newton's method.
+* Taylor series, with one more coefficient by each Picard iteration on series of balls. The last coefficients
+decide
+  the step's length. Balls enclose the effects of rounding and cancellation within a step.
+* Where damping is so heavy that such steps would be far shorter than the time that is left, and once its
+  boundary layer has died out: collocation at Chebyshev nodes that include the end of the step, which is
+  stable for any damping, by Newton's method.
 
-Everything is computed twice, with other digits, orders and lengths of steps. A result is returned only where
-the two agree to the digits asked for; until then the digits are doubled.
+Everything is computed twice, with different digits, orders and step lengths. A result is returned only if the
+two agree to the requested digits; otherwise the digits are doubled.
 """
 
 from __future__ import annotations
@@ -36,38 +37,38 @@ from lag_envs.scenes import symbolic
 from lag_envs.scenes.base import Scene
 
 Array = NDArray[np.float64]
-#: Series of one motion at most, before it counts as unresolved.
+#: Largest number of series for one motion; beyond it, the motion counts as unresolved.
 MOST_STEPS = 5_000
-#: Digits are doubled so often.
+#: How often digits are doubled.
 DOUBLINGS = 2
-#: Damping times what is left of the time: above it collocation is tried.
+#: Collocation is tried if damping times the time that is left exceeds this.
 STIFF = 300.0
-#: After so many series, and half as many more each time; the layer takes about as many.
+#: Series before the first try, and half as many again before each next one; the layer takes about as many.
 FIRST_TRY = 16
-#: Bits that are spared for rounding within a step, tried in turn.
+#: Extra bits against rounding within a step, tried in turn.
 SPARE = (80, 240, 720)
 
 
 class Unresolved(ArithmeticError):
-    """The oracle cannot vouch for its own result: the motion is singular on the way, or nearly so."""
+    """The oracle cannot guarantee its result: the motion is singular on the way, or nearly so."""
 
 
 class Singular(Unresolved):
-    """So short are the steps, or so many, that more digits would not help."""
+    """The steps are so short, or so many, that more digits would not help."""
 
 
 class Rounded(Unresolved):
-    """Rounding within a step is larger than what a step may leave out: the arithmetic has too few bits."""
+    """Rounding within a step exceeds its allowed truncation error: the arithmetic has too few bits."""
 
 
 # --- equations ----------------------------------------------------------------------------------------------
 
 
 class Names(NamedTuple):
-    """What a scene's coordinates, controls and state are, read off their names."""
+    """A scene's coordinates, controls and state, as read from their names."""
 
     free: tuple[str, ...]
-    #: What moves from outside: its control, and whether that is its acceleration, rate or place.
+    #: Prescribed coordinates: the control, and whether it is their acceleration, rate or place.
     moved: Mapping[str, tuple[str, str]]
     controls: tuple[str, ...]
     state: Sequence[tuple[str, str]]  #: coordinate, and "place", "velocity" or "momentum"
@@ -88,13 +89,13 @@ def names_of(scene: Scene) -> Names:
             state.append((name, "place"))
         elif name.removesuffix("_dot") in (*free, *moved):
             state.append((name.removesuffix("_dot"), "velocity"))
-        else:  # w, or w_<name> where several coordinates have one
+        else:  # w, or w_<name> if several coordinates have one
             state.append((name[2:] or free[0], "momentum"))
     return Names(free, moved, controls, state)
 
 
 class Equations:
-    """Lagrange's equations M a = f of all scenes that differ in numbers only.
+    """Lagrange's equations M a = f of all scenes that differ only in numbers.
 
     Parameters
     ----------
@@ -104,9 +105,9 @@ class Equations:
     Attributes
     ----------
     mass, force, coupling : list of sympy.Expr
-        Rows of M, f, and the rows of the mass matrix between free coordinates and rates that are held.
+        Rows of M, f, and the rows of the mass matrix that couple free coordinates with held rates.
     q, v, u : dict of sympy.Symbol
-        Places and velocities of all that moves, controls, by name.
+        Places and velocities of all moving coordinates, and controls, by name.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -138,7 +139,7 @@ class Equations:
 
     @cached_property
     def residuals(self) -> Formulas:
-        """M a - f, and its rows of derivatives by places, velocities and accelerations."""
+        """M a - f, and its rows of derivatives with respect to places, velocities and accelerations."""
         n = len(self.a)
         left = [sum((self.mass[i * n + j] * self.a[j] for j in range(n)), -self.force[i]) for i in range(n)]
         of = [[symbols[name] for name in self.names.free] for symbols in (self.q, self.v)]
@@ -156,7 +157,7 @@ _known: dict[Any, Equations] = {}
 
 
 def equations_of(scene: Scene) -> Equations:
-    """Return the equations of a scene; those of scenes that differ in numbers only are derived once."""
+    """Return a scene's equations, derived once for all scenes that differ only in numbers."""
     numbers = tuple(scene._numbers())
     fields = [f.name for f in dataclasses.fields(scene)]  # type: ignore[arg-type]
     key = type(scene), repr([(name, getattr(scene, name)) for name in fields if name not in numbers]), numbers
@@ -201,21 +202,21 @@ def _ball(x: Any) -> Any:
 
 
 def number(ball: Any) -> mpf:
-    """Return a ball's middle, which mpmath holds without rounding."""
+    """Return a ball's midpoint as an mpmath number, without rounding."""
     mantissa, exponent = ball.mid().man_exp()
     with mp.workprec(int(mantissa).bit_length() + 1):
         return mp.ldexp(mpf(int(mantissa)), int(exponent))
 
 
 class Plan(NamedTuple):
-    """How a motion is computed."""
+    """The precision of a computation."""
 
-    digits: int  #: that each step keeps, absolute and relative to places and velocities
-    spare: int = SPARE[0]  #: bits beyond those, of which a recurrence loses some with each order
+    digits: int  #: kept by each step, absolute and relative to places and velocities
+    spare: int = SPARE[0]  #: extra bits; a recurrence loses some with each order
 
     @property
     def order(self) -> int:
-        """Coefficients of a series at most."""
+        """Largest number of coefficients of a series."""
         return int(1.15 * self.digits) + 8
 
     @property
@@ -224,12 +225,12 @@ class Plan(NamedTuple):
         return int(3.33 * self.digits) + self.spare
 
     def small(self, of: Any) -> Any:
-        """Return what may be left out of a number of this size."""
+        """Return the allowed truncation error for a number of this size."""
         return flint.arb(10) ** -self.digits * (1 + abs(of).mid())
 
 
 def agreed(compute: Callable[[int], list[mpf]], digits: int) -> list[mpf]:
-    """Return what is computed with so many digits at least, once two such computations agree.
+    """Return a result with at least so many digits, once two such computations agree.
 
     Raises
     ------
@@ -263,9 +264,9 @@ class Oracle:
     Parameters
     ----------
     scene : Scene
-        Its parameters are taken as the exact numbers that they are.
+        Its parameters are taken as exact numbers.
     numbers : mapping, optional
-        Other numbers for some of them, which SymPy takes as exact too.
+        Other numbers for some of them, also taken as exact.
 
     Examples
     --------
@@ -285,11 +286,11 @@ class Oracle:
         self._bound: dict[tuple[int, int], list] = {}
 
     def exactly(self, expression: Any) -> Any:
-        """Return an expression with the scene's numbers in it."""
+        """Return an expression with the scene's numbers inserted."""
         return expression.xreplace(self._values)
 
     def _constants(self, formulas: Formulas, bits: int) -> list:
-        """Return the constants of formulas as balls of so many bits, or as floats for 0 bits."""
+        """Return the constants of formulas as balls with so many bits, or as floats for 0 bits."""
         key = id(formulas), bits
         if key not in self._bound:
             exact = [self.exactly(e) for e in formulas.constants]
@@ -307,16 +308,16 @@ class Oracle:
     def terms(
         self, q: Mapping[str, Any], v: Mapping[str, Any], u: Sequence, xp: Any = FLOATS, bits: int = 0
     ) -> tuple[list, list, list]:
-        """Return rows of M, f, and rows of the mass matrix between free coordinates and held rates.
+        """Return rows of M, f, and the rows of the mass matrix that couple free coordinates with held rates.
 
         Parameters
         ----------
         q, v : mapping
-            Places and velocities of all coordinates that do not rest, by name.
+            Places and velocities of all coordinates that are not at rest, by name.
         u : sequence
             The controls.
         xp : namespace
-            Functions of these numbers.
+            Functions for numbers of this kind.
         bits : int
             Precision of the constants; 0 for floats.
         """
@@ -337,7 +338,7 @@ class Oracle:
         return matrix, np.array(solve(matrix.tolist(), force), dtype=np.float64)
 
     def start(self, state: Sequence, controls: Sequence, make: Callable) -> tuple[dict, dict]:
-        """Return places and velocities of all coordinates; w stands for the velocity where a rate is held."""
+        """Return places and velocities of all coordinates; w replaces the velocity if a rate is held."""
         zero = make(0.0)
         q, v = (dict.fromkeys((*self.names.free, *self.names.moved), zero) for _ in range(2))
         for (name, kind), x in zip(self.names.state, state, strict=True):
@@ -351,7 +352,7 @@ class Oracle:
         return q, v
 
     def shift(self, q: Mapping, v: Mapping, u: Sequence, xp: Any = FLOATS, bits: int = 0) -> list:
-        """Return M⁻¹ G ṡ of the rates that are held, which w has more than the velocities."""
+        """Return M⁻¹ G ṡ, by which w exceeds the velocities if rates ṡ are held."""
         mass, _, coupling = self.terms(q, v, u, xp, bits)
         rates = [v[name] for name in self.equations.rates]
         return solve(mass, [sum(g * s for g, s in zip(row, rates, strict=True)) for row in coupling])
@@ -380,14 +381,14 @@ class Oracle:
         Raises
         ------
         Unresolved
-            If they do not, even with four times the digits, or where the motion needs too many steps.
+            If they do not, even with four times the digits, or if the motion needs too many steps.
         ValueError
-            For a state or controls of another length than the scene's.
+            If the state or the controls do not have the scene's length.
         """
         return agreed(lambda working: self.once(state, controls, dt, working), digits)
 
     def once(self, state: Sequence, controls: Any, dt: Any, digits: int) -> list[mpf]:
-        """Return the end as one computation gives it, each of whose steps keeps so many digits."""
+        """Return the end state from one computation whose steps keep so many digits."""
         for what, given, names in (
             ("state", state, self.names.state),
             ("controls", listed(controls), self.names.controls),
@@ -422,23 +423,23 @@ class Oracle:
                 break
             done = part * h
             if done < plan.small(flint.arb(0)) * left:
-                raise Singular(f"steps come to nothing with {left.str(5, radius=False)} s left")
+                raise Singular(f"steps shrink to nothing with {left.str(5, radius=False)} s left")
             left = (left - done).mid()
             h = left if left < 2 * done else 2 * done
         else:
-            raise Singular(f"{MOST_STEPS} series leave {left.str(5, radius=False)} s")
+            raise Singular(f"{MOST_STEPS} series end with {left.str(5, radius=False)} s left")
         v = self._shifted(plan, q, v, u, 1)
         return [(q if kind == "place" else v)[name] for name, kind in self.names.state]
 
     def _shifted(self, plan: Plan, q: dict, v: dict, u: Sequence, sign: int) -> dict:
-        """Return velocities with what `shift` returns added or taken away."""
+        """Return velocities plus or minus the result of `shift`."""
         if not self.equations.rates:
             return v
         more = self.shift(q, v, u, BALLS, plan.bits)
         return v | {name: v[name] + sign * x for name, x in zip(self.names.free, more, strict=True)}
 
     def driven(self, q: Mapping, v: Mapping, u: Sequence, zero: Any) -> dict[str, list]:
-        """Return for each coordinate that moves from outside its place, rate and acceleration."""
+        """Return place, rate and acceleration of each prescribed coordinate."""
         held = dict(zip(self.names.controls, u, strict=True))
         return {
             name: [q[name], v[name], held[control] if level == "acceleration" else zero]
@@ -453,11 +454,11 @@ class Oracle:
         Parameters
         ----------
         state, controls
-            As for `flow`.
+            As in `flow`.
         h : float or mpf
             The unit of time [s].
         count : int
-            Number of coefficients, the value at the start included.
+            Number of coefficients, including the value at the start.
         digits : int
             Of the arithmetic.
         """
@@ -474,7 +475,7 @@ class Oracle:
     def _coefficients(
         self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any
     ) -> Iterator[tuple[dict[str, list], dict[str, list]]]:
-        """Yield the coefficients of places and velocities, with time in units of h, one more every time."""
+        """Yield the coefficients of places and velocities, with time in units of h, one more each time."""
         free, n, zero = self.names.free, len(self.names.free), flint.arb(0)
         x, w = ({name: [value] for name, value in start.items()} for start in (q, v))
         formulas = self.equations.formulas
@@ -505,12 +506,12 @@ class Oracle:
             yield x, w
 
     def _series(self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict, Any]:
-        """Return places and velocities after a part of a time h, and which part of it was taken."""
+        """Return places and velocities after a fraction of a time h, and that fraction."""
         free, part = self.names.free, flint.arb(1)
         limits = [plan.small(start[name]) for start in (q, v) for name in free]
         grown = enumerate(self._coefficients(plan, q, v, u, h), start=1)
         for k, (x, w) in itertools.islice(grown, plan.order):
-            # More than two, since every second one may vanish.
+            # More than two, since every second coefficient may vanish.
             last = [of[name][-4:] for of in (x, w) for name in free]
             if k > 6 and all(abs(c) < limit for cs, limit in zip(last, limits, strict=True) for c in cs):
                 break
@@ -524,13 +525,13 @@ class Oracle:
         places, rates = ({name: flint.arb_poly(of[name])(part) for name in of} for of in (x, w))
         after = [of[name] for of in (places, rates) for name in free]
         if not all(y.rad() < limit for y, limit in zip(after, limits, strict=True)):
-            raise Rounded("rounding within a step is larger than what a step may leave out")
+            raise Rounded("rounding within a step exceeds its allowed truncation error")
         return {n: y.mid() for n, y in places.items()}, {n: y.mid() for n, y in rates.items()}, part
 
     # --- heavy damping ---
 
     def _damping(self, q: dict, v: dict, u: Sequence) -> float:
-        """Return how fast drag slows the motion down, about [1/s]."""
+        """Return the rate at which drag slows the motion down, about [1/s]."""
         n, formulas = len(self.names.free), self.equations.damping
         q, v = ({name: float(x) for name, x in of.items()} for of in (q, v))
         held = [float(x) for x in u]
@@ -556,7 +557,7 @@ class Oracle:
             h = left if left < 2 * h else 2 * h
 
     def _collocated(self, plan: Plan, q: dict, v: dict, u: Sequence, h: Any) -> tuple[dict, dict] | None:
-        """Return places and velocities after a time h, by one polynomial for each acceleration."""
+        """Return places and velocities after a time h, from one polynomial for each acceleration."""
         free, n, arb_mat = self.names.free, len(self.names.free), flint.arb_mat
         formulas, nodes = self.equations.residuals, _nodes(plan.digits, plan.bits)
         constants, count = self._constants(formulas, plan.bits), len(nodes.x)
@@ -595,7 +596,7 @@ class Oracle:
         else:
             return None
         along = once * a
-        # Is it smooth? What has a layer in it misses the start, by what has died out long before the end.
+        # Check smoothness: a polynomial misses the start by a layer that has died out long before the end.
         rest, first = nodes.last * along, nodes.first * along
         for c, name in enumerate(free):
             smooth = all(abs(rest[k, c]) < 10 * limits[c] for k in range(rest.nrows()))
@@ -606,12 +607,12 @@ class Oracle:
 
 
 def listed(controls: Any) -> list:
-    """Return the controls as a list; a scene with one control may be given a number."""
+    """Return the controls as a list; a single control may be given as a number."""
     return list(controls) if isinstance(controls, Sequence | np.ndarray) else [controls]
 
 
 def _shorter(order: int, coefficient: Any, limit: Any) -> float:
-    """Return the part of a step whose coefficient of that order is just small enough."""
+    """Return the fraction of a step at which the coefficient of that order is just small enough."""
     size = coefficient.abs_upper()
     if not size.is_finite():
         raise Unresolved("a coefficient of the series is not finite")
@@ -624,12 +625,12 @@ def _evaluated(expression: Any, bits: int) -> Any:
 
 
 class Nodes(NamedTuple):
-    """Where a polynomial on [0, 1] is collocated: Chebyshev's nodes, one end among them."""
+    """Collocation nodes of a polynomial on [0, 1]: Chebyshev's, including one end."""
 
     x: Sequence[Any]  #: the first is 1
     once: Any  #: integrals from 0 to the nodes, from values at the nodes
     twice: Any  #: integrals of these
-    last: Any  #: the last coefficients in Chebyshev's polynomials, from values at the nodes
+    last: Any  #: the last Chebyshev coefficients, from values at the nodes
     first: Any  #: the value at 0
 
 

@@ -1,6 +1,6 @@
 """The first picture of docs/accuracy.md: error against run time, ours and the rivals'.
 
-It is drawn from ``docs/accuracy.json`` alone, so it can be drawn again without measuring.
+It is drawn from ``docs/accuracy.json`` alone, so it can be redrawn without measuring.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: A scene with a step of its own, a system for the general series, and how both are stepped.
+#: A scene with a dedicated step, a system for the general series, and the methods that step both.
 SCENE, SYSTEM, MODE = "PivotedBar", "double pendulum, driven", "alone"
-#: Columns of the general table that are not rivals, and names by which they are drawn.
+#: Columns of the general table that are not rivals, and the names of rivals in the picture.
 RIVALS = ("heyoka", "MuJoCo", "Pinocchio", "RK4, compiled", "DOP853, compiled", "Radau IIA, compiled")
 OURS = "lag_envs"
 Points = list[tuple[float, float]]
@@ -29,13 +29,13 @@ def draw(accuracy: dict[str, Any]) -> Figure:
     Parameters
     ----------
     accuracy : dict
-        What ``docs/accuracy.json`` holds.
+        The contents of ``docs/accuracy.json``.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
-    _panel(left, "A bar on a moving support: a step of its own", *own_step(accuracy))
+    _panel(left, "A bar on a moving support: a dedicated step", *own_step(accuracy))
     _panel(right, "A driven double pendulum: the general series", *general(accuracy))
     left.set_ylabel("largest error of one control step, relative")
     shown = {
@@ -60,13 +60,13 @@ def own_step(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
         for column, ratio in near.items():
             if column.startswith("to ") and ratio is not None:
                 rivals.setdefault(name, []).append((ratio * row["ns"], float(column[3:])))
-    # Of each the faster form.
+    # The faster form of each.
     best = {name: _fastest(points) for name, points in rivals.items()}
     return ours, {name: points for name, points in best.items() if len(points) > 1}
 
 
 def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
-    """Return the same of a system that is stepped by the general series."""
+    """Return the same for a system that is stepped by the general series."""
     ours: Points = []
     rivals: dict[str, Points] = {}
     for row in _rows(accuracy, "general", "general-times-single", system=SYSTEM):
@@ -80,7 +80,7 @@ def general(accuracy: dict[str, Any]) -> tuple[Points, dict[str, Points]]:
 
 
 def findings(accuracy: dict[str, Any]) -> list[str]:
-    """Return sentences on how often somebody is faster at an error, and on what a general simulator takes."""
+    """Return sentences on how often a rival is faster at an error, and on the time of a general simulator."""
     own = list(_rows(accuracy, "work_precision", "work_precision_targets", horizon="one step"))
     modes = ("general-times-single", "general-times-batch")
     systems = [row for name in modes for row in _rows(accuracy, "general", name)]
@@ -92,9 +92,9 @@ def findings(accuracy: dict[str, Any]) -> list[str]:
         ]
         counts = [sum(float(row["error"]) == error for row in rows) for rows in (own, systems)]
         texts.append(
-            f"To an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons "
-            f"on the package's scenes, and in {faster[1]} of {counts[1]} on scenes that are only energies "
-            "(alone and in a batch)."
+            f"At an error of {_power(error)}, a rival is faster in {faster[0]} of {counts[0]} comparisons "
+            f"on the package's scenes, and in {faster[1]} of {counts[1]} on scenes defined by energies alone "
+            "(single states and batches).",
         )
     row = list(_rows(accuracy, "general", modes[0], system=SYSTEM))[-1]
     if row["MuJoCo"] is not None:
@@ -117,7 +117,7 @@ def _fastest(points: Points) -> Points:
 
 
 def _rows(accuracy: dict[str, Any], section: str, table: str, **wanted: str) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table as dicts by column, of those that have given entries."""
+    """Yield the rows of a table as dicts by column, if they have the given entries."""
     parts = next(part for part in accuracy["sections"] if part["name"] == section)
     found = next(one for one in parts["tables"] if one["name"] == table)
     for cells in found["rows"]:

@@ -1,7 +1,8 @@
-"""The report about a user's own file: errors against time, the certificate, stability, scene by scene.
+"""The report on a user's own file: errors against time, the certificate, stability, scene by scene.
 
 Subjects are the scenes of the file's tasks, with the tasks' parameters, starts and controls, and scenes that
-no task uses and that their defaults make. Loading the file runs its code, in each process that measures.
+no task uses, if their defaults suffice to make them. Loading the file runs its code, in each process that
+measures.
 """
 
 from __future__ import annotations
@@ -33,28 +34,28 @@ from lag_envs.scenes.base import Scene
 from lag_envs.scenes.checks import StepRefused
 
 SECTION = "own"
-#: States whose exact ends are computed, and those whose certificate is asked for; the same for a quick look.
+#: Numbers of states with exact ends, and of states for the certificate; then the same for a quick look.
 MEMBERS, MANY = 50, 1000
 FEW, SOME = 6, 100
 TOLERANCES: Sequence[float] = (1e-3, 1e-6, 1e-9, 1e-12, 1e-14)
 ORDERS: Sequence[int] = (8, 12, 16, 20, 24)
-#: Parameters are multiplied by these, each alone; states by the last.
+#: Factors for each parameter alone; the last number is a factor for states.
 FACTORS, WILD = (1e-4, 1e-2, 1e2, 1e4), 10.0
-#: What rounding may add to a bound, relative to max(1, |entry|).
+#: Allowed excess over a bound by rounding, relative to max(1, |entry|).
 ROUNDING = 1e-12
-#: How far energy may be out of balance, relative to what there is of it and of work.
+#: Allowed imbalance of energy, relative to energy and work.
 BALANCE = 1e-9
-#: How often the time of a step is halved for it.
+#: How often a step is halved to integrate the work.
 DEEPEST = 12
 
 
 class Subject(NamedTuple):
-    """A scene, where its motions start, and what acts on it."""
+    """A scene, the start of its motions, and its controls."""
 
     name: str
     scene: Scene
     dt: float
-    boxes: Sequence[tuple[float, float]]  #: of the state's entries, centre and half width
+    boxes: Sequence[tuple[float, float]]  #: centre and half width of each state entry
     controls: Sequence[tuple[float, float]]
 
     task: type[Any] | None = None
@@ -71,7 +72,7 @@ class Subject(NamedTuple):
 
 
 def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
-    """Return the states that episodes under random actions have after so many steps, or before their ends."""
+    """Return the states of episodes under random actions, after so many steps or before their end."""
     env = LagrangianEnv(task)  # type: ignore[arg-type]
     env.action_space.seed(seed)
     states = []
@@ -91,12 +92,12 @@ def _met(task: type[Any], lengths: NDArray[np.int64], seed: int) -> Array:
 
 
 def subjects(name: str) -> list[Subject]:
-    """Return what ``FILE`` or ``FILE:Class`` means: the scenes of tasks, then those that no task uses.
+    """Return the subjects of ``FILE`` or ``FILE:Class``: scenes of tasks, then scenes that no task uses.
 
     Raises
     ------
     UserError
-        Where there are none.
+        If there are none.
     """
     path, kind = own_files.split(name)
     found, problems = [], []
@@ -133,7 +134,7 @@ def _of_task(label: str, task: Any) -> Subject:
 
 
 def _of_scene(label: str, scene: Scene) -> Subject:
-    """Take a unit each way, half a turn of an angle, and twice that as speed, for want of a task."""
+    """Return a scene without a task as a subject: ±1, or ±π for an angle, and twice that for speeds."""
     boxes = [(0.0, math.pi if "rad" in unit else 1.0) for unit in scene.state_units]
     widths = [
         2.0 * half if unit.endswith("/s") else half
@@ -145,7 +146,7 @@ def _of_scene(label: str, scene: Scene) -> Subject:
 
 
 def subject(file: str, name: str) -> Subject:
-    """Return the subject of a name, in a process that measures."""
+    """Return the subject with a name, in a process that measures."""
     return next(s for s in subjects(file) if s.name == name)
 
 
@@ -153,11 +154,11 @@ def subject(file: str, name: str) -> Subject:
 
 
 def jobs(quick: bool, file: str = "") -> list[Job]:
-    """Return the jobs: errors and certificate, stability, then what is timed."""
+    """Return the jobs: errors and certificate, stability, then all that is timed."""
     if not file:
         return []
     path = Path(own_files.split(file)[0])
-    # Rows are not taken over from another version of the file.
+    # Rows from another version of the file are not reused.
     about = {
         "file": str(path.resolve()) + file[len(str(path)) :],
         "digest": hashlib.sha256(path.read_bytes()).hexdigest()[:16],
@@ -179,7 +180,7 @@ def jobs(quick: bool, file: str = "") -> list[Job]:
 
 
 def steps(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield errors of steps as shipped beside their bounds, and what share is certified as a whole."""
+    """Yield errors of steps as shipped beside their bounds, and the share certified as a whole."""
     s = subject(file, name)
     order = s.scene._order(s.dt)
     starts, controls = s.draw(SOME if quick else MANY, seed=1)
@@ -243,7 +244,7 @@ def points(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
 
 
 def cases(s: Subject) -> Iterator[tuple[str, Scene, float]]:
-    """Yield scenes with one extreme parameter each, where its range allows it, and a factor of the state."""
+    """Yield scenes with one extreme parameter each, if its range allows it, and a factor for the state."""
     yield "as it is", s.scene, 1.0
     yield f"states × {WILD:g}", s.scene, WILD
     for field in dataclasses.fields(s.scene):  # type: ignore[arg-type]
@@ -259,7 +260,7 @@ def cases(s: Subject) -> Iterator[tuple[str, Scene, float]]:
 
 
 def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
-    """Yield refusals and the balance of energy of steps with extreme parameters and states."""
+    """Yield refusals and the energy balance of steps with extreme parameters and states."""
     s = subject(file, name)
     count = 2 if quick else 20
     starts, controls = s.draw(count, seed=2)
@@ -277,9 +278,9 @@ def stability(file: str, digest: str, quick: bool, name: str) -> Iterator[Row]:
 
 
 def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
-    """Return how far a step's change of energy is from the work done, relative to energy and work.
+    """Return the imbalance between a step's change of energy and its work, relative to energy and work.
 
-    Work is a quadrature along the motion. Where that is too coarse, the time is halved.
+    Work is a quadrature along the motion. If that is too coarse, the time is halved.
     """
     control: Any = held if len(held) else 0.0
     total = size = 0.0
@@ -296,11 +297,11 @@ def balance(scene: Scene, start: Array, held: Array, dt: float) -> float:
     return abs(total) / size if size else 0.0
 
 
-# --- what it comes to ---
+# --- results ---
 
 
 def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
-    """Return what is shown."""
+    """Return the content."""
     names = list(dict.fromkeys(str(r.get("subject", r.get("system"))) for r in rows))
     found, factors = general_results.best(rows), ", ".join(f"{f:g}" for f in FACTORS)
     pictures = [
@@ -318,15 +319,15 @@ def content(rows: Sequence[Row], problems: Sequence[Result]) -> Content:
     return Content(
         "Your own scenes",
         [
-            "Steps of one control interval, from states to which random actions lead within a second of "
-            "the tasks' episodes; of a scene without a task from random states, a unit or half a turn at "
-            "most. Errors are against Taylor series of Lagrange's equations, which SymPy derives from the "
+            "Steps of one control interval, from states that random actions reach within a second of the "
+            "tasks' episodes; for a scene without a task, from random states within a unit or half a turn. "
+            "Errors are against Taylor series of Lagrange's equations, which SymPy derives from the "
             "energies, in python-flint's ball arithmetic; relative to max(1, |entry|). Times are medians "
             "of the processor's time, samples taken in turn.",
-            "The certificate bounds what the series of the step leave out; rounding comes on top. "
-            f"Stability is asked for with each parameter multiplied by {factors}, where its range allows it: "
-            "a step that cannot be certified is refused, and energy has to change by the work done.",
-            *([f"Not taken part: {', '.join(missing)}."] if missing else []),
+            "The certificate bounds the truncation error of the step's series; rounding comes on top. "
+            f"Stability is tested with each parameter multiplied by {factors}, where its range allows it: a "
+            "step that cannot be certified is refused, and the change of energy has to equal the work done.",
+            *([f"Not included: {', '.join(missing)}."] if missing else []),
         ],
         [
             t
@@ -362,7 +363,7 @@ def _steps(rows: Sequence[Row]) -> Table:
         ))  # fmt: skip
     return Table(
         "own-steps",
-        "Steps as they are shipped: the share certified in one attempt, attempts a step, the largest bound "
+        "Steps as shipped: the share certified in one attempt, attempts per step, the largest bound "
         "in units of the state, and the worst error where the exact end was computed",
         (
             "scene",
@@ -386,7 +387,7 @@ def _times(found: Mapping[tuple, Mapping[str, general_results.Best]], mode: str)
 def _stability(rows: Sequence[Row]) -> Table:
     return Table(
         "own-stability",
-        "Extreme parameters and states: steps refused, and energy out of balance at most, relative to "
+        "Extreme parameters and states: refused steps, and the largest imbalance of energy, relative to "
         "energy and work",
         ("scene", "case", "steps", "refused", "balance"),
         [
@@ -421,12 +422,12 @@ def _claims(rows: Sequence[Row]) -> list[Claim]:
             f"{beyond:.1e} at most, {len(exact)} steps" if exact else "",
         ),
         Claim(
-            "No step is refused from the states that random actions lead to.",
+            "No step is refused from the states that random actions reach.",
             refused == 0 if shares else None,
             f"{refused} of {sum(r['states'] for r in shares):,}" if shares else "",
         ),
         Claim(
-            f"Energy changes by the work done, to {BALANCE:g}, at extreme parameters too.",
+            f"The change of energy equals the work done, to {BALANCE:g}, at extreme parameters too.",
             worst <= BALANCE if balances else None,
             f"{worst:.1e} at most in {len(balances)} cases" if balances else "",
         ),

@@ -20,9 +20,9 @@ def write(found: dict[str, Any], contents: dict[str, Content], folder: Path) -> 
     Parameters
     ----------
     found : dict
-        What `report.collect` returns: machine, versions, settings, seconds.
+        The result of `report.collect`: machine, versions, settings, seconds.
     contents : dict
-        What each section shows, by name.
+        Each section's content, by name.
     folder : Path
         The report's folder.
     """
@@ -58,7 +58,7 @@ def file_of(picture: Picture) -> str:
 
 
 def draw(picture: Picture, folder: Path) -> Path:
-    """Write a figure; the file depends on what is drawn only."""
+    """Write a figure; the file depends only on the drawing."""
     import matplotlib
 
     path = folder / file_of(picture)
@@ -71,7 +71,7 @@ def draw(picture: Picture, folder: Path) -> Path:
 
 
 def write_csv(table: Table, path: Path) -> None:
-    """Write a table with its numbers in full."""
+    """Write a table with all digits of its numbers."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(table.columns)

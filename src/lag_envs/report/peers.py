@@ -1,7 +1,7 @@
-"""Other libraries' integrators as rivals, one class each, in the fastest form that each library has.
+"""Other libraries' integrators as rivals, one class each, in the fastest form of each library.
 
-A library is imported when it is first built; where it is missing, that raises. All but MuJoCo are given the
-`Equation` of the problems, written once on generic numbers; MuJoCo has equations of its own, made from the
+A library is imported when its rival is first built, which raises if it is missing. All but MuJoCo are given
+the `Equation` of the problems, written once on generic numbers; MuJoCo has its own equations, made from the
 scene's parameters.
 """
 
@@ -30,14 +30,14 @@ SUBSTEPS = (1, 4, 16, 64)
 class Peer(Rival):
     """A rival from another library."""
 
-    #: What is measured: methods, each with tolerances or substeps.
+    #: The methods to measure, each with tolerances or substeps.
     settings: ClassVar[dict[str, Sequence[float]]]
     #: Methods whose setting is a number of substeps per control step.
     stepped: ClassVar[Sequence[str]] = ()
 
     @classmethod
     def solves(cls, scene: Scene) -> bool:
-        """Tell whether it can be given a scene."""
+        """Tell whether it can step a scene."""
         return True
 
     @property
@@ -53,8 +53,8 @@ class SciPy(Peer):
     """SciPy's solvers with a compiled right-hand side.
 
     dopri5, dop853 and lsoda are those of `scipy.integrate.ode`, whose loops are compiled and take a tenth of
-    the time of `solve_ivp`. A batch is one system of all states, so they share their steps; its matrix, which
-    lsoda asks for, has a band. Radau is `solve_ivp`'s and has no batch.
+    the time of `solve_ivp`. A batch is one system of all states, so they share their steps; its matrix, for
+    lsoda, is banded. Radau is `solve_ivp`'s and has no batch.
     """
 
     family = "scipy"
@@ -76,7 +76,7 @@ class SciPy(Peer):
         """Compile the right-hand side."""
         equation, count, span = problems.equation, len(problems), dt * steps
         size = equation.size
-        start = np.ascontiguousarray(problems.y[:size].T)  # one state after the other: a matrix has a band
+        start = np.ascontiguousarray(problems.y[:size].T)  # state by state, so that the matrix is banded
         parameters = [tuple(row) for row in problems.p.T.tolist()]
         ends = np.empty_like(start)
         solve = self._solver(equation, count if together else 1, together)
@@ -91,7 +91,7 @@ class SciPy(Peer):
         return Sample(run, count * steps, ends=lambda: problems.states(ends.T, span))
 
     def _solver(self, equation: Equation, count: int, together: bool) -> Callable:
-        """Return ``solve(y, span, p)``, NaN where it gives up."""
+        """Return ``solve(y, span, p)``, which gives NaN if the solver gives up."""
         from scipy.integrate import ode, solve_ivp
 
         rate = _rate_of_many(equation) if together else _rate(equation)
@@ -166,9 +166,9 @@ def _rate_of_many(equation: Equation) -> Callable:
 class Heyoka(Peer):
     """heyoka's adaptive Taylor series, of an order chosen from the tolerance, with fast_math.
 
-    Its compiled step is called from a compiled loop where a control is held for one step, so that no call
-    from Python counts; over longer times it is `propagate_until`, in one call. A batch goes in blocks of
-    twice the width that heyoka recommends, or of that width ("narrow"), the fastest of those tried.
+    For one step per control, its compiled step is called from a compiled loop, so that no call from Python
+    counts; over longer times it is `propagate_until`, in one call. A batch goes in blocks of twice the width
+    that heyoka recommends, or of that width ("narrow"), the fastest of those tried.
     """
 
     family = "heyoka"
@@ -177,11 +177,11 @@ class Heyoka(Peer):
 
     @property
     def changing(self) -> bool:
-        """The compiled loop goes through them."""
+        """The compiled loop goes through several controls."""
         return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
-        """Compile the integrator, and find its step."""
+        """Compile the integrator, and find its step function."""
         import heyoka
 
         width = heyoka.recommended_simd_size() * (1 if self.method == self.NARROW else 2) if together else 1
@@ -236,15 +236,15 @@ class Heyoka(Peer):
         return heyoka.taylor_adaptive_batch(system, np.zeros((equation.size, width)), pars=pars, **options)
 
 
-#: What keeps the machine code of heyoka's steps loaded.
+#: Keeps the machine code of heyoka's steps loaded.
 _engines: list[Any] = []
 
 
 def _stepper(integrator: Any) -> int | None:
-    """Return the address of heyoka's compiled step, or None where it cannot be loaded.
+    """Return the address of heyoka's compiled step, or None if it cannot be loaded.
 
     It is heyoka's own object code, as its integrator runs it: ``step(state, pars, time, h, coefficients)``,
-    where `h` has the longest step allowed, and the step taken on return.
+    where `h` is the longest allowed step on entry, and the step taken on return.
     """
     from importlib.metadata import files
 
@@ -252,7 +252,7 @@ def _stepper(integrator: Any) -> int | None:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    for file in files("heyoka") or ():  # its vector functions live in libraries of its own
+    for file in files("heyoka") or ():  # its vector functions are in separate libraries
         if file.name.startswith(("libsleef", "libheyoka")):
             llvm.load_library_permanently(str(file.locate()))
     try:
@@ -314,9 +314,9 @@ def _loop() -> Callable:
 
 
 class Diffrax(Peer):
-    """diffrax in one call compiled by XLA: a loop over the states alone, a map over them in a batch.
+    """diffrax in one call compiled by XLA: a loop over single states, or a map over a batch.
 
-    Steps are chosen by its controller, each state its own, or are all alike ("fixed").
+    Its controller chooses each state's steps, or all steps have one length ("fixed").
     """
 
     family = "diffrax"
@@ -332,7 +332,7 @@ class Diffrax(Peer):
         import jax
 
         span, size, count = dt * steps, problems.equation.size, len(problems)
-        # XLA compiles anew for every shape, which takes seconds: so there are few.
+        # XLA compiles again for every shape, which takes seconds, so there are few shapes.
         shape = next((n for n in ((128, 1024) if together else (64,)) if n >= count), count)
         y, p = (
             jax.numpy.asarray(blocks(x, shape).swapaxes(1, 2)[0]) for x in (problems.y[:size], problems.p)
@@ -349,7 +349,7 @@ class Diffrax(Peer):
 @cache
 def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Callable:
     """Compile ``solve(y, p, count, span, setting)``, where the setting is tolerance or step."""
-    # Read when JAX starts: one core, as all others.
+    # Read when JAX starts: one core, like all others.
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     import diffrax
     import jax
@@ -384,7 +384,7 @@ def _diffrax(equation: Equation, method: str, fixed: bool, together: bool) -> Ca
 
 
 class Torchdiffeq(Peer):
-    """torchdiffeq on tensors of all states, which share their steps; its loop over steps is Python."""
+    """torchdiffeq on tensors of all states, which share their steps; its loop over steps is in Python."""
 
     family = "torchdiffeq"
     settings: ClassVar = {
@@ -407,7 +407,7 @@ class Torchdiffeq(Peer):
         numbers = torch.from_numpy(problems.p)
         times = torch.tensor([0.0, span], dtype=torch.float64)
         options: dict[str, Any] = {"rtol": self.setting, "atol": self.setting, "method": self.method}
-        # A step has to end at the end: its interpolation is of lower order than its steps.
+        # A step has to land on the end: interpolation is of lower order than the steps.
         options["options"] = {"step_t": times[1:], "first_step": dt}
         if self.fixed:
             step = span / self.substeps(steps)
@@ -430,7 +430,7 @@ class Torchdiffeq(Peer):
 
 # --- MuJoCo ---
 
-#: Models by scene, in the frame of what is moved from outside: its acceleration tilts gravity. Contacts and
+#: Models by scene, in the frame of the prescribed motion: its acceleration tilts gravity. Contacts and
 #: constraints, of which there are none, are switched off.
 MODELS: dict[type[Scene], str] = {
     PivotedBar: """
@@ -486,7 +486,7 @@ class MuJoCo(Peer):
         ]  # fmt: skip
         data = mujoco.MjData(models[0])
         start = np.array([(0.0, *case.state) for case in problems.cases])
-        # Every step of a long rollout would be stored; only its end is asked for.
+        # A long rollout would store every step, but only its end is needed.
         chunk = min(n, 1000)
         path = np.empty((len(models), chunk, start.shape[1]))
         ends = start.copy()

@@ -1,4 +1,4 @@
-"""Methods at their settings as points: errors and times, which verdicts compare and diagrams show."""
+"""Methods at their settings as points: errors and times, for verdicts to compare and diagrams to show."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Point(NamedTuple):
 
     @property
     def ours(self) -> bool:
-        """Whether it is what the package ships."""
+        """Whether it is the shipped method."""
         return self.family == "ours"
 
     @property
@@ -45,7 +45,7 @@ class Point(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest error, infinite where a member is lost."""
+        """The largest error, infinite if a member is lost."""
         return max((math.inf if error is None else error for error in self.errors), default=math.inf)
 
     @property
@@ -66,10 +66,10 @@ class Point(NamedTuple):
 
 
 def gathered(rows: Sequence[Row]) -> list[Point]:
-    """Return the points, their times all in the same spell of the machine.
+    """Return the points, with all times as on a machine of one speed.
 
-    Each job has timed ours in turn with its own, as its clock. Times are multiplied by what the clock of the
-    first job, that of ours, has to theirs. A method without a batch is in the batch as it is alone.
+    Each job has timed ours in turn with its own samples, as its clock. Times are multiplied by the ratio of
+    the clock in our own job to that job's clock. A method without a batch counts there as it does alone.
     """
     measured = [r for r in rows if r["kind"] == "point" and "problem" not in r]
     clocks = {(r["variant"], r["horizon"], r["mode"]): r["clock"] for r in measured if r["family"] == "ours"}

@@ -1,4 +1,4 @@
-"""Exact ends of motions, which the processes of a report share."""
+"""Exact ends of motions, shared by the processes of a report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lag_envs.store import write
 Array = NDArray[np.float64]
 #: Folder in which the exact ends are kept; None keeps nothing.
 store: Path | None = None
-#: An undamped pendulum that turns or swings through so many radians, about, ends by elliptic functions.
+#: An undamped pendulum that moves through more than about so many radians uses elliptic functions.
 FAR = 5.0
 
 
@@ -32,7 +32,7 @@ def _pendulum(oracle: Oracle, controls: tuple[float, ...]) -> tuple[Any, Any] | 
 
 
 def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: int) -> list[mpf]:
-    """Return the state after a time dt, as one computation with so many digits gives it."""
+    """Return the state after a time dt, from one computation with so many digits."""
     held = listed(controls)
     if known := _pendulum(oracle, tuple(map(float, held))):
         (_, speed), (alpha, beta) = oracle.start(state, held, float), known
@@ -44,14 +44,14 @@ def once(oracle: Oracle, state: Sequence[Any], controls: Any, dt: Any, digits: i
 def flow(scene: Scene, state: Sequence[Any], controls: Any, dt: Any, digits: int = 30) -> list[mpf]:
     """Return the state after a time dt with the controls held.
 
-    By the oracle, see `Oracle.flow`; undamped pendulums that go far are by their closed form.
+    From the oracle, see `Oracle.flow`; undamped pendulums that move far use their closed form.
     """
     oracle = oracle_of(scene)
     return agreed(lambda working: once(oracle, state, controls, dt, working), digits)
 
 
 def remembered(scene: Scene, state: Sequence[float], controls: Any, dt: float) -> list[mpf]:
-    """Return what `flow` returns with 30 digits, from `store` where it is known there."""
+    """Return the result of `flow` with 30 digits, from `store` if it is known there."""
     problem = repr((type(scene), scene, *(float(x).hex() for x in (*state, *listed(controls), dt))))
     file = store and store / f"{hashlib.sha256(problem.encode()).hexdigest()[:24]}.json"
     with mp.workdps(40):

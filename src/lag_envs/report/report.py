@@ -1,4 +1,4 @@
-"""The whole report: settings, jobs of all sections, and what is written; the command ``lag-envs report``."""
+"""The whole report: settings, jobs of all sections, and the files; for the command ``lag-envs report``."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ FILE = "report.json"
 
 @dataclass
 class Settings:
-    """What is measured, and where it goes."""
+    """Extent and destination of a report."""
 
     folder: str = "report"
     quick: bool = False
     sections: tuple[str, ...] = SECTIONS
     processes: int = 2
     date: str = ""
-    file: str = ""  #: a user's own, which is measured in place of the package
+    file: str = ""  #: a user's own file, measured in place of the package
 
 
 class NotAReport(ValueError):
@@ -39,14 +39,14 @@ class NotAReport(ValueError):
 
 
 def make_report(settings: Settings) -> bool:
-    """Measure what the folder does not have yet and write everything; return False where it was interrupted.
+    """Measure what the folder lacks and write everything; return False if interrupted.
 
     Raises
     ------
     NotAReport
-        For a folder that holds other things, which stay untouched.
+        If the folder holds other things, which stay untouched.
     OSError
-        For a folder that cannot be written to.
+        If the folder cannot be written to.
     """
     folder = prepare(Path(settings.folder))
     given = (settings.quick, settings.file) if settings.file else (settings.quick,)
@@ -68,7 +68,7 @@ def make_report(settings: Settings) -> bool:
 
 
 def prepare(folder: Path) -> Path:
-    """Return the folder, made or found to be a report's."""
+    """Return the folder, which is new, empty or already a report's."""
     folder.mkdir(parents=True, exist_ok=True)
     names = {path.name for path in folder.iterdir()}
     if names and "results.jsonl" not in names:
@@ -80,7 +80,7 @@ def prepare(folder: Path) -> Path:
 
 
 def collect(settings: Settings, results: Sequence[Result], complete: bool, seconds: float) -> dict[str, Any]:
-    """Return everything that was measured, by section."""
+    """Return all measurements, by section."""
     return {
         "complete": complete,
         "machine": machine(),
@@ -99,7 +99,7 @@ def collect(settings: Settings, results: Sequence[Result], complete: bool, secon
 
 
 def content_of(found: dict[str, Any]) -> dict[str, Content]:
-    """Return what each section shows."""
+    """Return each section's content."""
     return {
         name: module(name).content(part["rows"], [Result(**problem) for problem in part["problems"]])
         for name, part in found["sections"].items()

@@ -1,9 +1,9 @@
-"""What is compared: ours, and rivals of any kind behind one interface, each in the fastest form that it has.
+"""The methods to compare: ours, and rivals of any kind behind one interface, each in its fastest form.
 
-A `Rival` is built for some `Problems` and a time over which their controls are held. What it then runs, and
-what is timed, is one call for all of them over the whole time: compiled loops where there are, blocks of
-states at once where it can take them, steps of its own choice where it chooses them. Errors are those of the
-very calls that are timed.
+A `Rival` is built for some `Problems` and a time over which their controls are held. It then runs, and is
+timed, in one call for all of them over the whole time: in compiled loops if it has them, on blocks of states
+at once if it can take them, with its own choice of steps if it has one. Errors are those of the very calls
+that are timed.
 
 `Ours` and `Compiled` are compiled by our machinery; other libraries are in `peers`.
 """
@@ -37,7 +37,7 @@ class Rival(ABC):
         A tolerance, or for methods that are `fixed` the substeps per control step; 1/4 is one step for four.
     """
 
-    #: Whose it is: a package's name, "compiled", or "ours".
+    #: Where it comes from: a package's name, "compiled", or "ours".
     family: ClassVar[str]
 
     def __init__(self, method: str, setting: float) -> None:
@@ -45,36 +45,36 @@ class Rival(ABC):
 
     @property
     def fixed(self) -> bool:
-        """Whether all steps are alike, so that time goes with their number whatever the horizon."""
+        """Whether all steps have one length, so that time goes with their number whatever the horizon."""
         return False
 
     @property
     def batched(self) -> bool:
-        """Whether there is a form that takes many states at once."""
+        """Whether it can take many states at once."""
         return True
 
     @abstractmethod
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
-        """Compile what can be compiled and return the call, with the states that it ends in.
+        """Compile what can be compiled and return the call, with its end states.
 
         Parameters
         ----------
         problems : Problems
-            What to solve, in one call.
+            The problems to solve, in one call.
         dt : float
             The control step [s].
         steps : int
-            For how many of them each control is held.
+            For how many control steps each control is held.
         together : bool
-            Take the states at once; else one after the other.
+            Take all states at once; otherwise one after the other.
         changes : int, default 1
-            For timing single steps: how many of them follow one another in the call. Alone each problem goes
-            on with the next one's control, in a batch with its own. What it ends in is then of no use.
+            For timing single steps: how many of them follow one another in the call. Alone, each problem goes
+            on with the next one's control; in a batch, with its own. The end states are then of no use.
 
         Raises
         ------
         ImportError
-            Where the library is missing.
+            If the library is missing.
         ValueError
             For an equation that it cannot solve.
         """
@@ -95,18 +95,18 @@ class Rival(ABC):
 
 
 class Ours(Rival):
-    """The stepping that the package ships: a scene's own flow, and no other order or tolerance.
+    """The shipped stepping: a scene's own flow, and no other order or tolerance.
 
-    The setting is the number of steps per control step: whoever wants another accuracy takes another `dt`.
+    The setting is the number of steps per control step: for another accuracy, users choose another `dt`.
     """
 
     family = "ours"
-    METHOD = "lag_envs"  #: control step by control step, as an environment takes them
+    METHOD = "lag_envs"  #: control step by control step, like an environment
     ONE_CALL = "lag_envs, one call"  #: the whole time as one step, which `simulate` divides by the bound
 
     @property
     def fixed(self) -> bool:
-        """Over a long time as over a short one, but in one call."""
+        """Long times as sequences of steps, or in one call."""
         return self.method == self.METHOD
 
     @property
@@ -115,7 +115,7 @@ class Ours(Rival):
         return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
-        """Compile the scene's own step; scenes with other parameters are batches of their own."""
+        """Compile the scene's own step; scenes with other parameters are separate batches."""
         cases = problems.cases
         count = 1 if self.method == self.ONE_CALL else self.substeps(steps)
         length = dt * steps / count
@@ -147,14 +147,14 @@ class Ours(Rival):
 
 
 class Compiled(Rival):
-    """An integrator of `METHODS`, compiled as ours is: the same recorder, compiler and vector width.
+    """An integrator of `METHODS`, compiled like ours: with the same recorder, compiler and vector width.
 
-    Coefficients come ready, so that nothing but the method is timed. Alone: one compiled loop over steps and
+    Coefficients are precomputed, so that only the method is timed. Alone: one compiled loop over steps and
     trajectories. In a batch: one compiled loop over blocks of states.
     """
 
     family = "compiled"
-    CARRIED = ", carried"  #: what a method's name ends with if cosine and sine are carried along
+    CARRIED = ", carried"  #: suffix of a method that carries cosine and sine along
 
     @property
     def fixed(self) -> bool:
@@ -163,7 +163,7 @@ class Compiled(Rival):
 
     @property
     def changing(self) -> bool:
-        """Its loop goes through them."""
+        """Its loop goes through several controls."""
         return True
 
     def build(self, problems: Problems, dt: float, steps: int, together: bool, changes: int = 1) -> Sample:
@@ -205,7 +205,7 @@ def _names(equation: Equation) -> tuple[list[str], list[str]]:
 
 @cache
 def _step(equation: Equation, method: str, carried: bool) -> list[str]:
-    """Return the lines that take the unknowns y0, y1, ... one step of length h further, from the time t."""
+    """Return the lines that advance the unknowns y0, y1, ... by one step of length h from the time t."""
     y, p = _names(equation)
     trace = ElementaryTrace()
     given = trace.inputs(*y, *p, "t", "h")
@@ -256,7 +256,7 @@ def _batch(equation: Equation, method: str, carried: bool) -> Callable:
 
 
 def blocks(columns: Array, width: int) -> Array:
-    """Return columns in blocks, shape (blocks, rows, width); the last is filled up with the first column.
+    """Return columns in blocks, shape (blocks, rows, width); the last is padded with the first column.
 
     Examples
     --------
@@ -270,7 +270,7 @@ def blocks(columns: Array, width: int) -> Array:
 
 
 def unblocked(found: Array, count: int) -> Array:
-    """Return the columns that `blocks` has cut.
+    """Return the columns from the result of `blocks`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Jobs in processes of their own: one that hangs or crashes costs its own rows only.
+"""Jobs in separate processes: one that hangs or crashes loses only its own rows.
 
 Every finished job is written at once, so that an interrupted report resumes where it was.
 """
@@ -28,7 +28,7 @@ from lag_envs.progress import progress
 from lag_envs.workers import died, outcomes, processes
 
 Row = dict[str, Any]
-#: Whose versions matter.
+#: Packages whose versions are recorded.
 LIBRARIES = (
     "gymnasium", "numpy", "numba", "llvmlite", "scipy", "mpmath", "sympy", "matplotlib",
     "python-flint", "heyoka", "diffrax", "jax", "torchdiffeq", "torch", "mujoco", "pin",
@@ -37,14 +37,14 @@ LIBRARIES = (
 
 @dataclass(frozen=True)
 class Job:
-    """A piece of work, of some seconds.
+    """A piece of work that takes seconds.
 
     ``function``, as "module:name" within this package or "package.module:name", is called with the arguments
-    and yields rows that JSON can hold. It may raise: the rows before that are kept and the problem is noted.
+    and yields rows of JSON types. It may raise: earlier rows are kept and the problem is noted.
     """
 
     section: str
-    name: str  #: tells what is done; unique within the section
+    name: str  #: describes the work; unique within the section
     function: str
     arguments: dict[str, Any] = field(default_factory=dict)
     timeout: float = 120.0  #: seconds until it counts as hanging
@@ -52,14 +52,14 @@ class Job:
 
     @property
     def key(self) -> str:
-        """What the rows are found by again; other arguments, code or another machine make another key."""
+        """The key under which rows are stored; it depends on arguments, code and machine."""
         parts = [self.section, self.name, self.function, self.arguments, fingerprint()]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
 @dataclass
 class Result:
-    """What came of a job."""
+    """A job's outcome."""
 
     section: str
     name: str
@@ -71,7 +71,7 @@ class Result:
 
 @cache
 def fingerprint() -> str:
-    """Return a digest of code, libraries and machine: rows of others are not taken over."""
+    """Return a digest of code, libraries and machine: rows with another digest are not reused."""
     digest = hashlib.sha256(json.dumps([machine(), versions()], sort_keys=True).encode())
     for path in sorted(Path(lag_envs.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
@@ -79,7 +79,7 @@ def fingerprint() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what took part."""
+    """Return the versions of Python and packages."""
     found = {"lag_envs": lag_envs.__version__}
     for name in LIBRARIES:
         try:
@@ -92,7 +92,7 @@ def versions() -> dict[str, str]:
 def run_jobs(
     jobs: Sequence[Job], folder: Path, processes: int, tell: Callable[[str], None] = lambda text: None
 ) -> tuple[list[Result], bool]:
-    """Run the jobs that the folder has no result of yet.
+    """Run the jobs that have no result in the folder yet.
 
     Parameters
     ----------
@@ -101,22 +101,22 @@ def run_jobs(
     folder : Path
         Results are appended to ``results.jsonl`` in it; references are kept there too.
     processes : int
-        How many may run side by side.
+        How many may run in parallel.
     tell : callable, optional
         Called with a line about each job that failed.
 
     Returns
     -------
     results : list of Result
-        Of all jobs that are finished, in the order of the jobs.
+        Of all finished jobs, in the order of the jobs.
     complete : bool
-        False where the user broke it off.
+        False if the user interrupted it.
     """
     file = folder / "results.jsonl"
     known = {result.key: result for result in load(file) if result.problem is None}
     todo = [job for job in jobs if job.key not in known]
     if len(todo) < len(jobs):
-        tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are taken over from before")
+        tell(f"{len(jobs) - len(todo)} of {len(jobs)} jobs are reused from before")
     complete = True
     with progress(len(todo)) as advance:
 
@@ -138,7 +138,7 @@ def run_jobs(
 
 
 def load(file: Path) -> list[Result]:
-    """Return the results in a file; lines that a kill has cut off are passed over."""
+    """Return the results in a file; a line that was cut off by a kill is skipped."""
     results = []
     for row in store.rows(file):
         with suppress(TypeError):
@@ -160,7 +160,7 @@ def _in_processes(jobs: Sequence[Job], folder: Path, count: int) -> Iterator[Res
                 outcome = f"stopped after {job.timeout:.0f} s", job.timeout
             elif isinstance(outcome, BaseException):
                 outcome = died(outcome), 0.0
-            # Also those from before it died.
+            # Including the rows from before it died.
             yield Result(job.section, job.name, job.key, list(store.rows(Path(rows) / job.key)), *outcome)
 
 
@@ -175,7 +175,7 @@ def _begin(folder: str) -> None:
 
 
 def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | None, float]:
-    """Do a job, write its rows, and return what went wrong and how many seconds it took."""
+    """Do a job, write its rows, and return its problem, if any, and its time in seconds."""
     start, problem = time.monotonic(), None
     try:
         place, _, name = function.partition(":")
@@ -187,12 +187,12 @@ def _work(function: str, arguments: dict[str, Any], rows: Path) -> tuple[str | N
 
 
 def module(name: str) -> Any:
-    """Return a module of this package, or, where the name has a dot, another one."""
+    """Return a module of this package, or, if the name has a dot, of another one."""
     return import_module(name if "." in name else f"lag_envs.report.{name}")
 
 
 def describe(error: BaseException) -> str:
-    """Return an error in one line; a missing package is said to be one.
+    """Return an error as one line; for a missing package, that it is not installed.
 
     Examples
     --------

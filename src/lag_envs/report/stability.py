@@ -1,4 +1,4 @@
-"""Where a step is accurate, where it is not, and where it is refused: maps and a table of named cases."""
+"""Where a step is accurate, inaccurate, or refused: maps and a table of named cases."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ def _decades(low: int, high: int, n: int) -> list[float]:
 
 
 def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[Row]:
-    """Yield the errors of one step of dt for each value of what the map varies.
+    """Yield the errors of one step of dt for each value of the map's varied quantity.
 
-    Where the error of ours is above what is called exact, the row also has ``roundings``, its error over the
-    effect of one rounding of the start, and ``substeps``.
+    If our error exceeds the limit for exactness, the row also has ``roundings``, its error over the effect of
+    one rounding of the start, and ``substeps``.
     """
     found = [MAPS[map].case(name, x, dt) for x in values]
     ends = methods(found, dt)
@@ -83,7 +83,7 @@ def cells(map: str, name: str, dt: float, values: Sequence[float]) -> Iterator[R
 
 
 def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
-    """Return the largest error of an entry over what one rounding of the start makes of it."""
+    """Return the largest error of an entry over the effect of one rounding of the start."""
     exact = reference.remembered(case.scene, case.state, case.control, dt)
     errors, gains = reference.errors(end, exact), extremes.amplification(case, dt)
     shares = [abs(e) / (extremes.EPS * g) for e, g in zip(errors, gains, strict=True) if g]
@@ -91,7 +91,7 @@ def _roundings(case: Case, dt: float, end: Sequence[float]) -> float | None:
 
 
 def cases(names: Sequence[str]) -> Iterator[Row]:
-    """Yield what comes of the named stiff and extreme cases, beside the comparison integrators."""
+    """Yield the outcomes of the named stiff and extreme cases, beside the comparison integrators."""
     for name in names:
         row: Row = {"kind": "case", "name": name, "peers": {}}
         try:
@@ -107,7 +107,7 @@ def cases(names: Sequence[str]) -> Iterator[Row]:
 
 
 def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
-    """Return the largest error of each end relative to the scales; where there is none, why."""
+    """Return the largest error of each end relative to the scales; if there is none, the reason."""
     try:
         exact = reference.remembered(case.scene, case.state, case.control, dt)
     except ArithmeticError as error:  # such as oracle.Unresolved
@@ -127,10 +127,10 @@ def outcomes(case: Case, dt: float, ends: dict[str, Any]) -> Row:
 
 
 def methods(found: Sequence[Case], dt: float) -> dict[str, list[Any]]:
-    """Return where every method ends from each case, or in place of that why it does not.
+    """Return each method's end state for each case, or the reason why there is none.
 
     Keys are names; ", 16" is added for 16 steps in place of one, ", float32" for that arithmetic. "ours" is
-    the product; "ours, float32" the formula of its series, with the substeps that the bound asks for.
+    the shipped step; "ours, float32" is the formula of its series, with the substeps that the bound requires.
     """
     ends: dict[str, list[Any]] = {OURS: [_ours(case, dt) for case in found]}
     flow = Stepped(found[0].scene, dt=dt).flow
@@ -160,7 +160,7 @@ def _ours(case: Case, dt: float) -> Any:
 
 
 def _count(case: Case, dt: float) -> float:
-    """Return the number of plain substeps that are accurate: what the bound says, or what `within` says."""
+    """Return the number of plain substeps for accuracy: from the bound, or from `within`."""
     scene, state, control = case
     bound = scene.step_bound(state, control, dt)
     if bound.order:
@@ -177,18 +177,18 @@ def _count(case: Case, dt: float) -> float:
 def march(
     fast: Callable, found: Sequence[Case], dt: float, counts: np.ndarray, dtype: type[np.floating]
 ) -> list[list[float]]:
-    """Step cases of one scene by a formula of a step, as NumPy arrays of one precision.
+    """Step cases of one scene by a step's formula, on NumPy arrays of one precision.
 
     Parameters
     ----------
     fast : callable
         As in `Flow`.
     found : sequence of Case
-        Of one class of scene, with one kind of control.
+        From one class of scene, with one kind of control.
     dt : float
         Time [s].
     counts : ndarray of int, shape (len(found),)
-        Each takes as many steps of a length dt / count.
+        Each case takes this many steps of length dt / count.
     dtype : type
         Precision of everything: constants, state, arithmetic.
     """

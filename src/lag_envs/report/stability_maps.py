@@ -1,4 +1,4 @@
-"""What the maps of stability vary, and the cases of their cells."""
+"""The quantities that the stability maps vary, and the cases of their cells."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ STARTS: dict[str, tuple[tuple[float, ...], float]] = {
 
 
 class Map(NamedTuple):
-    """A quantity that is varied beside the step."""
+    """A quantity that is varied along with the step."""
 
     label: str
     scenes: Sequence[str]
-    exponents: tuple[int, int]  #: of 10, from and to
+    exponents: tuple[int, int]  #: of 10, first and last
     case: Callable[[str, float, float], Case]  #: of scene, value and dt
 
 
@@ -37,14 +37,14 @@ def _damped(name: str, decay: float, dt: float) -> Case:
 
 
 def _drag(scene: Scene) -> float:
-    """Return the rate at which drag alone would slow the motion down, without control [1/s]."""
+    """Return the rate at which drag alone would slow down the motion, without control [1/s]."""
     stepped = Stepped(scene)
     found = stepped.drive(stepped.lift(np.zeros(len(scene.state_names))), 0.0, stepped.numbers(), np)
     return float(found.damping_rate)
 
 
 def _undamped(name: str, *, speed: float | None = None, control: float | None = None, **changes: Any) -> Case:
-    """Return a case whose reference is in closed form, however far it goes: shells have no drive."""
+    """Return a case with a closed-form reference, however far it goes: shells have no drive."""
     state, u = STARTS[name]
     if speed is not None:
         state = (state[0], speed, *state[2:])

@@ -1,4 +1,4 @@
-"""What the errors of stiff and extreme cases come to: tables, claims, maps."""
+"""Results on stiff and extreme cases: tables, claims, maps."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
 PEERS = ("ETD4RK", "implicit midpoint", "RK4", "Verlet", "explicit Euler")
 OURS = "ours"
-#: What a cell can hold in place of an error.
+#: Contents of a cell other than an error.
 REFUSED, DIVERGED, NO_REFERENCE, TOO_LONG = "refused", "diverged", "no reference", "not run"
-#: An error of so many times the state's own size counts as divergence, as a result that is not finite does.
+#: An error of this many times the state's size counts as divergence, like a result that is not finite.
 FAR_OFF = 100.0
-#: The formulas alone, without the jump along the slow manifold, are run for so many substeps at most.
+#: Most substeps for the formulas alone, without the jump along the slow manifold.
 MOST_SUBSTEPS = 1000
-#: Colours of what is not an error; errors go from pale yellow to dark blue.
+#: Colours of cells without an error; errors go from pale yellow to dark blue.
 SPECIAL = {DIVERGED: "black", REFUSED: "#d55e00", TOO_LONG: "#d0d0d0", NO_REFERENCE: "#8c8c8c"}
 LOWEST, HIGHEST = -17, 2
 
 
 def content(rows: list[Row], problems: list[Result]) -> Content:
-    """Return what the section shows."""
+    """Return the section's content."""
     cells = [row for row in rows if row["kind"] == "cell"]
     found = [row for row in rows if row["kind"] == "case"]
     maps: dict[tuple[str, str], list[Row]] = {}
@@ -44,20 +44,20 @@ def content(rows: list[Row], problems: list[Result]) -> Content:
         "Stiff and extreme cases",
         [
             "Each cell of a map is one control step from one start with the control held, once with our step "
-            "and once with each comparison integrator, which takes it in one step (or in 16, where that is "
-            "said). The error is the largest of the state's entries, each relative to its scale: "
+            "and once with each comparison integrator, which takes it in one step (or in 16, if "
+            "stated). The error is the largest of the state's entries, each relative to its scale: "
             "max(1, |q|, |q'| dt) for places and angles, max(1, |q'|, (α² + β²)^¼) for rates. Diverged means "
             f"a result that is not finite or an error above {FAR_OFF:g} times the scale. The reference has "
-            "30 digits; where that is not enough, the cell says so.",
+            "30 digits; if that is not enough, the cell says so.",
             "Maps in float32 run the same formulas on float32 numbers. Ours then takes the substeps that "
-            f"the bound asks for, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which avoids "
+            f"the bound requires, up to {MOST_SUBSTEPS:,}. The jump along the slow manifold, which avoids "
             "most of them under heavy damping, exists in float64 only.",
             "A named case should have full accuracy, be accurate up to the rounding floor, or be refused "
             f"with an error. Full accuracy means an error of at most {EXACT:g} times the scale in every "
-            "entry. Where the system itself amplifies a rounding of its start so much that no method can "
-            f"have that, {extremes.ROUNDINGS:g} times the effect of such a rounding is allowed in "
+            "entry. If the system itself amplifies a rounding of its start so much that no method can reach "
+            f"that, {extremes.ROUNDINGS:g} times the effect of such a rounding is allowed in "
             "addition. That effect is measured: every entry of the start is moved by 2^-53 of its size in "
-            "the reference. A case is met if it does what was expected, or is more accurate.",
+            "the reference. A case is met if its outcome is as expected, or more accurate.",
             "When a step is divided, substeps are computed with twice the digits, so that rounding does "
             "not add up over hundreds of thousands of them. A step that would need more than a million is "
             "refused.",
@@ -111,9 +111,9 @@ def _verdicts(found: Sequence[Row]) -> Table | None:
         lines.append([*cells, *(row.get(key) for key in keys), verdict])
     return Table(
         "extreme-cases",
-        "Every stiff and extreme case. Error: relative to the scale. Amplification: what one rounding of the "
-        "start makes at the end, over 2^-53 times the scale. Roundings: the error over the effect of one "
-        "rounding of the start, or of the end where that is more.",
+        "Every stiff and extreme case. Error: relative to the scale. Amplification: the effect of one "
+        "rounding of the start at the end, over 2^-53 times the scale. Roundings: the error over the "
+        "effect of one rounding of the start, or of the end if that is larger.",
         [
             "case",
             "scene",
@@ -131,7 +131,7 @@ def _verdicts(found: Sequence[Row]) -> Table | None:
 
 
 def _counts(rows: Sequence[Row], method: str) -> list[Any]:
-    """Return how many cells, the largest error, and how many cells are good, and in each special state."""
+    """Return the number of cells, the largest error, and the numbers of good cells and of special states."""
     values = [row["errors"].get(method, NO_REFERENCE) for row in rows]
     numbers = [v for v in values if isinstance(v, float)]
     special = [values.count(name) for name in SPECIAL]
@@ -150,7 +150,7 @@ def _map_table(maps: dict[tuple[str, str], list[Row]]) -> Table:
 
 
 def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> Table | None:
-    """Return a table with a line for each map: how ours does, and in which share of cells each is exact."""
+    """Return a table with a line for each map: our results, and each method's share of exact cells."""
     lines: list[list[Any]] = []
     for (map, scene), rows in maps.items():
         _, largest, *_ = _counts(rows, OURS)
@@ -160,8 +160,8 @@ def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> 
         refused = _counts(rows, OURS)[3 + list(SPECIAL).index(REFUSED)]
         lines.append([scene, map, len(rows), *shares, largest, roundings, refused, single])
     caption += (
-        f" Shares of cells in which one step is accurate to {EXACT:g} of the scale; then the largest error "
-        "of ours, over the effect of a rounding of the start where it is above that, how often ours is "
+        f" Shares of cells in which one step is accurate to {EXACT:g} of the scale; then our largest error, "
+        "our error over the effect of a rounding of the start where it is above that, how often our step is "
         "refused, and the largest error of its formula in float32."
     )
     columns = ["scene", "map", "cells", OURS, *PEERS]
@@ -170,7 +170,7 @@ def _shares(maps: dict[tuple[str, str], list[Row]], name: str, caption: str) -> 
 
 
 def _summary(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
-    """Return the maps of damping in brief."""
+    """Return a summary of the damping maps."""
     damped = {key: rows for key, rows in maps.items() if key[0] == "damping"}
     long = _shares(damped, "", "")
     if long is None:
@@ -178,8 +178,8 @@ def _summary(maps: dict[tuple[str, str], list[Row]]) -> Table | None:
     columns = ["scene", OURS, *PEERS, "largest error of ours"]
     places = [list(long.columns).index(name) for name in columns]
     caption = (
-        "One step with γ dt from 1e-3 to 1e6 and dt from 1e-6 to 1 s: in which share of the cases each is "
-        f"accurate to {EXACT:g} of the scale, and the largest error of ours."
+        "One step with γ dt from 1e-3 to 1e6 and dt from 1e-6 to 1 s: the share of cases in which each is "
+        f"accurate to {EXACT:g} of the scale, and our largest error."
     )
     return Table("stability", caption, columns, [[row[i] for i in places] for row in long.rows])
 
@@ -194,8 +194,8 @@ def _amplified(cells: Sequence[Row]) -> Table | None:
             lines.append([*place, row["errors"][OURS], roundings, "met" if met else "missed"])
     columns = ["scene", "map", "value", "dt [s]", "substeps", "error", "roundings", "verdict"]
     caption = (
-        f"Cells of the maps in which the error of ours is above {EXACT:g} of the scale: the error, and how "
-        "many times the effect of one rounding of the start it is."
+        f"Cells of the maps in which our error is above {EXACT:g} of the scale: the error, and the error "
+        "over the effect of one rounding of the start."
     )
     return Table("stability-amplified", caption, columns, lines) if lines else None
 
@@ -208,9 +208,7 @@ def _problem_table(problems: Sequence[Result], rows: Sequence[Row]) -> Table | N
         if row["kind"] == "cell" and row.get("problem")
     ]
     lines += [[row["name"], row["problem"]] for row in rows if row["kind"] == "case" and row.get("problem")]
-    return (
-        Table("stability-problems", "What could not be measured.", ["what", "why"], lines) if lines else None
-    )
+    return Table("stability-problems", "Problems: not measured.", ["what", "why"], lines) if lines else None
 
 
 def _cell_table(cells: Sequence[Row]) -> Table:
@@ -245,7 +243,7 @@ def _pictures(maps: dict[tuple[str, str], list[Row]], found: Sequence[Row]) -> l
             Picture(
                 "extreme-cases-map",
                 "The named cases: log10 of the error of one control step, ours beside the comparison "
-                "integrators in one step and in 16. Cases that are to be refused are in the table only.",
+                "integrators in one step and in 16. Cases that should be refused are in the table only.",
                 lambda: _draw_cases(measured),
                 raster=True,
             )
@@ -266,7 +264,7 @@ def _edges(values: Sequence[float]) -> np.ndarray:
 
 
 def _paint(axes: Any, x: Any, y: Any, values: Sequence[Sequence[Any]]) -> Any:
-    """Draw cells that hold errors or a special state; return what the colour bar needs."""
+    """Draw cells that hold errors or a special state; return the mappable for the colour bar."""
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap
 

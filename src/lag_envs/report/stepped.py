@@ -1,4 +1,4 @@
-"""A scene in its normal form together with a flow that steps it: ours, or one to compare it with."""
+"""A scene in its normal form together with a flow that steps it: ours, or one for comparison."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Stepped:
     scene : Scene
         A scene with a normal form.
     flow : Flow, optional
-        What steps it; by default our own flow for control steps of `dt`.
+        The flow; by default our own for control steps of `dt`.
     dt : float
         Control step [s].
 
@@ -44,11 +44,11 @@ class Stepped:
         self.angle, self.width = form.angle, form.width
 
     def constants(self) -> dict[str, float]:
-        """Return the numbers that a step takes."""
+        """Return the arguments of a step."""
         return self.scene._constants()
 
     def numbers(self) -> SimpleNamespace:
-        """Return them by attribute."""
+        """Return the arguments by attribute."""
         return SimpleNamespace(**self.constants())
 
     def lift(self, state: ArrayLike) -> tuple:
@@ -68,20 +68,20 @@ class Stepped:
         return self.form.pack(moved, y, [u], dt, k)
 
     def largest_majorant(self, dt: float) -> float:
-        """Return the bound's x up to which one series is certified."""
+        """Return the x of the bound up to which one series is certified."""
         return pendulum.largest_majorant(dt, self.flow.order or pendulum.ORDER, self.flow.tolerance)
 
     def stepper(self) -> Stepper:
-        """Return the code of a step; constants that are zero leave none."""
+        """Return the code of a step, without the constants that are zero."""
         absent = frozenset(name for name, value in self.constants().items() if value == 0.0)
         return Stepper(self.form, self.flow, absent)
 
     def present(self) -> list[float]:
-        """Return the constants that the code takes."""
+        """Return the constants of the code."""
         return [value for value in self.constants().values() if value != 0.0]
 
     def simulate(self, state: ArrayLike, controls: ArrayLike, dt: float) -> NDArray[np.float64]:
-        """Step as `Scene.simulate` does; rows after a refused step are NaN."""
+        """Step like `Scene.simulate`; rows after a refused step are NaN."""
         given = np.asarray(controls, np.float64)
         trajectory = np.full((len(given) + 1, self.width - (2 if self.angle is not None else 0)), np.nan)
         trajectory[0] = state

@@ -1,7 +1,7 @@
-"""A control step by any flow, compiled for one trajectory and for a batch, and the time that it takes.
+"""A control step by any flow, compiled for one trajectory and for a batch, and its time.
 
-Both are made from the same recorded code, by the same compiler at the same vector width, whoever's method it
-is, so that times compare methods.
+Both are made from the same recorded code, by the same compiler at the same vector width, for our methods and
+others, so that times compare methods.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Kernels:
     Parameters
     ----------
     scene : Scene
-        Which of its constants are zero decides the code; problems on the same kind of scene share it.
+        Its zero constants decide the code; problems on the same kind of scene share it.
     flow : Flow, optional
         Ours for steps of `dt`, or a comparison integrator.
     dt : float
@@ -52,11 +52,11 @@ class Kernels:
         self.stepped = Stepped(scene, flow, dt)
         self._code = self.stepped.stepper()
         self._names = [name.removeprefix("k_") for name in self._code.constants]
-        #: Whether every step is an ordinary one, as those of the comparison integrators.
+        #: Whether every step is an ordinary one, as with the comparison integrators.
         self.plain = any(line == "within = True" for line in self._code.fast)
 
     def arguments(self, scene: Scene, dt: float) -> tuple[float, ...]:
-        """Return what the compiled functions take behind states and controls."""
+        """Return the arguments of the compiled functions after states and controls."""
         constants = scene._constants()
         present = [name for name, value in constants.items() if value != 0.0]
         if present != self._names:
@@ -65,11 +65,11 @@ class Kernels:
 
     @cached_property
     def simulate(self) -> Callable:
-        """``simulate(trajectory, controls, dt, x, constants...)``, as `Scene.simulate` calls it."""
+        """``simulate(trajectory, controls, dt, x, constants...)``, as called by `Scene.simulate`."""
         return self._code.compile_simulate()
 
     def end(self, case: Case, dt: float, steps: int) -> Array:
-        """Return the state after some steps with the control held; NaN where a step was refused."""
+        """Return the state after some steps with the control held; NaN if a step was refused."""
         trajectory = np.empty((steps + 1, len(case.state)))
         trajectory[0] = case.state
         refused = self.simulate(
@@ -94,7 +94,7 @@ class Kernels:
     def batch(self) -> Callable:
         """``batch(rows, count, steps, dt, x, constants...)``: many states, block by block, each some steps.
 
-        Returns how many steps were refused. `fill` and `states` tell what lies where.
+        Returns the number of refused steps. `fill` and `states` define the layout.
         """
         code = self._code
         names = [*code.start, "u0", "ordinary"]
@@ -137,7 +137,7 @@ class Kernels:
         return compile_function("batch", source, *(() if self.plain else (code.compile(),)))
 
     def fill(self, cases: Sequence[Case]) -> Array:
-        """Return the rows of a batch; the last block is filled up with its first state."""
+        """Return the rows of a batch; the last block is padded with its first state."""
         count = -(-len(cases) // BLOCK)
         padded = [*cases, *[cases[0]] * (count * BLOCK - len(cases))]
         y = self.stepped.lift(np.array([case.state for case in padded]))
@@ -152,7 +152,7 @@ class Kernels:
 
 
 class Sample(NamedTuple):
-    """Something to be timed: `run` does so many control steps, after `prepare`, which is not timed."""
+    """A sample to time: `run` does so many control steps, after `prepare`, which is not timed."""
 
     run: Callable[[], object]
     steps: int
@@ -172,7 +172,7 @@ def one_by_one(kernels: Kernels, cases: Sequence[Case], controls: Array, dt: flo
     Parameters
     ----------
     kernels : Kernels
-        What is timed.
+        The compiled steps.
     cases : sequence of Case
         Starts, all on the same scene.
     controls : array, shape (len(cases), T)
@@ -203,9 +203,9 @@ def at_once(kernels: Kernels, cases: Sequence[Case], steps: int, dt: float) -> S
 def interleaved(
     samples: Mapping[K, Sample], rounds: int = 7, clock: Callable[[], float] = time.perf_counter
 ) -> dict[K, float]:
-    """Return the time of a control step [ns] of each sample, as median over rounds.
+    """Return each sample's time of a control step [ns], the median over rounds.
 
-    Every round takes each sample once, so that a slow spell of the machine falls on all of them.
+    Every round runs each sample once, so that a slow phase of the machine affects all of them.
 
     Examples
     --------

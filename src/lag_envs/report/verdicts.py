@@ -1,7 +1,8 @@
-"""What the points of `work_precision` come to: who is faster at which error, in tables, claims and sentences.
+"""Results from the points of `work_precision`: who is faster at which error, in tables, claims and sentences.
 
-Ours is what the package ships. Everybody's fastest form and setting that reaches an error is compared with
-ours that reaches it; a defeat is told like a win. Sentences are made of the numbers, so none outlives them.
+Ours is the shipped stepping. Everybody's fastest form and setting that reaches an error is compared with our
+fastest that reaches it; defeats are reported like wins. Sentences are made from the numbers, so they cannot
+go stale.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ ROUNDING = 2.0**-53
 ROUNDINGS = 4
 #: Errors at which times are compared.
 TARGETS = (1e-3, 1e-6, 1e-9, 1e-12)
-#: Those that the README shows.
+#: The ones shown in README.
 SHOWN = TARGETS[1:]
-#: At which error ours is claimed to be the fastest: what accuracy is promised of a step, and what the system
-#: leaves of it over a long time.
+#: Error at which ours is claimed to be the fastest: the promised accuracy of a step, and what the system's
+#: amplification leaves of it over a long time.
 CLAIMED = {"one step": 1e-12, "10 s": 1e-12, "1,000 s": 1e-9}
 
-#: Whose finest setting has to be accurate, so that what is fast is no broken form.
+#: Required error of each form's finest setting, so that none is fast because it is broken.
 ACCURATE = 1e-9
 
 
 def floors(rows: Sequence[Row]) -> dict[tuple, float]:
-    """Return, by variant and horizon, what the system makes of one rounding."""
+    """Return the amplified rounding by variant and horizon."""
     return {
         (r["variant"], r["horizon"]): max(r["amplified"], ROUNDING) for r in rows if r["kind"] == "rounding"
     }
@@ -57,7 +58,7 @@ class Comparison(NamedTuple):
 
     @property
     def lost(self) -> bool:
-        """Whether a rival is faster, or gets there alone."""
+        """Whether a rival is faster, or alone in reaching the error."""
         return self.rival is not None and (self.ratio is None or self.ratio < 1.0)
 
     @property
@@ -118,13 +119,13 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "where there is one (linear scenes; Jacobi's elliptic functions for a pendulum without damping and "
         "drive), else Taylor series in fixed-point arithmetic. The control is held over the whole time. Over "
         "1,000 s there is no control, and pendulums have no damping.",
-        "Ours is what the package ships: each scene's own order and tolerance, control step by control step. "
+        "Ours is the shipped stepping: each scene's own order and tolerance, control step by control step. "
         "Over 10 s and 1,000 s there are also steps of half to eight times that length, and a single step "
         "that `simulate` divides ('lag_envs, one call'). The time includes the test whether a step is "
         "certified.",
         "Every rival gets the scene's own equation in its fastest form, and errors are those of the calls "
         "that are timed. The usual integrators are compiled by the same compiler at the same vector width "
-        "as ours, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or turn "
+        "as ours, with precomputed coefficients. 'Carried' ones have cosine and sine as unknowns, or rotate "
         "them by short polynomials, and call no function. When a control is held for long they also take "
         "one step for several control steps. heyoka runs with fast_math: single steps are its own machine "
         "code called from a compiled loop, longer times one call of propagate_until, and a batch goes in "
@@ -136,7 +137,7 @@ def _text(rows: Sequence[Row]) -> list[str]:
         "run.",
         "Times are those of one control step. Everything in a job is timed in turn with ours, and the median "
         "is taken. Jobs are brought to one scale by our own time in each. Over 10 s or 1,000 s, slow methods "
-        "are timed over a part of that, in one call too.",
+        "are timed over only part of that, also in one call.",
     ]
 
 
@@ -152,7 +153,7 @@ def findings(found: Sequence[Comparison]) -> list[str]:
 
 
 def _finding(found: Sequence[Comparison]) -> str:
-    """Return who is faster at one error, as a clause; every comparison is in one of its counts."""
+    """Return who is faster at one error, as a clause that counts every comparison."""
     settled = sorted((d for d in found if d.ratio is not None), key=lambda d: d.ratio or 0.0)
     lost = [d for d in settled if d.lost]
     won = [d for d in settled if not d.lost]
@@ -189,8 +190,8 @@ def _listed(parts: Iterable[str]) -> str:
 def _targets(found: Sequence[Comparison]) -> Table:
     return Table(
         "work_precision_targets",
-        "The fastest of ours and the fastest of everybody else's that reach an error; below 1 the other is "
-        "faster. An empty cell: not reached.",
+        "The fastest form of ours and of all others that reaches an error; below 1 the other is "
+        "faster. Empty cell: not reached.",
         [
             "scene", "horizon", "mode", "error", "ours", "ours: error", "ours: ns", "fastest other",
             "other: error", "other: ns", "other / ours",
@@ -206,7 +207,7 @@ def _targets(found: Sequence[Comparison]) -> Table:
     )  # fmt: skip
 
 
-#: Rivals that take more than so many times our time are left to the tables in CSV.
+#: Rivals slower than this many times our time appear only in the CSV tables.
 NEAR = 10.0
 
 
@@ -219,7 +220,7 @@ def _near(points: Sequence[Point]) -> Table:
 
 
 def _rivals(points: Sequence[Point]) -> Table:
-    """Return every rival's own shortest time to each error, on one step."""
+    """Return every rival's shortest time to each error, for one step."""
     rows = []
     here = [p for p in points if p.horizon == "one step" and not p.ours]
     for variant in VARIANTS:
@@ -235,7 +236,7 @@ def _rivals(points: Sequence[Point]) -> Table:
     return Table(
         "work_precision_rivals",
         "Each rival's shortest time to an error in one control step, as a multiple of the time of lag_envs, "
-        "and its smallest error. Below 1 the rival is faster. An empty cell: not reached.",
+        "and its smallest error. Below 1 the rival is faster. Empty cell: not reached.",
         ["scene", "mode", "rival", *(f"to {target:.0e}" for target in TARGETS), "smallest error"],
         rows,
     )
@@ -316,8 +317,8 @@ def _left(rows: Sequence[Row]) -> Table:
             found.append([row["variant"], row["horizon"], MODES[row["mode"]], _setting(row), problem])
     return Table(
         "work_precision_left",
-        "What was not run, and what diverged: members that ended without a number or further away than their "
-        "own size. They are drawn at the upper edge. Finer settings of what would take too long are not run "
+        "Not run, or diverged: members that ended without a number or further away than their own size. "
+        "They are drawn at the upper edge. Finer settings of methods that would take too long are not run "
         "either.",
         ["scene", "horizon", "mode", "method", "problem"],
         found,
@@ -344,7 +345,7 @@ def _all(points: Sequence[Point]) -> Table:
 
 
 def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Comparison]) -> list[Claim]:
-    """Return what is claimed; whether it holds is measured, and what does not hold is told in the README."""
+    """Return the claims; whether they hold is measured, and README lists those that do not."""
     made = [_fastest(found, horizon, target) for horizon, target in CLAIMED.items()]
     steps = [p for p in points if p.ours and p.method == OURS and p.horizon == "one step"]
     largest = max((p.worst for p in steps), default=math.nan)
@@ -382,7 +383,7 @@ def claims(rows: Sequence[Row], points: Sequence[Point], found: Sequence[Compari
     same = _same_bits(rows)
     made.append(
         _claim(
-            "The batches that are timed end where single trajectories do, bit for bit, ours and the others",
+            "Batches that are timed end bit for bit where single trajectories do, for ours and the others",
             same,
             lambda: all(same),
             lambda: f"{sum(same)} of {len(same)}",
@@ -453,8 +454,8 @@ def _file(variant: str) -> str:
 def _caption(variant: str) -> str:
     return (
         f"{variant}: largest error against the time of a control step. Lower left is better. Columns: one "
-        "control step, 10 s, 1,000 s; rows: alone, and in a batch (1,024 states; 128 over 10 s and 1,000 s). "
-        "Of each method the faster form is drawn. Thin bars reach down to the median error. Dotted: what the "
-        "system itself makes of one rounding of its start. Reference: 30 digits, by closed forms where there "
-        "is one, else by Taylor series."
+        "control step, 10 s, 1,000 s; rows: alone, and in a batch (1,024 states; 128 over 10 s and 1,000 "
+        "s). The faster form of each method is drawn. Thin bars reach down to the median error. Dotted: "
+        "one rounding of the start, amplified by the system itself. Reference: 30 digits, by closed forms "
+        "if there are any, otherwise by Taylor series."
     )

@@ -1,8 +1,7 @@
-"""Error against time: the stepping that is shipped, the usual integrators, other libraries.
+"""Error against time: the shipped stepping, the usual integrators, other libraries.
 
-Every rival runs in the fastest form that it has (`rivals`, `peers`), alone and in a batch, and the errors are
-those of the calls that are timed. What is measured here is compared and told in `verdicts` and drawn in
-`diagrams`.
+Every rival runs in its fastest form (`rivals`, `peers`), alone and in a batch, and the errors are those of
+the timed calls. `verdicts` compares and reports the measurements, `diagrams` draws them.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ from lag_envs.stepping.flows import Flow
 __all__ = ["content", "errors", "jobs", "orders", "points"]
 
 SECTION = "work_precision"
-#: Orders of the series whose convergence is measured; nothing else is told of those that are not shipped.
+#: Orders of the series whose convergence is measured; orders that are not shipped are used for nothing else.
 ORDERS = tuple(range(4, 21, 2))
 
 
 class Horizon(NamedTuple):
-    """How long the control is held, and what is measured over that time."""
+    """How long the control is held, and the measurements over that time."""
 
     seconds: float | None  #: None: one control step
     members: int  #: problems
@@ -61,19 +60,19 @@ QUICK = {
 }
 QUICK_METHODS = ("Verlet", "RK4", "RK4, carried", "DOP853, carried")
 QUICK_VARIANTS = ("PivotedBar",)
-#: Libraries that are slow to compile or to run are measured on one variant per kind of equation.
+#: Libraries that are slow to compile or to run; measured on one variant per kind of equation.
 COVERED = {
     "diffrax": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
     "torchdiffeq": ("PivotedBar", "Incline, moving", "CylinderInCylinder, tilt"),
 }
-#: Seconds that the errors of one point may take; what would take longer is not run.
+#: Seconds that the errors of one point may take; slower points are not run.
 LIMIT = 2.0
-#: Seconds that one sample of its time may take, about.
+#: Approximate seconds for one sample of its time.
 SAMPLE = 0.02
 
 
 def control_step(variant: str) -> float:
-    """Return the control step [s] with 36 bits behind the point: products with whole numbers are exact."""
+    """Return the control step [s] rounded to a multiple of 2^-36: its products with integers are exact."""
     return round(VARIANTS[variant].dt * 2**36) / 2**36
 
 
@@ -117,14 +116,14 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def problems(variant: str, horizon: str, cases: Sequence[Case]) -> list[Case]:
-    """Return the cases of a horizon; over 1,000 s without control, and a pendulum's without damping."""
+    """Return the cases of a horizon; those over 1,000 s have no control, and pendulums no damping."""
     if horizon != "1,000 s":
         return list(cases)
     return [Case(_undamped(case.scene), case.state, 0.0) for case in cases]
 
 
 def _undamped(scene: Scene) -> Scene:
-    """Return a scene whose motion has a closed form: what is stepped by series has none with damping."""
+    """Return a scene whose motion has a closed form: without damping, if it is stepped by series."""
     if not Stepped(scene).flow.order:
         return scene
     return dataclasses.replace(scene, damping=0.0)  # type: ignore[type-var]
@@ -163,7 +162,7 @@ def truths(variant: str, horizon: str, plan: Horizon) -> list[Truth]:
 
 
 def amplified(some: Sequence[Truth], dt: float, steps: int) -> float:
-    """Return what the system makes of one rounding of its start: the median, relative to the scales."""
+    """Return the median effect of one rounding of the start, relative to the scales."""
     from mpmath import mp, mpf
 
     found = []
@@ -176,7 +175,7 @@ def amplified(some: Sequence[Truth], dt: float, steps: int) -> float:
 
 
 def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
-    """Compute the exact ends, which are kept for the other jobs; yield what a rounding grows to."""
+    """Compute the exact ends, which are kept for the other jobs; yield amplified roundings."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     dt = control_step(variant)
     found = truths(variant, horizon, plan)
@@ -187,7 +186,7 @@ def references(variant: str, horizon: str, quick: bool) -> Iterator[Row]:
 
 
 def errors(some: Sequence[Truth], ends: Array) -> Row:
-    """Return errors of states, the largest and median of those below 1, and how many members are lost."""
+    """Return errors of states, the largest and median of those below 1, and the number of lost members."""
     found = [t.error(end) for t, end in zip(some, ends, strict=True)]
     kept = [error for error in found if error < 1.0]
     return {
@@ -203,13 +202,13 @@ def errors(some: Sequence[Truth], ends: Array) -> Row:
 
 
 def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
-    """Return a family's methods at all settings; ours are with those that our machinery compiles."""
+    """Return a family's methods at all settings; ours belong to those compiled by our machinery."""
     plan = (QUICK if quick else HORIZONS)[horizon]
     if family == "compiled":
         equation = Problems(problems(variant, horizon, ensemble(variant, 1))).equation
         methods = [m for m in Compiled.methods(equation) if not quick or m in QUICK_METHODS]
         ours = [Ours(Ours.METHOD, 1)]
-        if plan.seconds is not None:  # a control that is held may be stepped with any dt
+        if plan.seconds is not None:  # a constant control may be stepped with any dt
             ours += [*(Ours(Ours.METHOD, n) for n in (1 / 8, 1 / 4, 1 / 2, 2)), Ours(Ours.ONE_CALL, 1)]
         return [
             *ours,
@@ -223,7 +222,7 @@ def rivals(variant: str, horizon: str, family: str, quick: bool) -> list[Rival]:
 def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
     """Yield errors and times of a family on a variant, alone and in a batch.
 
-    Every row has as its `clock` the time of a control step of ours, taken in turn with it in the same job.
+    Every row has as its `clock` our time of a control step, measured in turn with it in the same job.
     """
     dt = control_step(variant)
     for horizon, plan in (QUICK if quick else HORIZONS).items():
@@ -234,7 +233,7 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
             base = batch if together or steps > 1 else mirrored(batch, *VARIANTS[variant].controls)
             found: list[Row] = []
             samples: list[Sample] = []
-            done: dict[str, float] = {}  # error so far of methods; -1 where finer settings are not run
+            done: dict[str, float] = {}  # error so far of methods; -1 if finer settings are not run
             for rival in rivals(variant, horizon, family, quick):
                 if done.get(rival.method) == -1.0 or (together and not rival.batched):
                     continue
@@ -268,15 +267,15 @@ def points(variant: str, family: str, quick: bool) -> Iterator[Row]:
 def point(
     rival: Rival, some: Sequence[Truth], base: Sequence[Case], dt: float, steps: int, together: bool
 ) -> tuple[Row, Sample]:
-    """Return the errors of a rival, and the sample by which its time is taken.
+    """Return the errors of a rival, and the sample for timing it.
 
     Raises
     ------
     TimeoutError
-        Where it would take too long.
+        If it would take too long.
     """
     members = [t.case for t in some]
-    # Where states share their steps, the errors are those of a batch as large as the one that is timed.
+    # If states share their steps, errors are from a batch as large as the timed one.
     cases = [*members, *base[len(members) :]] if together and rival.shared else members
     if rival.family != "ours":
         few = cases if together else cases[:1]
@@ -284,29 +283,29 @@ def point(
         if expected > LIMIT:
             raise TimeoutError(f"not run, it would take {expected:.0f} s")
     ends = rival.build(Problems(cases), dt, steps, together).end()[: len(some)]
-    known = np.where(np.isnan(ends), np.nan, ends)  # there are many bit patterns that are no number
+    known = np.where(np.isnan(ends), np.nan, ends)  # NaN has many bit patterns
     row = errors(some, ends) | {"digest": hashlib.sha256(known.tobytes()).hexdigest()[:16]}
     return row, timed(rival, base, dt, steps, together)
 
 
 def _seconds(rival: Rival, cases: Sequence[Case], dt: float, steps: int, together: bool) -> float:
-    """Return how long a call takes, about, from one for a hundredth of the time; compile on the way."""
+    """Estimate the time of a call from one for a hundredth of the time; compile on the way."""
     part = max(1, steps // 100)
     sample = rival.build(Problems(cases), dt, part, together)
     sample.end()
-    begin = time.process_time()  # whatever else the machine does
+    begin = time.process_time()  # not affected by the machine's other work
     sample.end()
     return max(time.process_time() - begin, 1e-7) * steps / part
 
 
 def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: bool) -> Sample:
-    """Return a sample of some milliseconds, in one call, all in compiled loops where the rival has them.
+    """Return a sample of some milliseconds, in one call, all in compiled loops if the rival has them.
 
-    Over a long time a step costs what it does over a shorter one, so a slow rival is timed over a part of it.
+    A step costs the same over a long time as over a short one, so a slow rival is timed over part of it.
     """
     if steps == 1 and rival.changing:
         each = rival.substeps(1) if rival.fixed else 1
-        if together:  # few, for a control that is held drives states afar
+        if together:  # few, since a constant control drives states far away
             return rival.build(Problems(base), dt, 1, True, max(1, 4 // each))
         return rival.build(Problems(base[:8]), dt, 1, False, max(8, 512 // each))
     some = base if together else base[:1]
@@ -322,9 +321,9 @@ def timed(rival: Rival, base: Sequence[Case], dt: float, steps: int, together: b
 
 
 def mirrored(cases: Sequence[Case], low: float, high: float) -> list[Case]:
-    """Return cases of which each second one has the control of the one before, mirrored in their range.
+    """Return cases in which every second control is the one before, mirrored within its range.
 
-    So no drive builds up where one control follows another.
+    So no drive builds up over successive controls.
     """
     return [
         case._replace(control=low + high - cases[i - 1].control) if i % 2 else case
@@ -333,7 +332,7 @@ def mirrored(cases: Sequence[Case], low: float, high: float) -> list[Case]:
 
 
 def repeated(sample: Sample, times: int) -> Sample:
-    """Return the sample of several calls, each going on where the last one ended or starting anew."""
+    """Return the sample of several calls, each continuing from the last end state or starting afresh."""
 
     def run() -> None:
         for _ in range(times):
@@ -354,7 +353,7 @@ class Series(NamedTuple):
 
 
 def series(scene: Scene, quick: bool = False) -> list[Series]:
-    """Return all methods that have an order: the series of ours at several, and the usual integrators."""
+    """Return all methods that have an order: ours at several orders, and the usual integrators."""
     found, flow = [], Stepped(scene).flow
     if flow.order:
         found = [Series(f"plain series {n}", plain_series(n), n) for n in ((4, 8) if quick else ORDERS)]
@@ -380,21 +379,22 @@ def orders(variant: str, quick: bool) -> Iterator[Row]:
 
 
 def single_steps(variant: str, cases: Sequence[Case]) -> dict[float, list[Truth]]:
-    """Return the exact ends of single steps of several lengths, each √2 times longer than the one before."""
+    """Return the exact ends of single steps of several lengths, each √2 times the previous one."""
     lengths = [round(VARIANTS[variant].dt * 2 ** (k / 2) * 2**36) / 2**36 for k in range(-4, 9)]
     return {h: [truth(case, h, 1) for case in cases] for h in lengths}
 
 
 def measured_order(found: Series, ends: Mapping[float, Sequence[Truth]]) -> float | None:
-    """Return how the error of one step grows with its length, less one; None where there is none."""
+    """Return the slope of the error of one step over its length, minus one; None if there is none."""
     kernels = Kernels(next(iter(ends.values()))[0].case.scene, found.flow)
     return slope({h: [t.error(kernels.end(t.case, h, 1)) for t in some] for h, some in ends.items()})
 
 
 def slope(found: Mapping[float, Sequence[float]]) -> float | None:
-    """Return the order seen in the errors of steps of several lengths, as median over members.
+    """Return the observed order from the errors of steps of several lengths, as median over members.
 
-    The shortest steps h and 2h are compared whose errors are well above rounding in half of the members.
+    The comparison uses the shortest steps h and 2h whose errors are well above rounding in half of the
+    members.
 
     Examples
     --------

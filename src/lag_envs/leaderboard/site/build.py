@@ -1,7 +1,7 @@
-"""Writes the leaderboard's page: an overview, a page for every environment and agent, a feed of new entries.
+"""Writes the leaderboard's page: an overview, a page for each environment and agent, a feed of new entries.
 
-What comes from submissions is untrusted. It reaches HTML through jinja2's escaping only, scripts as JSON
-without ``<``, ``>`` and ``&``, and links only where it is an address of http or https.
+Submissions' contents are untrusted. They reach HTML only through jinja2's escaping, scripts only as JSON
+without ``<``, ``>`` and ``&``, and links only if they are http or https addresses.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from lag_envs import store
 from lag_envs.leaderboard.site import driving
 from lag_envs.leaderboard.site.scenery import Scenery, describe
 
-#: Names the files that the last build wrote; only these are ever removed.
+#: Lists the files that the last build wrote; only these are ever removed.
 MANIFEST = "site.json"
 STATIC = Path(__file__).parent / "static"
-#: Poses of one episode that an overview's picture shows.
+#: Poses of one episode in an overview's picture.
 POSES = 15
 #: Entries of the feed.
 NEWS = 50
-ABOUT = "Leaderboard of lag_envs: every score recomputed from a policy that is data only."
+ABOUT = "Leaderboard of lag_envs: every score is recomputed from a policy that contains only data."
 
 KINDS = {"learned": "Learned", "controller": "Controller", "optimal": "Optimal"}
 
 
 class Column(NamedTuple):
-    """A column of a ranking: its key in a row, heading, what it means, and whether small is good."""
+    """A column of a ranking: its key in a row, heading, meaning, and whether small is good."""
 
     key: str
     label: str
@@ -48,7 +48,7 @@ COLUMNS = (
     Column(
         "rank",
         "Rank",
-        "Agents share a rank where it is not clear which of them is better. One that acts like an earlier "
+        "Agents share a rank if it is not clear which of them is better. One that acts like an earlier "
         "one has none.",
         True,
     ),
@@ -69,7 +69,7 @@ COLUMNS = (
     Column(
         "robustness",
         "Robust",
-        "Least score over environments with changed masses, drag and the like, on newer boards also with "
+        "Lowest score over environments with changed masses, drag and the like, on newer boards also with "
         "noise, delays and pushes.",
     ),
     Column("often", "10 × rate", "Score when acting ten times as often."),
@@ -79,23 +79,23 @@ COLUMNS = (
 def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     """Write the page.
 
-    A browser that looks at the old page meanwhile, and a process killed at any moment, leave whole pages:
-    scripts, styles and data have the hash of their content in their names, pages are replaced at once, the
-    overview last, and what no page refers to any more goes in the end.
+    A browser that reads the old page meanwhile, or a kill at any moment, finds whole pages: scripts, styles
+    and data have the hash of their content in their names, each page is replaced at once, the overview last,
+    and files that no page refers to are removed at the end.
 
     Parameters
     ----------
     data : Mapping
-        What `lag_envs.leaderboard.standings.page_data` returns.
+        The result of `lag_envs.leaderboard.standings.page_data`.
     out : Path
         Folder of the page; made if it does not exist.
     url : str, optional
-        Address at which the folder will be found. Previews of links need it for their pictures.
+        Address at which the folder will be found. Link previews need it for their pictures.
 
     Raises
     ------
     ValueError
-        If the address is none of http or https.
+        If the address is not http or https.
     FileExistsError
         If the folder holds an ``index.html`` that no earlier build wrote.
     NotADirectoryError, OSError
@@ -107,7 +107,7 @@ def build(data: Mapping[str, Any], out: Path, url: str = "") -> None:
     wanted = {**files, **pages}
     store.write(out / MANIFEST, json.dumps({"files": sorted({*before, *wanted})}, indent=0))
     for name, text in wanted.items():
-        # A name with a hash says what is in the file, so it need not be written again.
+        # The hash in its name covers the content, so an existing file need not be written again.
         if name in pages or not (out / name).is_file():
             store.write(out / name, text)
     for name in before - set(wanted):
@@ -120,7 +120,7 @@ def render(
 ) -> tuple[dict[str, str], dict[str, str | bytes]]:
     """Return the pages, the overview last, and the files they refer to: content by path.
 
-    Where the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
+    If the page is part of a larger site, `site` has (title, address) of its sections, for the pages' head.
     """
     if url and not safe_url(url):
         raise ValueError(f"the page's address must begin with https:// or http://, got {url!r}")
@@ -213,13 +213,13 @@ def _unused(name: str, taken: set[str]) -> str:
 
 
 def _about(row: Mapping[str, Any]) -> str:
-    """Return an agent in a sentence."""
+    """Return a one-sentence summary of an agent."""
     place = "" if row["rank"] is None else f", rank {row['rank']}"
     return f"{KINDS.get(row['kind'], row['kind'])}: score {number(row['score'])}{place}"
 
 
 def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, Any]:
-    """Return an environment's data with all that the templates and the script ask for."""
+    """Return an environment's data for the templates and the script."""
     board: dict[str, Any] = {
         "known": None,
         "value": None,
@@ -245,7 +245,7 @@ def _board(given: dict[str, Any], protocol: Any, scenery: Scenery) -> dict[str, 
     known, board["optimum"] = board["known"], None
     if known and known.get("optimum") is not None and known["best"] != known["random"]:
         board["optimum"] = (known["optimum"] - known["random"]) / (known["best"] - known["random"])
-    # Of the best agent that can be watched; without any, the scene as it is at the start.
+    # From the best agent that can be watched; without any, the scene at its start.
     watched = [row for row in board["rows"] if row["replays"]]
     shown = next((row for row in watched if row["rank"] is not None), watched[0] if watched else None)
     board["shown"] = shown and shown["name"]
@@ -278,7 +278,7 @@ def _scores(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def safe_url(url: Any) -> str | None:
-    """Return an address of http or https as it is, and None for all else.
+    """Return an http or https address as it is, and None for anything else.
 
     Examples
     --------
@@ -295,7 +295,7 @@ def safe_url(url: Any) -> str | None:
 
 
 def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequence[float]]:
-    """Return states of an episode at equal times, while most of it happens."""
+    """Return states of an episode at equal times, while most of the motion happens."""
     if not names or len(states[0]) != len(names):
         return []
     values = np.nan_to_num(np.array(states, np.float64))
@@ -309,7 +309,7 @@ def _apart(states: Sequence[Sequence[float]], names: Sequence[str]) -> list[Sequ
 
 
 def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
-    """Return what a column is sorted by."""
+    """Return a column's sort key."""
     value = row[key]
     if key == "name":
         return str(value).casefold()
@@ -322,7 +322,7 @@ def value_of(row: Mapping[str, Any], key: str) -> float | str | None:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Return a number with so many digits after the point, fewer for large ones.
+    """Return a number with so many digits after the point, fewer for large numbers.
 
     Examples
     --------
@@ -385,7 +385,7 @@ def duration(value: Any) -> str:
 
 
 def _clean(value: Any) -> Any:
-    """Return the value with None for numbers that JSON does not have, without characters that are none."""
+    """Return the value without invalid characters, and with None for numbers that JSON does not have."""
     if isinstance(value, Mapping):
         return {_clean(str(k)): _clean(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -396,7 +396,7 @@ def _clean(value: Any) -> Any:
 
 
 def _json(value: Any) -> str:
-    """Return JSON that neither ends a script element nor means anything but itself in JavaScript."""
+    """Return JSON that cannot end a script element and means the same in JavaScript."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -409,7 +409,7 @@ def _manifest(out: Path) -> set[str]:
     """Return the files that the last build wrote."""
     try:
         names = json.loads((out / MANIFEST).read_text("utf-8"))["files"]
-        # A manifest that somebody wrote by hand must not remove what lies elsewhere.
+        # A manifest that somebody wrote by hand must not remove files elsewhere.
         return {n for n in names if re.fullmatch(r"(assets/)?[\w-]+\.(html|css|js|png|xml)", n)}
     except FileNotFoundError:
         if (out / "index.html").exists():

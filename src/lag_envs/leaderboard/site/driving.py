@@ -1,4 +1,4 @@
-"""What a browser needs to drive an environment: its step as a script, sliders, and agents that run live."""
+"""The data with which a browser drives an environment: its step as a script, sliders, and live agents."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from lag_envs.scenes.picture import Picture
 from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 
-#: Where sliders have their marks, as multiples of a parameter's value.
+#: Marks of the sliders, as multiples of a parameter's value.
 MARKS = (0.5, 2.0**-0.5, 1.0, 2.0**0.5, 2.0)
 
 
 def script(env_id: str) -> str | None:
     """Return the file with which a page drives an environment of the package.
 
-    None for an unknown id, and for one with imperfections that no script has.
+    None for an unknown id, and for one with imperfections that scripts do not have.
     """
     kind: Any = TASKS.get(env_id)
     try:
@@ -54,7 +54,7 @@ def script_of(kind: type[Task]) -> str:
     Returns
     -------
     str
-        JavaScript: a call of ``lagEnvs.put`` with the step's functions and what there is to know of them.
+        JavaScript: a call of ``lagEnvs.put`` with the step's functions and data about it.
     """
     task = kind()
     env = Unfused(task)
@@ -73,7 +73,7 @@ def _number(x: float) -> str:
 
 
 def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
-    """Return what the page knows of a step, in JSON types."""
+    """Return the page's data about a step, in JSON types."""
     task, program = env.task, env.program
     formulas, rows = task.formulas, env.program.rows
     units = dict(zip(task.scene.control_names, task.scene.control_units, strict=True))
@@ -116,9 +116,9 @@ def _about(kind: type[Task], env: Unfused) -> dict[str, Any]:
 def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
     """Return the parameters that may be changed while driving.
 
-    Only such are offered whose other values the script steps as an environment made with them would be; what
-    the formulas do beyond arithmetic, in Python, does not reach the script. How each changes the picture is
-    told at `MARKS`.
+    Only parameters for which the changed script steps like an environment made with the changed value: Python
+    code beyond the formulas' arithmetic does not reach the script. The effect on the picture is given at
+    `MARKS`.
     """
     task, program = env.task, env.program
     names, units = list(program.given), dict(zip(task.scene._numbers(), _units(task), strict=True))
@@ -129,7 +129,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
         for name, value in values.items()
         if 0.0 < value < math.inf and (others := _made(kind, {name: value}, MARKS))
     }
-    # All at once, which is quick; and only where that is not as it should be one by one.
+    # All at once, which is quick; one by one only if that fails.
     together = _follows(env, {name: values[name] for name in marked})
     found: list[dict[str, Any]] = []
     for name, others in marked.items():
@@ -144,7 +144,7 @@ def sliders(kind: type[Task], env: Unfused) -> list[dict[str, Any]]:
 
 
 def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float]) -> list[Task]:
-    """Return the task with parameters at marks; nothing where one of them is refused."""
+    """Return the task with parameters at marks; empty if one of them is refused."""
     try:
         return [kind(**{name: value * mark for name, value in values.items()}) for mark in marks]
     except (ValueError, TypeError, FormulaError):
@@ -152,7 +152,7 @@ def _made(kind: type[Task], values: Mapping[str, float], marks: Sequence[float])
 
 
 def _follows(env: Unfused, values: Mapping[str, float]) -> bool:
-    """Tell whether a script with other values of parameters does what tasks made with them do."""
+    """Tell whether a script with changed parameters does the same as tasks made with them."""
     others = _made(type(env.task), values, (MARKS[0], MARKS[-1]))
     return bool(others) and all(_steps_as(env, list(values), other) for other in others)
 
@@ -168,7 +168,7 @@ def _look(task: Task) -> dict[str, Any]:
 
 
 def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
-    """Tell whether a script with another task's values of parameters does what that task's does."""
+    """Tell whether a script with another task's parameters does the same as that task."""
     if other.formulas.key != env.task.formulas.key or other.limit != env.task.limit:
         return False
     changed, own = Unfused(env.task, env.program), Unfused(other)
@@ -196,8 +196,8 @@ def _steps_as(env: Unfused, names: Sequence[str], other: Task) -> bool:
 def agent(policy: Policy) -> dict[str, Any] | None:
     """Return a policy as the page runs it, in JSON types; None for one that only Python can run.
 
-    The page runs networks, linear and time-varying feedback, and tables; of the controllers those that are
-    nothing but feedback.
+    The page runs networks, linear and time-varying feedback, and tables; of the controllers, only those that
+    are pure feedback.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def agent(policy: Policy) -> dict[str, Any] | None:
     """
     made = policy.architecture
     if isinstance(made, Table) and made.task.imperfections:
-        return None  # it looks ahead on the environment without them, which the page does not have
+        return None  # it looks ahead on the environment without imperfections, which the page does not have
     if isinstance(made, Network | Linear | Table):
         about, arrays, head = _learned(policy), policy.arrays, made.head
     elif isinstance(made, Plan | Controller) and not made.plans:
@@ -225,7 +225,7 @@ def agent(policy: Policy) -> dict[str, Any] | None:
 
 
 def _learned(policy: Policy) -> dict[str, Any]:
-    """Return what the page knows of a policy whose arrays it takes as they are."""
+    """Return the page's data about a policy whose arrays it uses as they are."""
     made: Any = policy.architecture
     if isinstance(made, Linear):
         return {"kind": "linear"}
@@ -255,7 +255,7 @@ def _learned(policy: Policy) -> dict[str, Any]:
 
 
 def _feedback(law: Law) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return what the page knows of a controller that is nothing but feedback, and its arrays."""
+    """Return the page's data about a controller that is pure feedback, and its arrays."""
     if law.read is None:
         return {"kind": "linear"}, {"gain": -law.gains[0].T, "offset": law.actions[0]}
     arrays = {name: getattr(law, name) for name in ("states", "actions", "gains")}
@@ -263,7 +263,7 @@ def _feedback(law: Law) -> tuple[dict[str, Any], dict[str, Array]]:
 
 
 def _array(array: Any) -> dict[str, Any]:
-    """Return an array as base64 of its bytes; of 32 bits each where that is all there is to them."""
+    """Return an array's bytes in base64, in 32 bits per number if that is exact, else in 64."""
     short = array.astype("<f4")
     exact = bool((short.astype(np.float64) == array).all())
     data = np.ascontiguousarray(short if exact else array.astype("<f8"))

@@ -1,7 +1,7 @@
-"""What a browser needs to show an environment: names and units, shapes once, and poses per moment.
+"""The data with which a browser shows an environment: names and units, shapes, and poses at each moment.
 
-Numbers that change with time are columns: whole multiples of a unit, of which the second differences are
-written, for these are small; one that never changes is a single number.
+Numbers that change with time are columns: multiples of a unit, written as their second differences, which are
+small. A number that never changes is written once.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from lag_envs.tasks import TASKS
 from lag_envs.tasks.base import Task
 from lag_envs.tasks.measured import measured
 
-#: Unit of states, actions and returns, of which three digits are shown.
+#: Unit of states, actions and returns, which are shown with three digits.
 UNIT = 1e-4
-#: Units of lengths as a share of the window, of angles [rad] and of parts of lines: a fraction of a pixel.
+#: Units of lengths as a share of the window, of angles [rad] and of parts of lines: each a fraction of a
+#: pixel.
 LENGTH, ANGLE, PART = 1e-4, 2e-4, 2e-3
 
 
 def describe(env_id: str) -> dict[str, Any]:
-    """Return what the page says of an environment and draws it with.
+    """Return the data with which the page describes and draws an environment.
 
     Parameters
     ----------
@@ -40,8 +41,8 @@ def describe(env_id: str) -> dict[str, Any]:
     -------
     dict
         ``title``, ``about`` (its description's paragraphs), ``difficulty``, ``open`` (None, or ``knows``,
-        ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (which
-        entries are a coordinate and its rate), ``dt`` [s] and ``picture`` (None where the scene has no
+        ``share`` and ``tried``: method, budget, return), ``state_names``, ``state_units``, ``pairs`` (the
+        entries that are a coordinate and its rate), ``dt`` [s] and ``picture`` (None if the scene has no
         bodies). Empty for an id that this version does not have, such as a frozen board's.
 
     Examples
@@ -74,7 +75,7 @@ def describe(env_id: str) -> dict[str, Any]:
 
 
 def _open(task: Task) -> dict[str, Any] | None:
-    """Return what was tried of a task that is open, and how far it got."""
+    """Return what was tried on an open task, and how far it got."""
     if task.open is None:
         return None
     found = measured(task.id).get("measured", {})
@@ -83,7 +84,7 @@ def _open(task: Task) -> dict[str, Any] | None:
 
 
 def _pairs(scene: Scene) -> list[list[int]]:
-    """Return where the state has a coordinate and its rate, free ones first."""
+    """Return the places of each coordinate and its rate in the state, free coordinates first."""
     state, free = scene._layout.state, scene._layout.free
     found = [
         [i, j]
@@ -95,14 +96,14 @@ def _pairs(scene: Scene) -> list[list[int]]:
 
 
 def picture(shown: Picture) -> dict[str, Any] | None:
-    """Return the shapes of a picture as ``site.js`` has them.
+    """Return the shapes of a picture in the form that ``site.js`` reads.
 
     Returns
     -------
     dict or None
-        ``shapes``, of which each is [kind, number of its frame, ...]; ``window``, [left, bottom, right, top]
-        [m], which moves with the frame ``follows``; and ``units``, those of x, y, angle and part. None where
-        there is nothing to be seen.
+        ``shapes``, each of them [kind, number of its frame, ...]; ``window``, [left, bottom, right, top] [m],
+        which moves with the frame ``follows``; and ``units``, those of x, y, angle and part. None if there is
+        nothing to see.
     """
     if not shown.shapes:
         return None
@@ -132,7 +133,7 @@ class Scenery:
         self._units = found and found["units"]
 
     def episode(self, replay: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a recorded episode with columns in place of its numbers, and with poses."""
+        """Return a recorded episode with poses, and with columns instead of numbers."""
         steps = min(len(replay["states"]) - 1, len(replay["actions"]))
         states, actions = replay["states"][: steps + 1], replay["actions"][:steps]
         rewards = np.nan_to_num(np.array(replay["rewards"][:steps], np.float64))
@@ -142,7 +143,7 @@ class Scenery:
             "returns": column(np.concatenate([[0.0], np.cumsum(rewards)]), UNIT),
         }
         kept = {key: value for key, value in replay.items() if key not in ("states", "actions", "rewards")}
-        if "reset_seed" in kept:  # JavaScript's numbers would round it
+        if "reset_seed" in kept:  # as a number, JavaScript would round it
             kept["reset_seed"] = str(kept["reset_seed"])
         dt = replay.get("dt") or (self._task.dt if self._task else 1.0)
         poses = self._poses(states, actions, replay.get("target"), dt)
@@ -153,7 +154,7 @@ class Scenery:
         return {"count": len(states), "target": target, "poses": self._poses(states, None, target, 0.0)}
 
     def preview(self, states: Sequence[Sequence[float]], target: Any) -> bytes | None:
-        """Return the last of some states as a PNG; None where nothing is to be seen."""
+        """Return the last of some states as a PNG; None if there is nothing to see."""
         task, shown = self._task, self._shown
         if task is None or shown is None or not shown.shapes or not states:
             return None
@@ -164,11 +165,11 @@ class Scenery:
 
     @property
     def start(self) -> list[list[float]]:
-        """The middle of where episodes start, if there is one."""
+        """The centre of the distribution of starts, if there is one."""
         return [[float(x) for x in self._task.centre]] if self._task else []
 
     def _poses(self, states: Any, actions: Any, target: Any, dt: float) -> dict[str, Any] | None:
-        """Return the columns that differ, and for each frame which are its x, y, angle and part."""
+        """Return the distinct columns, and for each frame the numbers of its x, y, angle and part."""
         task, shown = self._task, self._shown
         if task is None or shown is None or not self._units:
             return None

@@ -1,9 +1,9 @@
 "use strict";
-/* Driving an environment in the page. Loaded when somebody wants to.
+/* Driving an environment in the page. Loaded on demand.
  *
  * The step comes as functions that Python printed (lag_envs/envs/unfused.py); no physics is written here.
- * Arrays as there: k constants, f the rows of one environment, a an action, d draws in [0, 1), p poses.
- * Of imperfect sensors and actuators it has what scripts have: drawn parameters, noise, late actions.
+ * Arrays are named as there: k constants, f one environment's row, a action, d draws in [0, 1), p poses.
+ * Of imperfect sensors and actuators, scripts have drawn parameters, noise and delayed actions.
  *
  * In this order: random numbers, episodes, links, agents, the person's hands, the stage.
  */
@@ -11,7 +11,7 @@
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
 
   // --- random numbers --------------------------------------------------------------------------------------
-  // Those of lag_envs/stepping/primitives.py: SplitMix64's mix of key, step and index, in 64 bits.
+  // The same as lag_envs/stepping/primitives.py: SplitMix64's mix of key, step and index, in 64 bits.
 
   const big = (x) => BigInt(x);
   const BITS = 64;
@@ -61,7 +61,7 @@
       this.observe();
     }
 
-    /** Draws of this step, of the episode's own or of a purpose's. */
+    /** Draws of this step, from the episode's own key or that of a purpose. */
     draws(count, purpose) {
       const key = purpose ? episodeKey(this.key, PURPOSES[purpose]) : this.key;
       const step = purpose ? this.steps * Math.ceil(count / PER_STEP) : this.steps;
@@ -113,11 +113,11 @@
     }
   }
 
-  /** The action that a step's numbers mean. */
+  /** The action for a step's numbers. */
   const actionOf = (key, { controls, levels, largest }) => key.map((n, i) => (controls[i].values.length ? n : largest * (n / levels)));
 
   // --- links -----------------------------------------------------------------------------------------------
-  // As lag_envs/replay.py has them.
+  // The same as lag_envs/replay.py.
 
   const MARK = "drive=";
   const view = new DataView(new ArrayBuffer(8));
@@ -193,10 +193,10 @@
     return `${page}#${MARK}${fields}~${crc32(fields)}`;
   }
 
-  /** What a link says; throws an error whose text is for people. */
+  /** The contents of a link; throws an error with a text for the reader. */
   function readLink(link, about) {
     const fields = link.slice(link.lastIndexOf(MARK) + MARK.length).trim().split("~");
-    if (!link.includes(MARK) || fields.length < 2) throw new Error("This is no link of a drive.");
+    if (!link.includes(MARK) || fields.length < 2) throw new Error("This is not the link of a drive.");
     if (fields[0] !== String(about.version)) throw new Error("The link's version is not one that this page reads.");
     const [, id, seed, packed, claimed, digest, check] = fields;
     if (fields.length !== 7 || check !== crc32(fields.slice(0, 6).join("~"))) {
@@ -212,7 +212,7 @@
 
   // --- agents ----------------------------------------------------------------------------------------------
 
-  /** Numbers of an array that came as base64. */
+  /** Numbers of an array in base64. */
   function numbersOf({ data, bits }) {
     const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
     return bits === 32 ? new Float32Array(bytes.buffer) : new Float64Array(bytes.buffer);
@@ -228,7 +228,7 @@
     sigmoid,
   };
 
-  /** A function from an episode to its next action, as the architectures of lag_envs/leaderboard act. */
+  /** A function from an episode to its next action, like the architectures of lag_envs/leaderboard. */
   function agentOf(about) {
     const arrays = Object.fromEntries(
       Object.entries(about.arrays).map(([name, array]) => [name, { n: numbersOf(array), shape: array.shape }]),
@@ -264,14 +264,14 @@
   const affine = (x, weight, bias) =>
     Float64Array.from(bias.n, (start, row) => x.reduce((sum, v, i) => sum + v * weight.n[row * x.length + i], start));
 
-  /** What a network's observations are to it. */
+  /** Observations as a network's input. */
   function normaliser({ normalise }, { obs_mean: mean, obs_var: variance }) {
     if (!normalise) return (x) => x;
     const { epsilon, clip } = normalise;
     return (x) => x.map((v, i) => clamp((v - mean.n[i]) / Math.sqrt(variance.n[i] + epsilon), -clip, clip));
   }
 
-  /** The numbers that a network's layers make of what enters them. */
+  /** The output of a network's layers. */
   function layers(about, arrays) {
     const { activation, bins, choices, controls, largest, mean_limit: limit } = about;
     return (x) => {
@@ -329,7 +329,7 @@
     return found - x === 0.5 && found % 2 ? found - 1 : found;
   }
 
-  /** Actions minus gains times how far the state is from the planned one; the last of them go on. */
+  /** Planned actions minus gains times the state's distance from the plan; after the end, the last ones. */
   function plan(about, { states, actions, gains }) {
     const read = reader(about.read);
     const wrapped = about.read.pairs.map(([i]) => i);
@@ -349,7 +349,7 @@
     const read = reader(about.read);
     const strides = axes.map((_, j) => axes.slice(j + 1).reduce((product, axis) => product * axis.length, 1));
 
-    /** The table's number at a moment, and whether it is that of the mirror image. */
+    /** The table's number at a moment, and whether it is from the mirror image. */
     function lookUp(state, target, steps) {
       const given = [...state, target, steps * about.interval];
       for (const [i] of about.read.pairs) given[i] -= 2 * Math.PI * Math.round(given[i] / (2 * Math.PI));
@@ -385,7 +385,7 @@
       };
     }
 
-    /** What actions are worth: the reward of a step from what is seen, and the value where it ends. */
+    /** The values of actions: the reward of a step from the observed state, plus the value where it ends. */
     function worth(episode, actions) {
       const { functions, about: code } = episode.code;
       const [state, target] = read(episode);
@@ -437,7 +437,7 @@
       this.pointer = null;
     }
 
-    /** What the gamepad says, [-1, 1] per axis; null without one, or where it is left alone. */
+    /** The gamepad's input, [-1, 1] per axis; null without one, or if it is not touched. */
     readPad() {
       if (this.pad === null) return null;
       const pad = navigator.getGamepads?.()[this.pad];
@@ -453,7 +453,7 @@
       return axes.some(Boolean) ? axes.map((x) => clamp(x, -1, 1)) : null;
     }
 
-    /** A number for each control. Keys count before the pointer, the pointer before the gamepad. */
+    /** A number for each control. Keys take precedence over the pointer, and the pointer over the gamepad. */
     numbers() {
       const pad = this.readPad();
       const { controls, levels, largest, rest } = this.about;
@@ -481,7 +481,7 @@
   ];
   const lacking = () => LACKING.filter(([, there]) => !there).map(([what]) => what);
 
-  /** Two values of the same shape, of which numbers are changed by those of others: a + Σ (b - a). */
+  /** A value with its numbers changed by those of others of the same shape: a + Σ (b - a). */
   function changed(base, others) {
     if (typeof base === "number") return others.reduce((sum, other) => sum + other - base, base);
     if (!Array.isArray(base)) return base;
@@ -533,7 +533,7 @@
 
     const hands = new Hands(about, () => {
       if (running) pause();
-      tell("The gamepad has left. Drive by keys, or connect it again; Space goes on.");
+      tell("The gamepad is disconnected. Drive with the keys, or connect it again; Space continues.");
     });
     const named = (name) => hands.pairs.map(([down, up], i) => `${nameOf(down)} ${nameOf(up)} ${name(about.controls[i].name)}`).join(", ");
     const how = named(symbol);
@@ -559,7 +559,7 @@
 
     // --- ghosts
 
-    /** Who runs beside: an agent, stored episodes, or the keys of a link. */
+    /** The ghost: an agent, stored episodes, or the keys of a link. */
     const GHOSTS = {
       live: (row) => load(board.rows[row].live).then((data) => {
         const act = agentOf(data);
@@ -611,7 +611,7 @@
     function chooseEpisode() {
       ghost.replay = ghost.replays[Number(episodeSelect.value)] ?? ghost.replays[0];
       if (ghost.replay.reset_seed !== undefined) seed = big(ghost.replay.reset_seed);
-      else tell("The seed of this episode is not known: the ghost has a start of its own.");
+      else tell("The seed of this episode is not known: the ghost starts elsewhere.");
       restart();
     }
 
@@ -630,7 +630,7 @@
       ghost.now = ghost.episode.poses();
     }
 
-    /** The ghost's poses and return at a share of the present step. */
+    /** The ghost's poses and return within the current step. */
     function ghostAt(part) {
       if (!ghost) return null;
       if (ghost.act) return { poses: mixedPoses(ghost.past, ghost.now, ghost.episode.over ? 1 : part), total: ghost.episode.total };
@@ -645,7 +645,7 @@
 
     const mixedPoses = (a, b, part) => b.map((frame, i) => frame.map((x, j) => (j < 3 ? a[i][j] + (x - a[i][j]) * part : x)));
 
-    /** Keep the seed in the address, where it is not that of the link there. */
+    /** Keep the seed in the address, unless a link there already has it. */
     function note() {
       if (seed !== linked?.seed) history.replaceState(null, "", `#seed=${seed}`);
     }
@@ -686,7 +686,7 @@
       offer();
     }
 
-    /** Offer the link of what was driven. */
+    /** Offer the link of this drive. */
     function offer() {
       if (!untouched() || !mine.length || rerunning) return;
       link.value = writeLink(about, seed, mine, me.total, location.href.replace(/#.*/, ""));
@@ -818,7 +818,7 @@
       return { slider, input, say };
     });
 
-    /** Take the sliders' values, and what follows from them. */
+    /** Apply the sliders' values and all that follows from them. */
     function change() {
       const values = inputs.map(({ say }) => say());
       constants = code.constants;
@@ -840,7 +840,7 @@
 
     // --- links
 
-    /** Recompute a link's drive, a little in each frame, and say whether its claim is true. */
+    /** Recompute a link's drive, a little in each frame, and tell whether its claim is true. */
     function judge(hash) {
       linked = rerunning = null;
       watch.hidden = true;
@@ -894,7 +894,7 @@
       try {
         hash = decodeURIComponent(hash);
       } catch {
-        // As it is, it is damaged, and will be told so.
+        // Left as it is, it will be reported as damaged.
       }
       verdict.textContent = "";
       if (hash.includes(MARK)) {
@@ -965,7 +965,7 @@
     }
     const take = (pad) => {
       hands.pad = pad.index;
-      tell("A gamepad is there: its stick drives.");
+      tell("A gamepad is connected: drive with its stick.");
     };
     window.addEventListener("gamepadconnected", (event) => take(event.gamepad));
     window.addEventListener("gamepaddisconnected", () => hands.readPad());
@@ -1016,16 +1016,16 @@
         await navigator.clipboard.writeText(link.value);
         said.textContent = "The link was copied.";
       } catch {
-        // Pages from a disk may not write there; what is selected can be copied by hand.
-        tell("Copy the link that is selected.");
+        // Pages opened from disk may not use the clipboard; the selected link can be copied by hand.
+        tell("Copy the selected link.");
       }
     });
     window.addEventListener("hashchange", followHash);
 
     listGhosts();
     restart();
-    const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers tell how it moves.";
-    tell(`${how ? `${how}; or the pointer, or a gamepad.` : "Nothing acts here: look on."} Space starts.${nothing}`);
+    const nothing = picture && about.frames ? "" : " This scene has nothing to draw; the numbers show how it moves.";
+    tell(`${how ? `${how}; or use the pointer or a gamepad.` : "There is nothing to control here: just watch."} Space starts.${nothing}`);
     if (calm.matches) speed.value = "0.5";
     const there = [...(navigator.getGamepads?.() ?? [])].find((pad) => pad?.connected);
     if (there) take(there);

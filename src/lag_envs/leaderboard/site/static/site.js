@@ -1,10 +1,10 @@
 "use strict";
 /* The leaderboard's page. Plain JavaScript, no build step, nothing from elsewhere, works from file: too.
  *
- * What comes from submissions is untrusted: it becomes text (textContent) or numbers, never markup.
+ * Submissions are untrusted: their contents become text (textContent) or numbers, never markup.
  *
  * In this order: helpers, scenes, painting, player, phase portraits, ranking, charts, drive, start.
- * Driving itself is drive.js, which is loaded when somebody wants to.
+ * Driving itself is in drive.js, which is loaded on demand.
  */
 (() => {
   const TURN = 2 * Math.PI;
@@ -79,9 +79,9 @@
 
   // --- scenes ----------------------------------------------------------------------------------------------
   // An environment's shapes lie in frames, [what, frame, ..., role], in metres, x to the right and y up; an
-  // episode says where the frames are. What the scene is, nobody here knows.
+  // episode says where the frames are. Nothing here depends on what the scene is.
 
-  /** Numbers of a column: whole multiples of a unit, of which the second differences are given. */
+  /** Numbers of a column, which holds the second differences of whole multiples of a unit. */
   function unpack(column, length, unit) {
     const values = new Float64Array(length);
     if (!Array.isArray(column)) return values.fill(column * unit);
@@ -94,14 +94,14 @@
     return values;
   }
 
-  /** Poses with numbers for their columns. */
+  /** Poses with their columns unpacked. */
   const prepared = ({ columns, frames }, length) => ({ columns: columns.map((c) => unpack(c, length, 1)), frames });
 
-  /** Where the frames are, [x, y, angle, part], from recorded poses at a moment and a share of the next. */
+  /** Where the frames are, [x, y, angle, part]: recorded poses at a moment, mixed with a share of the next. */
   function posesAt({ columns, frames }, units, moment, share = 0) {
     return frames.map((frame) => frame.map((c, i) => {
       const values = columns[c];
-      // What a control does it does all through a step.
+      // A control stays the same during a step.
       const next = i < 3 ? Math.min(moment + 1, values.length - 1) : moment;
       return units[i] * mix(values[moment], values[next], share);
     }));
@@ -270,7 +270,7 @@
     }
   }
 
-  /** Poses of an episode in one picture, as on one photographic plate. */
+  /** Poses of an episode in one picture, like a multiple exposure. */
   function poster(canvas, { picture, poster: still }) {
     const { pen, width, height } = fit(canvas);
     if (!width || !picture || !still?.poses) return;
@@ -289,7 +289,7 @@
     pen.globalAlpha = 1;
   }
 
-  /** Show an episode in place of its poster, again and again, unless the reader wants calm. */
+  /** Show an episode in place of its poster, in a loop, unless the reader prefers reduced motion. */
   function startFilm() {
     const canvas = find(".hero [data-poster]");
     const button = find(".film");
@@ -336,12 +336,12 @@
   const fetched = new Map();
   const waiting = new Map();
 
-  /** Called by the files in assets/, each of which holds the episodes of one agent, an agent, or a program. */
+  /** Called by the files in assets/; each holds the episodes of one agent, an agent, or a program. */
   function put(what) {
     waiting.get(document.currentScript?.getAttribute("src"))?.(what);
   }
 
-  /** Load a file as a script, which works from file: where fetch does not. */
+  /** Load a file as a script, which works from file:, where fetch does not. */
   function load(file) {
     if (!fetched.has(file)) {
       const promise = new Promise((resolve, reject) => {
@@ -351,7 +351,7 @@
           fetched.delete(file);
           reject(new Error(`${file} cannot be loaded`));
         });
-        // What was put is there already; else the script could not be run.
+        // The script has put its data by now, unless it could not be run.
         script.addEventListener("load", () => reject(new Error(`This browser cannot run ${file}`)));
         document.head.append(script);
       });
@@ -363,7 +363,7 @@
   /** The episodes in a file. */
   const episodes = (file) => load(file).then((replays) => replays.map(prepare));
 
-  /** An episode with numbers for its columns. */
+  /** An episode with its columns unpacked. */
   function prepare(replay) {
     const dt = replay.dt || board.dt || 1;
     const rows = (columns, n) => {
@@ -480,7 +480,7 @@
       if (chosen) drawPhase(side, chosen, now, board, sides);
     }
 
-    /** Write the read-out; its elements stay, so that nothing moves sixty times a second. */
+    /** Write the read-out; its elements are reused, so that the layout does not jump with every frame. */
     function fill(side, entries) {
       if (side.cells?.length !== entries.length) {
         side.cells = entries.map(([name]) => {
@@ -495,7 +495,7 @@
       });
     }
 
-    /** Tell what is to be seen to those who do not see it, when it has come to rest. */
+    /** Describe the picture to screen readers once it is at rest. */
     function say(prefix = "") {
       clearTimeout(saying);
       saying = setTimeout(() => {
@@ -514,7 +514,7 @@
 
     function tick(now) {
       if (!playing) return;
-      // The first frame may bear a time from before the click.
+      // The first frame's time stamp may be from before the click.
       time += (Math.max(0, now - before) / 1000) * Number(speed.value);
       before = now;
       if (time >= end()) {
@@ -569,7 +569,7 @@
           said.textContent = String(error.message);
           return;
         }
-        // Another choice was made meanwhile.
+        // Another choice has been made meanwhile.
         if (asked !== side.asked) return;
         [side.row, side.replay] = [row, replays[episode] ?? replays[0]];
         side.episode.replaceChildren(...replays.map((replay, i) => {
@@ -617,7 +617,7 @@
     root.addEventListener("keydown", (event) => {
       const { key, target } = event;
       if (event.ctrlKey || event.altKey || event.metaKey || target.matches("select")) return;
-      // A button or a box does with the space bar what it always does.
+      // The space bar keeps its usual meaning on a button or a box.
       if (key === " " && !target.matches("button, [type=checkbox]")) setPlaying(!playing);
       else if (key === "ArrowLeft" || key === "ArrowDown") frames(event.shiftKey ? -10 : -1);
       else if (key === "ArrowRight" || key === "ArrowUp") frames(event.shiftKey ? 10 : 1);
@@ -640,7 +640,7 @@
 
     const ready = board.rows.map((row, i) => (row.file ? i : -1)).filter((i) => i >= 0);
     const other = ready.find((i) => board.rows[i].kind !== board.rows[ready[0]].kind) ?? ready[1];
-    // Episodes are long: they come when this comes into view, unless some were chosen by then.
+    // Episodes are large files: load them once this comes into view, unless some were chosen before.
     new IntersectionObserver((entries, observer) => {
       if (!entries.some((entry) => entry.isIntersecting)) return;
       observer.disconnect();
@@ -720,7 +720,7 @@
 
   // --- phase portraits -------------------------------------------------------------------------------------
 
-  /** Which coordinates have a rate in the state; first the pair that the value function is of. */
+  /** The coordinates whose rate is in the state, first the pair of the value function. */
   function pairsOf({ state_names: names, state_units: units, pairs, value }) {
     const found = [...pairs];
     const labels = (value?.axes ?? []).map((axis) => String(axis.label).replace(/\s*[[(].*$/, ""));
@@ -735,7 +735,7 @@
       y: pair[1],
       labels: pair.map((i) => (units[i] ? `${symbol(names[i])} [${units[i]}]` : symbol(names[i]))),
       value: shaded(pair) ? value : null,
-      // A bar's angle is drawn within one turn, where the value function has just that.
+      // A bar's angle is drawn within one turn if the value function covers exactly one.
       wraps: shaded(pair) && Math.abs(value.axes[0].high - value.axes[0].low - TURN) < 0.05,
     }));
   }
@@ -753,7 +753,7 @@
     return [low - pad, high + pad];
   }
 
-  /** The span of an axis, or the part of it where the paths are if that is much smaller. */
+  /** The span of an axis, or only the part that the paths cover if that is much smaller. */
   function nearer([low, high], axis) {
     if (high - low > 0.6 * (axis.high - axis.low)) return [axis.low, axis.high];
     const more = 0.2 * (high - low);
@@ -767,7 +767,7 @@
     const wrap = pair.wraps
       ? (x) => pair.value.axes[0].low + ((((x - pair.value.axes[0].low) % TURN) + TURN) % TURN)
       : (x) => x;
-    // Axes, shading and path change with the choice only; what moves is the ring.
+    // Axes, shading and path change only with the choice; only the ring moves.
     const same = ["width", "height"].every((size) => side.background?.[size] === side.phase[size]);
     if (!same) {
       const shown = sides.filter((s) => s.replay).flatMap((s) => s.replay.states);
@@ -800,7 +800,7 @@
       back.clip();
       back.lineJoin = "round";
       const { states } = side.replay;
-      // A light line below the coloured one keeps it readable on any shade.
+      // A light line under the coloured one keeps it readable on any shade.
       for (const [colour, wide] of [[ink.card, 4.5], [ink.series[side.row % COLOURS], 2]]) {
         back.strokeStyle = colour;
         back.lineWidth = wide;
@@ -840,7 +840,7 @@
     const columns = values.map((_, i) => x(mix(across.low, across.high, i / (nx - 1))));
     const rows = values[0].map((_, j) => y(mix(up.low, up.high, j / (ny - 1))));
     const within = (at, start, size) => at >= start - 1 && at <= start + size + 1;
-    // The shades are shared out among what is shown.
+    // The shades span the values that are shown.
     let [low, high] = [Infinity, -Infinity];
     values.forEach((column, i) => {
       if (!within(columns[i], box.left, box.width)) return;
@@ -903,7 +903,7 @@
 
   // --- ranking ---------------------------------------------------------------------------------------------
 
-  /** The mark of a kind, which does not rest on colour alone: a dot, a square, a diamond. */
+  /** The mark of a kind, told apart not by colour alone: a dot, a square, a diamond. */
   function mark(kind, size = 4.5) {
     if (kind === "controller") {
       return draw("rect", { x: -size, y: -size, width: 2 * size, height: 2 * size, class: "dot" });
@@ -985,7 +985,7 @@
       const way = rising ? 1 : -1;
       rows.sort((p, q) => {
         const [a, b] = [valueOf(p.data, key), valueOf(q.data, key)];
-        // What was not measured comes last, either way.
+        // Missing values come last in either order.
         if (a === null || b === null) return (a === null) - (b === null);
         const less = typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b;
         return way * less || p.element.dataset.row - q.element.dataset.row;
@@ -1044,7 +1044,7 @@
     form.addEventListener("input", filter);
     for (const input of all("[name=axis]", form)) input.addEventListener("change", pictures);
     pictures();
-    // A browser that goes back to the page fills in what was there.
+    // Going back to the page, browsers fill in the earlier choices.
     filter();
   }
 
@@ -1109,7 +1109,7 @@
     });
   }
 
-  /** The mean over seeds, at the first seed's steps, as far as all go. */
+  /** The mean over seeds, at the first seed's steps, up to where the shortest one ends. */
   function meanOf(seeds) {
     const at = (line, x) => {
       const k = line.findIndex((p) => p[0] >= x);
@@ -1196,7 +1196,7 @@
 
   // --- drive -----------------------------------------------------------------------------------------------
 
-  /** Let people drive: the program comes when somebody asks for it, or follows a link of a drive. */
+  /** Let people drive: the program is loaded when somebody asks for it, or opens the link of a drive. */
   function startDrive() {
     const root = find("#drive");
     if (!root) return null;
@@ -1284,7 +1284,7 @@
     readColours();
     again();
   });
-  // Keep the present environment in sight where the list of them is scrolled.
+  // Keep the current environment in view if the list of environments scrolls.
   const here = find(".top nav [aria-current]");
   if (here) here.closest("ul").scrollLeft = here.offsetLeft - 24;
 })();
