@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-#: The file; for each id, its ``envs`` hold ``scale`` and ``reference``, set once, and later ``measured`` values.
+#: The file; for each id, ``envs`` holds ``scale`` and ``reference``, set once, and later ``measured`` values.
 FILE = Path(__file__).with_name("measured.json")
 
 

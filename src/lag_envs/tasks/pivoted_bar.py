@@ -348,8 +348,8 @@ class SwingUpUnknown(SwingUp):
         variants={"known": {"randomize": None}, "perfect": {"observation_noise": None, "action_delay": None}},
     )
     difficulty = (
-        "A short bar falls three times as fast as a long one: the energy to pump and the balancing gains must "
-        "be inferred from noisy observations while the bar moves."
+        "A short bar falls three times as fast as a long one: the energy to pump and the balancing gains "
+        "must be inferred from noisy observations while the bar moves."
     )
     note = """
 The adaptive controller is best: it estimates length and friction while the bar moves, and takes the delay of

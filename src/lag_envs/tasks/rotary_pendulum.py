@@ -128,9 +128,9 @@ class RotarySwingUp(Task):
         "harder they push each other."
     )
     note = (
-        "Best is a plan, found on the exact model and followed by feedback. Energy shaping pumps with the "
-        "arm's acceleration, then hands over to an LQR; it loses many a catch, for pumping does not mind "
-        "how fast the arm is."
+        "The best agent follows a plan, found on the exact model, with feedback. Energy shaping pumps with "
+        "the arm's acceleration, then hands over to an LQR; it often fails to catch the pendulum, because "
+        "pumping ignores the arm's speed."
     )
 
     def observe(self, after: Any, target: Any, xp: Any) -> Mapping[str, Any]:
