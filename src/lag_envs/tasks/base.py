@@ -357,7 +357,7 @@ class Task:
         return min((speed for speed in found if speed is not None), default=None)
 
     def chance(self, per_interval: float) -> float:
-        """Return the chance per step of an event with a chance per interval: its rate is the same for any `dt`."""
+        """Return an event's chance per step from that per interval: its rate is the same for any `dt`."""
         if self._recording is not None:
             return self._recording.chance(per_interval)
         if self.dt == self.interval:
@@ -578,7 +578,7 @@ _NUMBERS = {"scene", "dt", "duration", "fixed_target", "formulas", "given", "imp
 class TaskFormulas:
     """The formulas of a task, as `lag_envs.envs.program` uses them.
 
-    If the scene has a normal form, the states ``y`` and ``z`` are lifted: cosine and sine of its angle follow.
+    If the scene has a normal form, states ``y`` and ``z`` are lifted: cosine and sine of its angle follow.
     """
 
     trace = ElementaryTrace
