@@ -129,7 +129,7 @@ def learned(env_id: str, folder: Path) -> Entrant:
 
 
 def check_alike(entrant: Entrant, first: Entrant) -> None:
-    """Raise a UserError if two runs of a learner were trained differently: they are not comparable samples."""
+    """Raise a UserError if two runs of a learner were trained differently: they are not alike as samples."""
     assert entrant.run is not None and first.run is not None
     for name in ("steps", "hyperparameters"):
         if entrant.run[name] != first.run[name]:

@@ -58,9 +58,7 @@ def page(data: Data, notes: Mapping[str, str] | None = None) -> str:
     parts.append(_image("agents-scores.png", "Results of all agents with intervals"))
     if data["learners"]:
         parts += ["### Learners", _learners_table(data["learners"], envs)]
-        parts.append(
-            "Results of learners' policies during training, over steps and over seconds:"
-        )
+        parts.append("Results of learners' policies during training, over steps and over seconds:")
         parts.append(_image("agents-steps.png", "Learning curves over steps"))
         parts.append(_image("agents-seconds.png", "Learning curves over seconds"))
         parts.append(
@@ -292,8 +290,8 @@ def _method(data: Data) -> str:
             " for all agents. Agents act deterministically.",
             *_fewer(data),
             "- *Ten times as often*: `dt` is a tenth of the environment's. Episodes keep their length in"
-            " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if there are any,"
-            " differ then, so an agent's luck differs too.",
+            " seconds; running rewards and the chance of a kick are scaled with `dt`. Kicks, if any, differ"
+            " then, so an agent's luck differs too.",
             "- *Parameters*: each of the scene's parameters 20 % lower and higher, the others unchanged; a"
             " moment of inertia that is not given follows mass and size. The agents, and the range of scores,"
             " are still those of the unchanged environment: part of a loss, or gain, comes from the changed"

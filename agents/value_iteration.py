@@ -30,7 +30,7 @@ from lag_envs.store import write
 Array = NDArray[np.float64]
 #: (points (n, d), actions (n,)) to (coordinates (n, d), rewards (n,), ended (n,)).
 Step = Callable[[Array, Array], tuple[Array, Array, NDArray[np.bool_]]]
-#: points (n, d) to (coordinates (m, n, d), weights (m,)): where m outcomes of a random kick lead.
+#: points (n, d) to (coordinates (m, n, d), weights (m,)): the m outcomes of a random kick.
 Kick = Callable[[Array], tuple[Array, Array]]
 
 VALUES, PROGRESS = "values.npy", "progress.json"
